@@ -192,14 +192,12 @@ def _results(plan: RunPlan, batches: Sequence[Batch]) -> Generator[list[TaskResu
             "limit": plan.config.timeout,
             "pieces": Batch.split,
         }
-        if plan.config.executor == "dask":
-            from shiftsim.runs.cluster import map_on_cluster
+        from shiftsim.runs.workers import map_on_cluster, map_unordered
 
+        if plan.config.executor == "dask":
             scheduler = plan.config.scheduler
             outcomes = map_on_cluster(plan.runner(), batches, scheduler=scheduler, **options)
         else:
-            from shiftsim.runs.workers import map_unordered
-
             options |= {"workers": plan.workers, "group": attrgetter("token")}
             outcomes = map_unordered(plan.runner(), batches, **options)
         with closing(outcomes):

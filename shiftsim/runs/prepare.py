@@ -10,11 +10,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from shiftsim._version import __version__
-from shiftsim.data.store.reading import ScenarioStore
-from shiftsim.errors import ConfigError, DataError, one_of
+from shiftsim.errors import ConfigError, one_of
 from shiftsim.files import require_no_import
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.planners.registry import (
@@ -27,7 +26,7 @@ from shiftsim.planners.registry import (
 from shiftsim.runs.config import RunConfig, Value, default_workers, parse_shard
 from shiftsim.runs.manifest import State, check_resumable, check_space, check_target, code_digest
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.scenarios import find_split, open_edits, open_named_store, token_hash
+from shiftsim.runs.scenarios import Selection, open_named_store, select_scenarios
 from shiftsim.runs.task import Batch, TaskRunner
 from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
 from shiftsim.sim.traffic import PLANNER, BatchTraffic, make_traffic, traffic_name
@@ -40,23 +39,6 @@ RUNS = Path("runs")
 _NOISE_FIELDS = ("kind", "sigma_accel", "sigma_rate", "theta")
 _MAX_NAME = 40  # characters of one part of a run's name
 _MEMORY_OF_NETWORK = 1.5e9  # bytes per worker
-
-
-class Selection(NamedTuple):
-    """The scenarios of a run, whatever its shard."""
-
-    split: str  # name of the split
-    present: list[str]  # tokens that the store holds
-    missing: list[str]  # tokens that it does not hold
-    num_dropped: int  # scenarios left out because the filter dropped them
-    fingerprint: dict[str, Any]  # what identifies them
-    edits: "EditSet | None" = None  # what makes them of recorded ones
-    edited: Mapping[str, Any] = {}  # which are made of which, for the manifest
-
-    @property
-    def tokens(self) -> tuple[str, ...]:
-        """All tokens."""
-        return (*self.present, *self.missing)
 
 
 @dataclass(frozen=True)
@@ -131,7 +113,7 @@ def prepare(
         load_metric(metric)
     entries = _planners(config, planners or config.planners)
     store = open_named_store(config.store)
-    selection = _select(config, store, edits)
+    selection = select_scenarios(config, store, edits)
     grouped = {entry.name for entry in entries if entry.in_batches or in_batches}
     fingerprint = {
         **selection.fingerprint,
@@ -257,61 +239,6 @@ def _checkpoints(config: RunConfig, takers: Sequence[str]) -> dict[str, str]:
             raise ConfigError(f"planner {name!r} has two checkpoints: {out[name]!r} and {path!r}")
         out[name] = path
     return out
-
-
-def _select(config: RunConfig, store: ScenarioStore, given: "EditSet | None") -> Selection:
-    known = tuple(store.tokens)
-    usable, fingerprint = known, {"store": store.hash}
-    if config.split in ("", store.path.name) and not config.all_scenarios:
-        usable, filter_hash = _usable(config, store)
-        if filter_hash:
-            fingerprint["filter"] = filter_hash
-    split = find_split(config.split, Path(store.path), usable)
-    name, tokens, store_tokens, edited = split.name, split.tokens, set(known), dict[str, Any]()
-    edits = given or (open_edits(config.edits, store) if config.edits else None)
-    if edits is not None:
-        edits.require_traffic(config.traffic)
-        edited = edits.describe(store, tokens)
-        name, tokens, store_tokens = f"{name}+{edits.name}", tuple(edited), set(edited)
-        fingerprint["edits"] = edits.digest
-    tokens = tokens[: config.limit] if config.limit else tokens
-    missing = sorted(set(tokens) - store_tokens)
-    if missing and not config.allow_partial:
-        raise DataError(
-            f"split {split.name!r} needs {len(tokens)} scenarios, store {config.store!r} "
-            f"lacks {len(missing)} of them, such as {missing[0]!r}",
-            hint="convert the missing scenarios, or --allow-partial",
-        )
-    if len(missing) == len(tokens):
-        raise DataError(
-            f"split {split.name!r}: store {config.store!r} holds none of its scenarios",
-            hint="name the store that was converted for this split",
-        )
-    fingerprint["tokens"] = token_hash(tokens)
-    if store.is_reviewed and store.reviews.hash:
-        fingerprint["review"] = store.reviews.hash
-    present = [token for token in tokens if token in store_tokens]
-    dropped = len(known) - len(usable)
-    return Selection(name, present, missing, dropped, fingerprint, edits, edited)
-
-
-def _usable(config: RunConfig, store: ScenarioStore) -> tuple[tuple[str, ...], str]:
-    """The scenarios of a whole store that filter and review accept, and the filter's hash."""
-    from shiftsim.runs.filter import read_filter_results
-
-    known, filter_hash = tuple(store.tokens), ""
-    usable, results = known, read_filter_results(store.path, store.hash)
-    if results is not None:
-        if not results.accepted:
-            raise DataError(
-                f"store {config.store!r}: the filter dropped all {len(results.rows)} scenarios",
-                hint="`shiftsim filter` says why; --all to use them nevertheless",
-            )
-        accepted, filter_hash = set(results.accepted), results.hash
-        usable = tuple(token for token in known if token in accepted)
-    if store.is_reviewed:
-        usable = store.reviews.usable(known, usable)
-    return usable, filter_hash
 
 
 def _check_folder(config: RunConfig, folder: Path, fingerprint: dict[str, Any]) -> State:

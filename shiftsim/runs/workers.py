@@ -1,18 +1,26 @@
-"""Run a function over many tasks: in this process, or in supervised worker processes.
+"""Run a function over many tasks: here, in supervised worker processes, or on a dask cluster.
 
-A worker that dies, or hangs and is killed, costs the one task it was working on.
+A worker that dies, or hangs and is killed, costs the one task it was working on. dask only hands
+the tasks out: on each of its threads one supervised process does them, so that a crash costs one
+task there as well, and no worker of the cluster. What a lost machine was doing, dask gives to
+another one.
 """
 
+import pickle
+import sys
+import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from math import inf
 from multiprocessing.connection import wait
 from time import monotonic, time
 from typing import Any, Generic, Literal, TypeVar
+from uuid import uuid4
 
-from shiftsim.errors import ConfigError
+from shiftsim.errors import ConfigError, import_extra
 from shiftsim.kernels import machine_code
 from shiftsim.processes import Process, ProcessEndedError, close, packed, start
 
@@ -24,6 +32,10 @@ _MAX_START_FAILURES = 3  # workers in a row that die before they are ready for a
 _LOOK_AHEAD = 128  # tasks among which one for a worker is chosen
 _TIME_TO_LOAD = 10.0  # s, on top of the limit of a worker's first task
 _TIME_TO_COMPILE = 20.0  # s, for one kernel: longer than any takes
+_CONNECT = 30.0  # s, for a scheduler to answer
+_HANDED_OUT = 64  # tasks at the scheduler at once, more where there are more threads
+# on a worker of the cluster: its processes by job and thread; kept from one task to the next
+_POOLS: "dict[tuple[str, int], Pool]" = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,3 +229,76 @@ class Pool:
             worker.process.connection.close()
         for worker in self.workers:
             worker.process.end()
+
+
+def map_on_cluster(
+    make: MakeFunction[T, R],
+    tasks: Iterable[T],
+    *,
+    scheduler: str,
+    alone: int = 0,
+    limit: float = 0.0,
+    pieces: Callable[[T], Sequence[T]] | None = None,
+) -> Generator[Outcome[T, R], None, None]:
+    """As `map_unordered`, on the cluster whose scheduler is at an address.
+
+    Raises:
+        MissingExtraError: dask.distributed is not installed.
+        ConfigError: There is no scheduler at that address.
+    """
+    distributed: Any = import_extra("distributed", "cluster")
+    try:
+        client = distributed.Client(scheduler, timeout=_CONNECT, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"no dask scheduler answers at {scheduler!r}: {error}",
+            hint="start one with `dask scheduler`, and workers with `dask worker ADDRESS`",
+        ) from error
+    job = uuid4().hex
+    work = partial(_work, job, pickle.dumps((sys.path, pickle.dumps(make), limit, pieces)))
+    waiting = deque(tasks)
+    pending: dict[Any, Any] = {}  # future -> task
+    done, window = 0, 1
+    futures = distributed.as_completed([], loop=client.loop)
+    try:
+        while waiting or pending:
+            if done % _HANDED_OUT == 0 or done == alone:
+                window = max(_HANDED_OUT, 2 * sum(client.nthreads().values()))
+            while waiting and len(pending) < (window if done >= alone else 1):
+                task = waiting.popleft()
+                future = client.submit(work, task, pure=False)
+                pending[future] = task
+                futures.add(future)
+            future = next(futures)
+            task = pending.pop(future)
+            done += 1
+            try:
+                yield from future.result()
+            except distributed.KilledWorker as error:  # every worker that took it was lost
+                parts = pieces(task) if pieces else (task,)
+                if len(parts) > 1:
+                    waiting.extendleft(reversed(parts))
+                else:
+                    yield Outcome(task, None, f"lost with several workers: {error}")
+    finally:
+        client.cancel(list(pending), force=True)
+        client.run(_forget, job)
+        client.close()
+
+
+def _work(job: str, payload: bytes, task: Any) -> list[Outcome[Any, Any]]:
+    """Do one task on a thread of a worker of the cluster."""
+    key = (job, threading.get_ident())
+    if key not in _POOLS:
+        for other in [other for other in _POOLS if other[1] == key[1]]:
+            _POOLS.pop(other).close()  # of a run whose main process was killed
+        paths, make, limit, pieces = pickle.loads(payload)
+        here = [*sys.path, *(path for path in paths if path not in sys.path)]
+        _POOLS[key] = Pool(pickle.dumps((here, make)), 1, limit, pieces)
+    return list(_POOLS[key].run([task], 0))
+
+
+def _forget(job: str) -> None:
+    """End the processes of a job on a worker of the cluster."""
+    for key in [key for key in _POOLS if key[0] == job]:
+        _POOLS.pop(key).close()
