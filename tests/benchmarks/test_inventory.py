@@ -18,12 +18,12 @@ def place(tmp_path, monkeypatch):
 
 
 def rows(**wanted):
-    found = stock.list_available_data()["rows"]
+    found = inventory.list_available_data()["rows"]
     return [row for row in found if all(row[name] == value for name, value in wanted.items())]
 
 
 def test_where_nothing_is_there_every_row_names_what_to_get(place):
-    found = stock.list_available_data()
+    found = inventory.list_available_data()
     assert found["stores"] == []
     assert len(found["rows"]) == 16
     [row] = rows(track="state-drift", planner="plantf")
@@ -41,12 +41,12 @@ def test_a_store_of_ones_own_and_a_checkpoint_are_found(place):
     store = write_toy_store(place / "stores" / "toy")
     (store / "splits").mkdir()
     (store / "splits" / "half.toml").write_text('tokens = ["toy-1"]')
-    token = stock.open_store(store).tokens[0]
+    token = inventory.open_store(store).tokens[0]
     (store / "splits" / "half.toml").write_text(f'tokens = ["{token}"]')
     (store / "splits" / "other.toml").write_text('tokens = ["not-here"]')
     (place / "checkpoints").mkdir()
     (place / "checkpoints" / "planTF.ckpt").touch()
-    [found] = stock.list_available_data()["stores"]
+    [found] = inventory.list_available_data()["stores"]
     assert [(one["name"], one["scenarios"]) for one in found["sets"]] == [
         ("toy", 4),
         ("toy:half", 1),
@@ -59,7 +59,7 @@ def test_a_store_of_ones_own_and_a_checkpoint_are_found(place):
 
 
 def test_the_published_list_is_known_by_its_tokens(place, monkeypatch):
-    tokens = stock.open_store(write_toy_store(place / "stores" / "mine")).tokens
+    tokens = inventory.open_store(write_toy_store(place / "stores" / "mine")).tokens
     mine = KnownSet("val14", "Val14", "nuplan", len(tokens), token_digest(tokens))
     others = tuple(one for one in known_sets() if one.name != "val14")
     monkeypatch.setattr(stock, "known_sets", lambda: (mine, *others))
@@ -72,7 +72,7 @@ def test_a_damaged_store_is_named_and_the_others_are_listed(place):
     write_toy_store(place / "stores" / "toy")
     broken = write_toy_store(place / "stores" / "broken")
     (broken / "store.json").write_text("{")
-    first, second = stock.list_available_data()["stores"]
+    first, second = inventory.list_available_data()["stores"]
     assert "store.json" in first["problem"]
     assert (second["name"], second["problem"]) == ("toy", "")
 
