@@ -6,7 +6,7 @@ import pytest
 from commands import call
 from stores import write_toy_store
 
-from shiftsim.benchmarks import TRACKS, known_sets, stock
+from shiftsim.benchmarks import TRACKS, inventory, known_sets
 from shiftsim.report.groups import KnownSet, token_digest
 
 
@@ -62,7 +62,7 @@ def test_the_published_list_is_known_by_its_tokens(place, monkeypatch):
     tokens = inventory.open_store(write_toy_store(place / "stores" / "mine")).tokens
     mine = KnownSet("val14", "Val14", "nuplan", len(tokens), token_digest(tokens))
     others = tuple(one for one in known_sets() if one.name != "val14")
-    monkeypatch.setattr(stock, "known_sets", lambda: (mine, *others))
+    monkeypatch.setattr(inventory, "known_sets", lambda: (mine, *others))
     [row] = rows(track="semantic-shift", planner="pdm-closed")
     assert (row["reference"], row["own"]) == ("mine", [])
     assert [lack["what"] for lack in row["missing"]] == ["own scenarios"]
