@@ -23,7 +23,6 @@ from typing import Any, BinaryIO
 from shiftsim.errors import ConfigError, DataError
 
 PACKAGE = Path(__file__).parent
-# a line end is found twice as fast as a line's beginning
 _IMPORT = re.compile(
     r"\n *(?:from shiftsim\.([\w.]+) import (?:\(([^)]*)\)|([^\n(]+))|import shiftsim\.([\w.]+))"
 )

@@ -169,8 +169,8 @@ def difference(manifest: dict[str, Any], fingerprint: dict[str, Any], shard: str
     if not names:
         return ""
     first = _in_words(names[0], before.get(names[0]), after.get(names[0]))
-    shown = ", ".join(_NAMES.get(name, name) for name in names)
-    return f"{shown} differ{first and f' ({first})'}"
+    listed = ", ".join(_NAMES.get(name, name) for name in names)
+    return f"{listed} differ{first and f' ({first})'}"
 
 
 def _in_words(name: str, old: Any, new: Any) -> str:
