@@ -21,4 +21,26 @@ from shiftsim.world.state import EgoState as EgoState
 from shiftsim.world.state import Tracks as Tracks
 from shiftsim.world.state import Trajectory as Trajectory
 
+__all__ = [
+    "Command",
+    "EgoState",
+    "NoiseModel",
+    "Observation",
+    "Planner",
+    "Run",
+    "Scenario",
+    "SceneInfo",
+    "ShiftsimError",
+    "SimulationLog",
+    "Tracks",
+    "Trajectory",
+    "check_planner",
+    "load_planner",
+    "open_run",
+    "open_store",
+    "run",
+    "show",
+    "simulate",
+]
+
 def deprecated_name(module: str, name: str) -> Any: ...

@@ -393,8 +393,8 @@ def _after_interrupt(words: list[str]) -> str:
     """What becomes of the work of a command that was interrupted, and how to go on."""
     for name in words[:2]:
         if name in _GOES_ON:
-            again = [*words, *(word for word in _GOES_ON[name] if word not in words)]
-            return f"what is finished is kept; go on with: {shlex.join(['shiftsim', *again])}"
+            resumed = [*words, *(word for word in _GOES_ON[name] if word not in words)]
+            return f"what is finished is kept; go on with: {shlex.join(['shiftsim', *resumed])}"
     return f"start again with: {shlex.join(['shiftsim', *words])}" if words else ""
 
 

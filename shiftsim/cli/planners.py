@@ -98,7 +98,7 @@ def check_one_planner(
             make, scenario, scenes.read(others[0]["token"]) if others else None
         )
     errors = [finding for finding in findings if finding.severity == "error"]
-    doubts = [finding for finding in findings if finding.severity == "warning"]
+    warnings = [finding for finding in findings if finding.severity == "warning"]
     if as_json:
         say_json([asdict(finding) for finding in findings])
     else:
@@ -107,7 +107,7 @@ def check_one_planner(
             if finding.hint:
                 say(f"   hint: {finding.hint}")
         verdict = plural(len(errors), "error") if errors else "obeys the contract"
-        verdict += f", {plural(len(doubts), 'warning')}" if doubts else ""
+        verdict += f", {plural(len(warnings), 'warning')}" if warnings else ""
         say(f"{planner} on scenario {scenario.token}: {verdict}")
     if any(finding.check == HANGS for finding in errors):
         raise KeyboardInterrupt
@@ -134,5 +134,5 @@ def convert(
     """Write the weights that the planner loads, and nothing else, to a safetensors file."""
     from shiftsim.planners.learned.convert import convert_checkpoint
 
-    made = convert_checkpoint(path, out)
-    show(made.to_dict(), made.lines(), as_json=as_json)
+    converted = convert_checkpoint(path, out)
+    show(converted.to_dict(), converted.lines(), as_json=as_json)

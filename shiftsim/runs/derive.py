@@ -122,8 +122,8 @@ class Rescorer:
     def __init__(self, run: Path, store: str, config: RunConfig) -> None:
         self.config, self._run = config, open_run(run)
         edits = self._run.manifest.get("edits")
-        made = make_edits(edits, self._run.path.name) if edits else None
-        self._scenarios = ScenarioReader(store, made)
+        edit_set = make_edits(edits, self._run.path.name) if edits else None
+        self._scenarios = ScenarioReader(store, edit_set)
 
     def __call__(self, batch: Batch) -> list[TaskResult]:
         """The results of tasks."""

@@ -4,7 +4,6 @@ import csv
 import io
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from made_runs import METRICS, random_scores, write_run
 
@@ -26,7 +25,6 @@ from shiftsim.report.tables import Number, Table, shown
 from shiftsim.report.words import LONG
 from shiftsim.report.writers import FORMATS, latex_escape, markdown_escape, render
 from shiftsim.runs.diff import diff_lines, diff_runs
-from shiftsim.runs.results import open_run
 
 TOKENS = ("t0", "t1", "t2", "t3")
 
@@ -460,15 +458,6 @@ def test_a_rollout_of_unknown_duration_withholds_every_class(tmp_path):
     table = scores(read_groups([run]))
     assert cells(table, "made-up, 8 s")["CLS"] == "– (2/3 done)"
     assert cells(table, "made-up, 15 s")["CLS"] == "– (1/2 done)"
-
-
-def test_runs_without_durations_are_read_as_before(tmp_path):
-    run = write_run(tmp_path / "a")
-    path = run.path / "scores.parquet"
-    pq.write_table(pq.read_table(path).drop_columns(["duration_class"]), path)
-    old = open_run(run.path)
-    assert old.scores["duration_class"].null_count == 4
-    assert score_table([old]) == score_table([write_run(tmp_path / "b")])
 
 
 def test_a_diff_of_different_durations_gives_no_mean(tmp_path):
