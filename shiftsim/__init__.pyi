@@ -8,6 +8,7 @@ from shiftsim.api import open_store as open_store
 from shiftsim.api import run as run
 from shiftsim.api import simulate as simulate
 from shiftsim.errors import ShiftsimError as ShiftsimError
+from shiftsim.metrics import compute_metrics as score
 from shiftsim.planners.contract import check_planner as check_planner
 from shiftsim.sim.log import SimulationLog as SimulationLog
 from shiftsim.sim.noise import NoiseModel as NoiseModel
@@ -39,6 +40,7 @@ __all__ = [
     "open_run",
     "open_store",
     "run",
+    "score",
     "show",
     "simulate",
 ]
