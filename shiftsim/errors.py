@@ -26,7 +26,7 @@ class ShiftsimError(Exception):
     """
 
     def __init__(self, message: str, hint: str = "") -> None:
-        self.message, self.hint = _in_one_line(message), hint
+        self.message, self.hint = _in_one_line(str(message)), hint
         super().__init__(self.message)
 
     def __str__(self) -> str:
