@@ -257,11 +257,12 @@ class ProcessVectorEnv(AsyncVectorEnv):
         try:
             return call(*arguments)
         except (EOFError, ConnectionError) as error:
-            wait([process.sentinel for process in self.processes], timeout=5.0)
-            codes = [process.exitcode for process in self.processes]
+            ended = wait([process.sentinel for process in self.processes], timeout=5.0)
+            number = next(n for n, one in enumerate(self.processes) if one.sentinel in ended)
+            self.processes[number].join()
+            code = self.processes[number].exitcode or 0
             self.close()
-            number, code = next((n, code) for n, code in enumerate(codes) if code)
-            how = f"exit code {code}" if code > 0 else signal.Signals(-code).name
+            how = f"exit code {code}" if code >= 0 else signal.Signals(-code).name
             raise ShiftsimError(
                 f"the process of environment {number} ended with {how}",
                 hint="what it printed is above; a script that makes processes needs the guard "

@@ -1,11 +1,11 @@
-"""The paper's tables from own runs: zero-shot generalization and noise robustness."""
+"""The paper's tables from own runs, and its figures: zero-shot generalization, noise robustness."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
 from shiftsim.report.groups import COLUMNS, DataSet, Group, distinct_sets
-from shiftsim.report.published import Published, called_alike
 from shiftsim.report.statistics import FEW_CLUSTERS, score_interval
 from shiftsim.report.tables import Cell, Estimate, Number, Table
 from shiftsim.report.words import LONG, NAMES
@@ -18,6 +18,45 @@ INTERVALS = (
 )
 PUBLISHED = "(published)"
 _SETS = {"val14": "Val14", "all": "DeepPlan", "deepplan": "DeepPlan"}
+
+
+@dataclass(frozen=True, slots=True)
+class Published:
+    """Numbers copied from the paper; scores are times 100."""
+
+    source: str  # where they are from
+    # names of each site by its abbreviation, in the paper's order
+    cities: Mapping[str, Sequence[str]]
+    scenarios: Mapping[str, int]  # scenarios of each site, by abbreviation
+    columns: Sequence[str]  # columns of `semantic_shift`: sets, sites, metrics
+    semantic_shift: Mapping[str, Mapping[str, Sequence[float]]]  # values by traffic and planner
+    noises: Sequence[str]  # columns of `robustness`
+    # by traffic, set and planner: mean and deviation of each noise
+    robustness: Mapping[str, Mapping[str, Mapping[str, Sequence[Sequence[float]]]]]
+    sets: Sequence[str]  # columns of `comparison`
+    comparison: Mapping[str, Sequence[str]]  # properties of the data sets, by name of the property
+
+    def abbreviation(self, city: str) -> str:
+        """The paper's abbreviation of a city; empty for other cities."""
+        plain = _letters(city)
+        found = (s for s, names in self.cities.items() if plain in map(_letters, (s, *names)))
+        return next(found, "")
+
+    def scores(self, traffic: str) -> dict[str, dict[str, float]]:
+        """Values of `semantic_shift` under one traffic mode, by planner and column."""
+        return {
+            planner: dict(zip(self.columns, values, strict=True))
+            for planner, values in self.semantic_shift.get(traffic, {}).items()
+        }
+
+
+def called_alike(name: str, listed: Iterable[str]) -> list[str]:
+    """Planners of a published table that are called like one of ours: one or none."""
+    return [other for other in listed if _letters(other) == _letters(name)]
+
+
+def _letters(text: str) -> str:
+    return "".join(c for c in text.casefold() if c.isalnum())
 
 
 class _Column(NamedTuple):

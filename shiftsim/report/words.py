@@ -1,11 +1,11 @@
-"""What metrics, units and violations are called where people read them."""
+"""What metrics, units and violations are called where people read them; which one is the worst."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from shiftsim.metrics import SHORT_NAMES
+from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES
 from shiftsim.world.state import AgentKind, Tracks
 
 COLLISIONS = "no_ego_at_fault_collisions"
@@ -69,3 +69,34 @@ def violation_words(row: Mapping[str, Any], tracks: Tracks) -> str:
         elif unit:
             words.append(f"{value:.3g} {unit}" if abs(value) >= 0.01 else f"under 0.01 {unit}")
     return ", ".join(words)
+
+
+class Violation(NamedTuple):
+    """A scored metric below 1."""
+
+    short: str  # the metric's abbreviation
+    reason: str  # what went wrong
+    time: float | None  # when it began [s from the start]; None where it has no moment
+    is_multiplier: bool  # whether the metric multiplies the score
+    row: Mapping[str, Any]  # of `metrics.parquet`
+
+    def __str__(self) -> str:
+        return self.reason if self.time is None else f"{self.reason} {self.time:.1f} s"
+
+
+def violations(rows: Iterable[Mapping[str, Any]]) -> list[Violation]:
+    """The scored metrics below 1 among rows of `metrics.parquet`, the earliest first."""
+    found = [
+        Violation(
+            SHORT_NAMES[name], REASONS[name], row["first_violation_s"], name in MULTIPLIERS, row
+        )
+        for row in rows
+        if (name := row["metric"]) in REASONS and row["score"] is not None and row["score"] < 1.0
+    ]
+    return sorted(found, key=lambda one: (one.time is None, one.time or 0.0))
+
+
+def worst_violation(found: Iterable[Violation]) -> Violation | None:
+    """The one that cost most and has a moment: the first of a multiplier, else the first."""
+    known = [one for one in found if one.time is not None]
+    return next((one for one in known if one.is_multiplier), known[0] if known else None)

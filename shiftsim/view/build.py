@@ -10,14 +10,13 @@ import pyarrow as pa
 
 from shiftsim.errors import ConfigError, DataError, beginning
 from shiftsim.files import below, write_text
-from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES
-from shiftsim.report.words import REASONS
+from shiftsim.metrics import SHORT_NAMES
+from shiftsim.report.words import REASONS, violations, worst_violation
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
 from shiftsim.view.page import MAX_ROLLOUTS, POLICY, Page, data_element, framed, replay_page
 from shiftsim.view.scene import Shown
 
-_FACTORS = [SHORT_NAMES[name] for name in MULTIPLIERS]
 _WRONG = {SHORT_NAMES[name]: reason for name, reason in REASONS.items()}  # in words, in their order
 
 
@@ -139,11 +138,8 @@ class Gallery:
 
     def _row(self, task: Task, index: int) -> dict[str, Any]:
         score, metrics = self._results(task)
-        firsts = {
-            SHORT_NAMES[row["metric"]]: row["first_violation_s"]
-            for row in metrics
-            if row["metric"] in SHORT_NAMES and row["score"] is not None and row["score"] < 1.0
-        }
+        found = violations(metrics)
+        worst = worst_violation(found)
         return {
             "token": task.token,
             "type": score.get("scenario_type", ""),
@@ -152,8 +148,8 @@ class Gallery:
             "noise": task.noise,
             "seed": task.seed,
             "cls": score.get("cls"),
-            "violated": firsts,
-            "at": _moment(firsts),
+            "violated": {one.short: one.time for one in found},
+            "at": worst and worst.time,
             "index": index,
             "page": f"replay/{page_name(task.token)}",
         }
@@ -209,14 +205,6 @@ def write_site(
     page = list_page(title, rows, above="\n".join([above, worst_table(rows)]))
     write_text(folder / "index.html", page)
     return len(found)
-
-
-def _moment(violated: Mapping[str, float | None]) -> float | None:
-    """Where a replay opens: the first violation that multiplies the score, else the first."""
-    known = {short: time for short, time in violated.items() if time is not None}
-    return min(
-        (known[s] for s in _FACTORS if s in known), default=min(known.values(), default=None)
-    )
 
 
 def worst_table(rows: Sequence[Mapping[str, Any]], count: int = 10) -> str:

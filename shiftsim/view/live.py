@@ -7,7 +7,7 @@ opened, and nothing is added to what the workers do.
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from http import HTTPStatus
@@ -18,9 +18,8 @@ from typing import Any, NamedTuple
 from urllib.parse import parse_qs, urlsplit
 
 from shiftsim.errors import ShiftsimError
-from shiftsim.metrics import MULTIPLIERS
 from shiftsim.report.palette import planner_styles
-from shiftsim.report.words import REASONS
+from shiftsim.report.words import violations
 from shiftsim.runs.execute import Progress
 from shiftsim.runs.results import OK, TaskResult
 from shiftsim.runs.rollouts import complete_rollout
@@ -145,13 +144,7 @@ class LiveRun:
                     for group, sums in sorted(self._sums.items())
                 ],
                 "worst": [
-                    {
-                        **result.task._asdict(),
-                        "score": 100.0 * float(result.scores["cls"]),
-                        "why": _words(violated := _violated(result)),
-                        "at": next(iter(violated.values()), None),
-                        "replay": number if result.rollout else None,
-                    }
+                    _describe(result) | {"replay": number if result.rollout else None}
                     for _, number, result in sorted(self._worst.values(), key=lambda one: one[:2])
                 ],
                 "failures": [
@@ -179,21 +172,19 @@ class LiveRun:
         return replay_page(scenario, [shown])
 
 
-def _violated(result: TaskResult) -> dict[str, float | None]:
-    """First times [s] of the violations that cost most, the earliest first; None where it has none.
+def _describe(result: TaskResult) -> dict[str, Any]:
+    """A finished rollout as JSON values, with the violations that cost most, the earliest first.
 
-    That is what made the score 0, else all that lowered it.
+    That is those of multipliers, else all.
     """
-    rows = {row["metric"]: row for row in result.metrics if row["metric"] in REASONS}
-    below = {name: row for name, row in rows.items() if row["score"] is None or row["score"] < 1.0}
-    costly = {name: row for name, row in below.items() if name in MULTIPLIERS} or below
-    times = {name: row["first_violation_s"] for name, row in costly.items()}
-    return dict(sorted(times.items(), key=lambda item: (item[1] is None, item[1] or 0.0)))
-
-
-def _words(violated: Mapping[str, float | None]) -> str:
-    parts = ((REASONS[name], seconds) for name, seconds in violated.items())
-    return ", ".join(words if at is None else f"{words} {at:.1f} s" for words, at in parts)
+    found = violations(result.metrics)
+    costly = [one for one in found if one.is_multiplier] or found
+    return {
+        **result.task._asdict(),
+        "score": 100.0 * float(result.scores["cls"]),
+        "why": ", ".join(map(str, costly)),
+        "at": costly[0].time if costly else None,
+    }
 
 
 class LiveServer(LocalServer):

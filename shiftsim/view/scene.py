@@ -12,9 +12,9 @@ import numpy as np
 import shapely
 
 from shiftsim.kernels import FloatArray
-from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES
+from shiftsim.metrics import SHORT_NAMES
 from shiftsim.report.palette import planner_styles
-from shiftsim.report.words import REASONS, violation_words
+from shiftsim.report.words import REASONS, violation_words, violations
 from shiftsim.sim.log import SimulationLog
 from shiftsim.view.pack import Quantised
 from shiftsim.world.layers import Layer
@@ -138,7 +138,7 @@ def describe_scene(replay: Replay) -> dict[str, Any]:
                 "cls": item.cls,
                 "colour": styles[item.planner].colour,
                 "marker": styles[item.planner].marker,
-                "violations": violations(item),
+                "violations": describe_violations(item),
                 "scores": _scores(item.metrics),
                 "degraded": int(item.log.degraded.sum()),
                 "tracks": _track_names(item.log.tracks) if own else None,
@@ -187,28 +187,24 @@ def _track_names(tracks: Tracks) -> list[str]:
     return [tracks.tokens[i] for i in _used(tracks)]
 
 
-def violations(item: Shown) -> list[dict[str, Any]]:
-    """First violations of scored metrics, by time; `words` say what happened."""
-    out = [
+def describe_violations(item: Shown) -> list[dict[str, Any]]:
+    """First violations of scored metrics as JSON values, by time; `words` say what happened."""
+    return [
         {
-            "metric": row["metric"],
-            "short": SHORT_NAMES[row["metric"]],
-            "multiplier": row["metric"] in MULTIPLIERS,
-            "t": row["first_violation_s"],
-            "value": _finite(row["first_violation_value"]),
-            "threshold": _finite(row["threshold"]),
-            "unit": row["unit"],
-            "partner": row["partner_token"],
-            "score": row["score"],
-            "words": violation_words(row, item.log.tracks),
+            "metric": one.row["metric"],
+            "short": one.short,
+            "multiplier": one.is_multiplier,
+            "t": one.time,
+            "value": _finite(one.row["first_violation_value"]),
+            "threshold": _finite(one.row["threshold"]),
+            "unit": one.row["unit"],
+            "partner": one.row["partner_token"],
+            "score": one.row["score"],
+            "words": violation_words(one.row, item.log.tracks),
         }
-        for row in item.metrics
-        if row["metric"] in SHORT_NAMES
-        and row["first_violation_s"] is not None
-        and row["score"] is not None
-        and row["score"] < 1.0
+        for one in violations(item.metrics)
+        if one.time is not None
     ]
-    return sorted(out, key=lambda found: found["t"])
 
 
 def _scores(metrics: Iterable[Mapping[str, Any]]) -> dict[str, float]:

@@ -40,6 +40,8 @@ _FPS = 10
 _KEY = "dotted: the recorded driver; red mark: where most of the score was lost"
 _FILM_DPI = 100
 _LARGEST = 6.0  # inches, of a single scene
+_EDITED = "#7b2fbf"  # as in replays
+_EDIT_WIDTH = 110  # characters of the words below the picture of an edit
 _WIDTH = 7.2  # inches, of a grid: the text of a paper in two columns
 
 
@@ -159,6 +161,43 @@ def draw_start(axes: Any, scenario: Scenario, extent: FloatArray) -> None:
     draw_others(axes, log, 0)
     draw_ego(axes, log, 0, RECORDED)
     draw_scale(axes, extent)
+
+
+def before_and_after(recorded: Scenario, edited: Scenario) -> Any:
+    """A matplotlib figure: both at the first iteration, tracks of the edit outlined.
+
+    Raises:
+        MissingExtraError: matplotlib is missing.
+    """
+    points = [recorded.expert[:, :2], edited.expert[:, :2]]
+    made = _edited_tracks(edited)
+    if len(made):
+        points.append(edited.tracks.poses[edited.iteration_rows[0], made, :2])
+    extent = extent_of_points(np.concatenate(points))
+    words = edited.script.words if edited.script else ()
+    lines = [part for line in words for part in wrap(line, _EDIT_WIDTH)]
+    figure, (both,) = panels(1, 2, extent)
+    for scenario, axes in zip((recorded, edited), both, strict=True):
+        draw_start(axes, scenario, extent)
+        axes.set_title(
+            f"{scenario.token}  {scenario.scenario_type}".replace("$", r"\$"), fontsize=9
+        )
+    tracks, row = edited.tracks, int(edited.iteration_rows[0])
+    x, y = tracks.poses[row, made, 0], tracks.poses[row, made, 1]
+    ring = {"s": 90, "facecolors": "none", "edgecolors": _EDITED, "linewidths": 1.4, "zorder": 8}
+    both[1].scatter(x, y, label="edited", **ring)
+    figure.supxlabel("\n".join(lines), fontsize=8)
+    add_legend(figure, both[1])
+    return figure
+
+
+def _edited_tracks(edited: Scenario) -> np.ndarray:
+    """Indices of the tracks that an edit made or changed and that are there at the start."""
+    script, row = edited.script, int(edited.iteration_rows[0])
+    names = set(script.tokens) if script else set()
+    there = edited.tracks.valid[row]
+    found = [name in names for name in edited.tracks.tokens]
+    return np.flatnonzero(there & np.array(found, np.bool_))
 
 
 def svg_of(figure: Any) -> str:

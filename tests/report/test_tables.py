@@ -11,8 +11,7 @@ from made_runs import METRICS, random_scores, write_run
 from shiftsim.benchmarks import known_sets, published
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES, WEIGHTS
-from shiftsim.report.about import CITED, runs_table
-from shiftsim.report.build import TABLES, Options, make_tables, write_report
+from shiftsim.report.build import CITED, TABLES, Options, make_tables, runs_table, write_report
 from shiftsim.report.details import (
     edited_scores,
     planner_comparison,
@@ -22,9 +21,16 @@ from shiftsim.report.details import (
 from shiftsim.report.groups import KnownSet, read_groups, token_digest
 from shiftsim.report.paper import noise_robustness, published_semantic, semantic_shift
 from shiftsim.report.scores import score_table, scores, summary
-from shiftsim.report.tables import Number, Table, shown
+from shiftsim.report.tables import (
+    FORMATS,
+    Number,
+    Table,
+    latex_escape,
+    markdown_escape,
+    render,
+    shown,
+)
 from shiftsim.report.words import LONG
-from shiftsim.report.writers import FORMATS, latex_escape, markdown_escape, render
 from shiftsim.runs.diff import diff_lines, diff_runs
 from shiftsim.runs.results import open_run
 
