@@ -47,8 +47,8 @@ def carl(
     from shiftsim.planners.learned.device import require_torch
 
     require_torch("training")
+    from shiftsim.train.folder import Settings
     from shiftsim.train.recipe import Training
-    from shiftsim.train.settings import Settings
 
     settings = Settings(
         store=store,

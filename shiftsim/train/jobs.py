@@ -9,9 +9,9 @@ import numpy as np
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.runs.workers import map_unordered
-from shiftsim.train.curves import Say
-from shiftsim.train.driving import Driven, Driver, Job, Start, State
-from shiftsim.train.settings import Settings
+from shiftsim.train.driving import Driven, Driver, Job, Start
+from shiftsim.train.folder import OnMessage, Settings
+from shiftsim.train.states import State
 
 NOISES = {  # how often states are collected under each
     "none": 0.4,
@@ -31,7 +31,7 @@ _BEGUN, _BEGUN_STEPS = 0.5, 75
 
 _SEE = "see whether `shiftsim run -p pdm-closed` works on the store"
 
-Show = Callable[[int, int], None]
+OnProgress = Callable[[int, int], None]  # gets how many of how many jobs are done
 
 
 class Towns(NamedTuple):
@@ -93,7 +93,9 @@ def collecting_jobs(
     return jobs
 
 
-def do(settings: Settings, checkpoint: str, jobs: list[Job], show: Show) -> list[Driven]:
+def run_jobs(
+    settings: Settings, checkpoint: str, jobs: list[Job], on_progress: OnProgress
+) -> list[Driven]:
     """Do jobs in worker processes; the results in the order of the jobs.
 
     Raises:
@@ -106,12 +108,18 @@ def do(settings: Settings, checkpoint: str, jobs: list[Job], show: Show) -> list
         if outcome.result is None:
             raise ConfigError(f"{outcome.death}", hint="go on with --resume")
         found[places[id(outcome.task)]] = outcome.result
-        show(len(found), len(jobs))
+        on_progress(len(found), len(jobs))
     return [found[place] for place in range(len(jobs))]
 
 
 def collect(
-    settings: Settings, towns: Towns, checkpoint: str, number: int, tau: float, show: Show, say: Say
+    settings: Settings,
+    towns: Towns,
+    checkpoint: str,
+    number: int,
+    tau: float,
+    on_progress: OnProgress,
+    on_message: OnMessage,
 ) -> Iterator[State]:
     """The labelled states of a round; PDM-Closed drives in the first if nobody else can."""
     random = np.random.default_rng([settings.seed, 2, number])
@@ -123,19 +131,25 @@ def collect(
         by_expert = number == 0 and not settings.checkpoint
         jobs = collecting_jobs(towns, needed, tau, random, by_expert=by_expert)
         before, failed = count, list[str]()
-        for driven in do(settings, checkpoint, jobs, show):
+        for driven in run_jobs(settings, checkpoint, jobs, on_progress):
             jobs_done += 1
             count += len(driven.states)
             failed += driven.failed
             yield from driven.states
         if failed:
-            say(f"{len(failed)} scenarios ended early, such as {failed[0]}")
+            on_message(f"{len(failed)} scenarios ended early, such as {failed[0]}")
         if count == before:
             raise DataError(f"no state could be collected: {failed[0]}", hint=_SEE)
 
 
 def mean_scores(
-    settings: Settings, towns: Towns, checkpoint: str, tau: float, *, by_expert: bool, show: Show
+    settings: Settings,
+    towns: Towns,
+    checkpoint: str,
+    tau: float,
+    *,
+    by_expert: bool,
+    on_progress: OnProgress,
 ) -> dict[str, float]:
     """Mean closed-loop score by noise, on towns that are left out."""
     sizes, jobs = [], []
@@ -143,7 +157,7 @@ def mean_scores(
         more = test_jobs(towns, settings.tests, noise, tau, by_expert=by_expert)
         sizes.append(len(more))
         jobs += more
-    done = do(settings, checkpoint, jobs, show)
+    done = run_jobs(settings, checkpoint, jobs, on_progress)
     halves = done[: sizes[0]], done[sizes[0] :]
     scores = [[score for driven in half for score in driven.scores] for half in halves]
     if not all(scores):
