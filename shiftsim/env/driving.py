@@ -232,7 +232,10 @@ class ProcessVectorEnv(AsyncVectorEnv):
     """Environments in a process each; an error in one of them, or its death, closes all."""
 
     def __init__(
-        self, makers: Sequence[Callable[[], DrivingEnv]], *, autoreset_mode: str | AutoresetMode
+        self,
+        makers: Sequence[Callable[[], gymnasium.Env[Any, Any]]],
+        *,
+        autoreset_mode: str | AutoresetMode,
     ) -> None:
         """Start the processes; forking is unsafe beside the threads of torch."""
         start = partial(super().__init__, context="spawn", autoreset_mode=autoreset_mode)
@@ -246,7 +249,7 @@ class ProcessVectorEnv(AsyncVectorEnv):
         """As Gymnasium's."""
         return self._close_on_error(super().step, actions)
 
-    def close_extras(self, **_: Any) -> None:
+    def close_extras(self, timeout: float | None = None, terminate: bool = True) -> None:
         """End the processes; there is nothing that they would have to write."""
         for process in self.processes:
             process.terminate()

@@ -6,13 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
 from shiftsim.errors import ConfigError, one_of
 from shiftsim.files import write_text
 from shiftsim.report import dataset, details, paper
 from shiftsim.report.figures import Figure
-from shiftsim.report.groups import Group, is_stand_in, made_up_note, weights_note
+from shiftsim.report.groups import Group, has_default_weights, synthetic_weights_note, weights_note
 from shiftsim.report.paper import Published
 from shiftsim.report.scores import scores
 from shiftsim.report.tables import ENDINGS, Table, latex_picture, markdown_escape, render
@@ -55,7 +54,7 @@ TABLES = (
     "benchmark-comparison",
     "runs",
 )
-_ASK = "the run must say --checkpoint PLANNER=shiftsim"
+_ASK_FOR_WEIGHTS = "the run must say --checkpoint PLANNER=shiftsim"
 _ABOUT_DATA = ("data-statistics", "benchmark-comparison", "runs")
 _LONG = ("planner-comparison-noise", *_ABOUT_DATA)
 BRIEF = tuple(name for name in TABLES if name not in _LONG)  # what a terminal shows
@@ -67,7 +66,7 @@ class Options:
 
     tables: tuple[str, ...] = TABLES  # kinds of tables, of `TABLES`
     by: str | None = None  # splits the rows of the score table further
-    beside: bool = False  # show the published figures as well
+    with_published: bool = False  # show the published figures as well
     allow_partial: bool = False  # show labelled means of incomplete groups
 
     def __post_init__(self) -> None:
@@ -87,20 +86,24 @@ def make_tables(
     """
     chosen = options or Options()
     partial = chosen.allow_partial
-    left_out = [group for group in groups if chosen.beside and is_stand_in(group)]
+    left_out = [group for group in groups if chosen.with_published and has_default_weights(group)]
     groups = [group for group in groups if group not in left_out]
-    stand_ins = weights_note(group.run for group in left_out)
+    default_weights = weights_note(group.run for group in left_out)
     if left_out and not groups:
-        raise ConfigError(f"nothing to show beside published figures: {stand_ins}", hint=_ASK)
-    beside = published if chosen.beside else None
+        raise ConfigError(
+            f"nothing to show beside published figures: {default_weights}", hint=_ASK_FOR_WEIGHTS
+        )
+    shown_published = published if chosen.with_published else None
     statistics = cache(lambda: dataset.own_statistics(groups))
     edited = {group.data.label for group in groups if group.data.edits}
     runs = list({group.run.path: group.run for group in groups}.values())
     makers: dict[str, Callable[[], Sequence[Table | None]]] = {
         "semantic-shift": lambda: paper.semantic_shift(
-            groups, published, beside=chosen.beside, allow_partial=partial
+            groups, published, with_published=chosen.with_published, allow_partial=partial
         ),
-        "noise-robustness": lambda: [paper.noise_robustness(groups, beside, allow_partial=partial)],
+        "noise-robustness": lambda: [
+            paper.noise_robustness(groups, shown_published, allow_partial=partial)
+        ],
         "edits": lambda: details.edited_scores(groups, allow_partial=partial),
         "planner-comparison": lambda: [details.planner_comparison(groups)],
         "planner-comparison-noise": lambda: [details.planner_comparison(groups, noisy=True)],
@@ -113,7 +116,11 @@ def make_tables(
         ),
         "runs": lambda: [runs_table(runs)],
     }
-    notes = [made_up_note(runs), weights_note(runs), stand_ins and f"left out: {stand_ins}; {_ASK}"]
+    notes = [
+        synthetic_weights_note(runs),
+        weights_note(runs),
+        default_weights and f"left out: {default_weights}; {_ASK_FOR_WEIGHTS}",
+    ]
     out: list[Table] = []
     for name in (name for name in TABLES if name in chosen.tables):
         for table in filter(None, makers[name]()):
@@ -154,17 +161,19 @@ def write_report(
             texts |= {f"{t.name}.csv": part for t, part in zip(tables, parts, strict=True)}
             continue
         if style == "html":
-            parts = [_page(title, report_html(runs, tables, _embedded(pictures)))]
+            coded = {path: base64.b64encode(path.read_bytes()).decode() for path in pictures}
+            images = {f"data:image/png;base64,{coded[p]}": t for p, t in pictures.items()}
+            parts = [_page(title, report_html(runs, tables, images))]
         elif style == "md":
-            images = [f"![{markdown_escape(t)}]({path.name})" for path, t in pictures.items()]
+            shown = [f"![{markdown_escape(t)}]({path.name})" for path, t in pictures.items()]
             head = [f"# {markdown_escape(title)}", markdown_escape(subtitle)]
-            parts = [*head, *parts, *images, f"```bibtex\n{cite}\n```"]
+            parts = [*head, *parts, *shown, f"```bibtex\n{cite}\n```"]
         elif style == "latex":
             files = {figure.save(folder, "pdf"): figure.title for figure in drawn}
             out += files
             texts[CITED] = cite
-            images = [latex_picture(path.name, t) for path, t in files.items()]
-            parts = [f"% {title}\n% {subtitle}\n% cite from {CITED}", *parts, *images]
+            shown = [latex_picture(path.name, t) for path, t in files.items()]
+            parts = [f"% {title}\n% {subtitle}\n% cite from {CITED}", *parts, *shown]
         else:
             parts = [f"{title}\n{subtitle}", *parts, cite]
         texts[f"report.{ENDINGS[style]}"] = "\n\n".join(parts)
@@ -204,12 +213,6 @@ def report_html(runs: Sequence[Run], tables: Sequence[Table], images: Mapping[st
     return "\n".join([STYLE, *parts])
 
 
-def _embedded(pictures: Mapping[Path, str]) -> dict[str, str]:
-    """Titles by addresses that hold the pictures themselves."""
-    coded = {path: base64.b64encode(path.read_bytes()).decode() for path in pictures}
-    return {f"data:image/png;base64,{coded[path]}": title for path, title in pictures.items()}
-
-
 def _page(title: str, body: str) -> str:
     """One HTML file."""
     words = html.escape(title)
@@ -247,7 +250,7 @@ def runs_table(runs: Sequence[Run]) -> Table:
         "date": _date,
         "rollouts finished": lambda run: "{ok} of {expected}".format(**run.manifest["counts"]),
         "scenarios": lambda run: f"split {run.manifest['split']}",
-        "store": lambda run: _store(run.manifest),
+        "store": _store,
         "traffic": lambda run: run.manifest["determining"]["traffic"],
         "controller": lambda run: run.manifest["determining"]["controller"],
         "thresholds": lambda run: run.manifest["determining"]["thresholds"]["name"],
@@ -280,9 +283,9 @@ def _package(run: Run, *, name: str) -> str:
     return str(run.manifest.get("versions", {}).get(name, ""))
 
 
-def _store(manifest: dict[str, Any]) -> str:
-    name = str(manifest["store"]).replace("\\", "/").rstrip("/").rpartition("/")[2]
-    return f"{name}, {_short(manifest['determining']['store'])}"
+def _store(run: Run) -> str:
+    name = str(run.manifest["store"]).replace("\\", "/").rstrip("/").rpartition("/")[2]
+    return f"{name}, {_short(run.manifest['determining']['store'])}"
 
 
 def _short(text: str) -> str:

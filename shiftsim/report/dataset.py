@@ -255,14 +255,10 @@ def benchmark_comparison(
     header = (
         "property",
         *published.sets,
-        *(f"{label} ({_kind(label in edited)})" for label in own),
+        *(f"{label} ({'own, edited' if label in edited else 'own'})" for label in own),
     )
     title = "Benchmarks compared"
     return Table("benchmark-comparison", title, header, tuple(rows), len(header), notes)
-
-
-def _kind(is_edited: bool) -> str:
-    return "own, edited" if is_edited else "own"
 
 
 def _property(name: str, stats: StoreStats, is_edited: bool) -> str:

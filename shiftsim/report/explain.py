@@ -120,7 +120,11 @@ def why(cls: float | None, metrics: list[dict[str, Any]]) -> str:
     parts = [row for row in scored if row["role"] == "weighted"]
     zero = [row for row in factors if row["score"] == 0.0]
     if zero:
-        causes = (f"{_cause(row['metric'])}{_first_violation(row)}" for row in zero)
+        causes = []
+        for row in zero:
+            is_dated = row["first_violation_iteration"] is not None
+            time = f" at {row['first_violation_s']:.1f} s{_partner(row)}" if is_dated else ""
+            causes.append(f"{in_words(row['metric'], REASONS)}{time}")
         return f"score 0 because of {' and '.join(causes)}"
     if cls == 0.0:
         return "score 0 because every weighted metric is 0"
@@ -128,18 +132,6 @@ def why(cls: float | None, metrics: list[dict[str, Any]]) -> str:
     terms = " + ".join(f"{row['weight']:g}·{row['score']:.4g}" for row in parts)
     total = sum(row["weight"] for row in parts)
     return f"{cls:.4f} = {product} × ({terms}) / {total:g}"
-
-
-def _cause(metric: str) -> str:
-    """What went wrong, as "at-fault collision (NCR)"."""
-    reason = REASONS.get(metric, metric)
-    return f"{reason} ({SHORT_NAMES[metric]})" if metric in SHORT_NAMES else reason
-
-
-def _first_violation(row: dict[str, Any]) -> str:
-    if row["first_violation_iteration"] is None:
-        return ""
-    return f" at {row['first_violation_s']:.1f} s{_partner(row)}"
 
 
 def _partner(row: dict[str, Any]) -> str:

@@ -112,10 +112,10 @@ class DataSet:
     def _part(self, duration: str) -> tuple["DataSet", BoolArray]:
         chosen = np.array([name in (duration, "") for name in self.durations], np.bool_)
         columns = ("tokens", "cities", "recordings", "types", "durations")
-        kept: dict[str, Any] = {
+        columns_of_part: dict[str, Any] = {
             name: tuple(compress(getattr(self, name), chosen.tolist())) for name in columns
         }
-        return replace(self, label=f"{self.label}, {duration}", **kept), chosen
+        return replace(self, label=f"{self.label}, {duration}", **columns_of_part), chosen
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +161,7 @@ def seed_deviation(values: FloatArray) -> float | None:
     return float(values.std(ddof=1)) if len(values) > 1 else None
 
 
-def made_up_note(runs: Iterable[Run]) -> str:
+def synthetic_weights_note(runs: Iterable[Run]) -> str:
     """Which planners drove with deterministic weights, so that no score of theirs is believed."""
     names = {
         name
@@ -176,16 +176,16 @@ def made_up_note(runs: Iterable[Run]) -> str:
 def weights_note(runs: Iterable[Run]) -> str:
     """Which planners drove with weights of our own, in place of their authors'."""
     identities = (run.manifest["determining"]["planners"].items() for run in runs)
-    said = {
+    notes = {
         f"{name}, {identity['weights']}"
         for items in identities
         for name, identity in items
         if isinstance(identity, dict) and identity.get("weights")
     }
-    return "; ".join(sorted(said))
+    return "; ".join(sorted(notes))
 
 
-def is_stand_in(group: Group) -> bool:
+def has_default_weights(group: Group) -> bool:
     """Whether a planner drove with weights of our own that nobody asked for by `--checkpoint`."""
     manifest = group.run.manifest
     name = group.planner.partition(" @")[0]
@@ -246,8 +246,8 @@ def _labelled_apart(groups: list[Group]) -> list[Group]:
     out = []
     for group in groups:
         values = zip(group.data.traits, zip(*kinds[group.data.label], strict=True), strict=True)
-        telling = [own for own, all_values in values if len(set(all_values)) > 1]
-        label = ", ".join([group.data.label, *telling])
+        differing = [value for value, all_values in values if len(set(all_values)) > 1]
+        label = ", ".join([group.data.label, *differing])
         out.append(replace(group, data=replace(group.data, label=label)))
     return out
 

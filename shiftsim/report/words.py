@@ -40,9 +40,9 @@ UNITS = {  # nuPlan's names, shortened
 }
 
 
-def in_words(metric: str) -> str:
+def in_words(metric: str, names: Mapping[str, str] = NAMES) -> str:
     """A metric as "no at-fault collision (NCR)"; one that is not scored by its name."""
-    return f"{NAMES[metric]} ({SHORT_NAMES[metric]})" if metric in NAMES else metric
+    return f"{names[metric]} ({SHORT_NAMES[metric]})" if metric in names else metric
 
 
 def legend(shorts: Iterable[str], words: Mapping[str, str] = LONG) -> str:

@@ -32,6 +32,7 @@ _BEGUN, _BEGUN_STEPS = 0.5, 75
 _SEE = "see whether `shiftsim run -p pdm-closed` works on the store"
 
 OnProgress = Callable[[int, int], None]  # gets how many of how many jobs are done
+RunJobs = Callable[[list[Job]], list[Driven]]  # `run_jobs` for some weights
 
 
 class Towns(NamedTuple):
@@ -94,9 +95,9 @@ def collecting_jobs(
 
 
 def run_jobs(
-    settings: Settings, checkpoint: str, jobs: list[Job], on_progress: OnProgress
+    settings: Settings, checkpoint: str, on_progress: OnProgress, jobs: list[Job]
 ) -> list[Driven]:
-    """Do jobs in worker processes; the results in the order of the jobs.
+    """Drive jobs in worker processes; the results in the order of the jobs.
 
     Raises:
         ConfigError: A worker died.
@@ -113,13 +114,7 @@ def run_jobs(
 
 
 def collect(
-    settings: Settings,
-    towns: Towns,
-    checkpoint: str,
-    number: int,
-    tau: float,
-    on_progress: OnProgress,
-    on_message: OnMessage,
+    settings: Settings, towns: Towns, number: int, tau: float, run: RunJobs, on_message: OnMessage
 ) -> Iterator[State]:
     """The labelled states of a round; PDM-Closed drives in the first if nobody else can."""
     random = np.random.default_rng([settings.seed, 2, number])
@@ -129,9 +124,8 @@ def collect(
         expected = count / jobs_done if jobs_done else _EXPECTED * float(np.mean(sizes))
         needed = int(np.ceil((wanted - count) / max(expected, 1.0)))
         by_expert = number == 0 and not settings.checkpoint
-        jobs = collecting_jobs(towns, needed, tau, random, by_expert=by_expert)
         before, failed = count, list[str]()
-        for driven in run_jobs(settings, checkpoint, jobs, on_progress):
+        for driven in run(collecting_jobs(towns, needed, tau, random, by_expert=by_expert)):
             jobs_done += 1
             count += len(driven.states)
             failed += driven.failed
@@ -143,22 +137,12 @@ def collect(
 
 
 def mean_scores(
-    settings: Settings,
-    towns: Towns,
-    checkpoint: str,
-    tau: float,
-    *,
-    by_expert: bool,
-    on_progress: OnProgress,
+    towns: Towns, count: int, tau: float, run: RunJobs, *, by_expert: bool
 ) -> dict[str, float]:
-    """Mean closed-loop score by noise, on towns that are left out."""
-    sizes, jobs = [], []
-    for noise in TESTED:
-        more = test_jobs(towns, settings.tests, noise, tau, by_expert=by_expert)
-        sizes.append(len(more))
-        jobs += more
-    done = run_jobs(settings, checkpoint, jobs, on_progress)
-    halves = done[: sizes[0]], done[sizes[0] :]
+    """Mean closed-loop score by noise, on `count` scenarios at most of towns that are left out."""
+    by_noise = [test_jobs(towns, count, noise, tau, by_expert=by_expert) for noise in TESTED]
+    done = run([job for jobs in by_noise for job in jobs])
+    halves = done[: len(by_noise[0])], done[len(by_noise[0]) :]
     scores = [[score for driven in half for score in driven.scores] for half in halves]
     if not all(scores):
         failed = [text for driven in done for text in driven.failed]

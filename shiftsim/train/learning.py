@@ -99,7 +99,8 @@ def _sum(parts: Iterable[BatchGradient]) -> BatchGradient:
     first, *others = parts
     loss, numbers = first.loss, first.numbers
     for other in others:
-        torch._foreach_add_(first.gradients, other.gradients)
+        for total, gradient in zip(first.gradients, other.gradients, strict=True):
+            total.add_(gradient)
         loss, numbers = loss + other.loss, numbers + other.numbers
     return BatchGradient(first.gradients, loss, numbers)
 
@@ -222,14 +223,11 @@ class Learner:
         rate = self._rate * schedule(self.step / self.total)
         apply_gradient(self.optimiser, self._trained, found, count, clip=CLIP, rate=rate)
         self.step += 1
-        self._average()
+        drift = 1.0 - min(AVERAGED, (1.0 + self.step) / (10.0 + self.step))
+        for name, value in self._parameters.items():
+            self.mean[name].lerp_(value.detach(), drift)
         means = (found.numbers / count).tolist()
         return StepResult(found.loss / count, (means[0], means[1]))
-
-    def _average(self) -> None:
-        keep = min(AVERAGED, (1.0 + self.step) / (10.0 + self.step))
-        means, now = list(self.mean.values()), [self._parameters[name] for name in self.mean]
-        torch._foreach_lerp_(means, [value.detach() for value in now], 1.0 - keep)
 
     def driving(self) -> Weights:
         """The network with the mean weights, which drives."""

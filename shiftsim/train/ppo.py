@@ -246,7 +246,8 @@ class Trainer:
             values = self.network.value(read, part["critic"])[:, 0]
             return ppo_loss(policy, values, part, critic_only=critic_only)
 
-        parameters, count = list(self.network.parameters()), len(order)
+        parameters: list[Tensor] = list(self.network.parameters())
+        count = len(order)
         found = self._pool.compute(parameters, count, loss_of_rows)
         rate = RATE * (1.0 - self.update / self.total)
         apply_gradient(self._optimiser, parameters, found, count, clip=CLIP_NORM, rate=rate)

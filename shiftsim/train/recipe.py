@@ -7,6 +7,7 @@ every two minutes.
 """
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -26,7 +27,7 @@ from shiftsim.train.folder import (
     write_state,
     write_table,
 )
-from shiftsim.train.jobs import OnProgress, Towns, collect, divide, mean_scores
+from shiftsim.train.jobs import RunJobs, Towns, collect, divide, mean_scores, run_jobs
 from shiftsim.train.learning import (
     BATCH,
     Learner,
@@ -128,16 +129,14 @@ class Training:
 
     def _choose_tau(self) -> float:
         """The tau with which PDM-Closed drives best through its labels, with and without noise."""
+        settings, rows = self._settings, self.progress.taus
         for tau in TAUS:
-            on_progress = self._on_progress(f"tau {tau:g} s")
-            found = mean_scores(
-                self._settings, self.towns, _NO_DRIVER, tau, by_expert=True, on_progress=on_progress
-            )
-            self.progress.taus.append({"tau": tau, **found})
+            run = self._run_jobs(_NO_DRIVER, f"tau {tau:g} s")
+            found = mean_scores(self.towns, settings.tests, tau, run, by_expert=True)
+            rows.append({"tau": tau, **found})
             self._on_message(f"tau {tau:g} s: {_in_words(found)}")
-        write_table(self._settings.out / "tau.parquet", self.progress.taus)
-        best = max(self.progress.taus, key=lambda row: sum(row.values()) - row["tau"])
-        return float(best["tau"])
+        write_table(settings.out / "tau.parquet", rows)
+        return float(max(rows, key=lambda row: sum(row.values()) - row["tau"])["tau"])
 
     def _collect(self) -> None:
         settings, progress = self._settings, self.progress
@@ -146,10 +145,9 @@ class Training:
             return
         drives = progress.round or settings.checkpoint
         checkpoint = str(settings.network) if drives else _NO_DRIVER
-        on_progress = self._on_progress(f"{self._where} collecting")
-        number, tau, towns = progress.round, progress.tau, self.towns
-        states = collect(settings, towns, checkpoint, number, tau, on_progress, self._on_message)
-        write_part(folder, states)
+        run = self._run_jobs(checkpoint, f"{self._where} collecting")
+        number, tau = progress.round, progress.tau
+        write_part(folder, collect(settings, self.towns, number, tau, run, self._on_message))
         self._write_state()
 
     def _train(self) -> None:
@@ -200,11 +198,8 @@ class Training:
         draw_curves(settings.out / "curves.png", progress.curve, progress.scores)
 
     def _scores(self, network: Path, where: str) -> dict[str, float]:
-        settings, tau = self._settings, self.progress.tau
-        on_progress = self._on_progress(f"{where} testing")
-        return mean_scores(
-            settings, self.towns, str(network), tau, by_expert=False, on_progress=on_progress
-        )
+        run, count = self._run_jobs(str(network), f"{where} testing"), self._settings.tests
+        return mean_scores(self.towns, count, self.progress.tau, run, by_expert=False)
 
     def _write_state(self) -> None:
         self.progress.seconds = monotonic() - self._began
@@ -215,7 +210,8 @@ class Training:
     def _where(self) -> str:
         return f"round {self.progress.round + 1} of {self._settings.rounds}:"
 
-    def _on_progress(self, what: str) -> OnProgress:
+    def _run_jobs(self, checkpoint: str, what: str) -> RunJobs:
+        """What drives jobs with some weights and says how far it is, now and then."""
         last = [monotonic()]
 
         def on_progress(done: int, total: int) -> None:
@@ -223,7 +219,7 @@ class Training:
                 last[0] = monotonic()
                 self._on_message(f"{what} {done} of {total} jobs")
 
-        return on_progress
+        return partial(run_jobs, self._settings, checkpoint, on_progress)
 
 
 def sum_of(row: dict[str, Any]) -> float:

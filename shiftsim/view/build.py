@@ -79,12 +79,12 @@ class Gallery:
     @property
     def tokens(self) -> list[str]:
         """Scenarios with rollouts to show, the lowest score first."""
-        found = [token for token, tasks in self._tokens.items() if self.choice.of(tasks)]
-        return sorted(found, key=lambda token: (self._lowest(token), token))
-
-    def _lowest(self, token: str) -> float:
-        tasks = self.choice.of(self._tokens[token])
-        return min(float(self._results(task)[0].get("cls", 1.0)) for task in tasks)
+        lowest = {
+            token: min(float(self._results(task)[0].get("cls", 1.0)) for task in chosen)
+            for token, tasks in self._tokens.items()
+            if (chosen := self.choice.of(tasks))
+        }
+        return sorted(lowest, key=lambda token: (lowest[token], token))
 
     def _results(self, task: Task) -> tuple[Mapping[str, Any], list[dict[str, Any]]]:
         """The rows of a rollout in `scores.parquet` and `metrics.parquet`; empty where none."""
@@ -110,10 +110,10 @@ class Gallery:
         if not found:
             there = zip(*self._tokens.get(token, []), strict=True)
             names = zip(("planners", "noise", "seeds"), there, strict=False)
-            kept = (f"{n}: {', '.join(map(str, dict.fromkeys(v)))}" for n, v in names)
+            available = (f"{n}: {', '.join(map(str, dict.fromkeys(v)))}" for n, v in names)
             raise ConfigError(
                 f"scenario {token!r} has no stored rollout with {self.choice}",
-                hint="; ".join(kept) or "--save-rollouts all keeps them",
+                hint="; ".join(available) or "--save-rollouts all keeps them",
             )
         return found[:MAX_ROLLOUTS]
 
@@ -212,20 +212,30 @@ def worst_table(rows: Sequence[Mapping[str, Any]], count: int = 10) -> str:
 
     In words, with links to that moment.
     """
+
+    def key(row: Mapping[str, Any]) -> tuple[Any, ...]:
+        names = (row["noise"] != "none", row["planner"], row["noise"], row["seed"])
+        return (row["cls"] or 0.0, row["token"], *names)
+
     by_page: dict[str, Mapping[str, Any]] = {}
-    for row in sorted((row for row in rows if (row["cls"] or 0.0) < 1.0), key=_lowest_first):
+    for row in sorted((row for row in rows if (row["cls"] or 0.0) < 1.0), key=key):
         by_page.setdefault(row["page"], row)
-    below = list(by_page.values())[:count]
-    if not below:
+    if not by_page:
         return ""
     lines = []
-    for row in below:
+    for row in list(by_page.values())[:count]:
         at = "" if row["at"] is None else f"t={row['at']:.2f}&amp;"
-        link = f'<a href="{row["page"]}#{at}focus={row["index"] + 1}">{_safe(row["token"])}</a>'
+        link = (
+            f'<a href="{row["page"]}#{at}focus={row["index"] + 1}">{html.escape(row["token"])}</a>'
+        )
         score = "–" if row["cls"] is None else f"{100.0 * row['cls']:.2f}"
         noise = row["noise"] if row["noise"] == "none" else f"{row['noise']}, seed {row['seed']}"
-        cells = (_safe(row["type"]), _safe(row["planner"]), _safe(noise), _what(row["violated"]))
-        inner = "".join(f"<td>{cell}</td>" for cell in (link, *cells))
+        times = [
+            (_WRONG[short], row["violated"][short]) for short in _WRONG if short in row["violated"]
+        ]
+        wrong = ", ".join(w if time is None else f"{w} {time:.1f}\u00a0s" for w, time in times)
+        texts = map(html.escape, (row["type"], row["planner"], noise))
+        inner = "".join(f"<td>{cell}</td>" for cell in (link, *texts, wrong))
         lines.append(f'<tr><td class="number">{score}</td>{inner}</tr>')
     names = ("scenario", "type", "planner", "noise", "what went wrong, first time")
     heads = "".join(f"<th>{name}</th>" for name in names)
@@ -234,21 +244,6 @@ def worst_table(rows: Sequence[Mapping[str, Any]], count: int = 10) -> str:
 <div class="wide" tabindex="0" role="region" aria-label="{title}"><table>
 <thead><tr><th class="number" title="closed-loop score (CLS)">score</th>{heads}</tr></thead>
 <tbody>{"".join(lines)}</tbody></table></div></section>"""
-
-
-def _lowest_first(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    key = (row["noise"] != "none", row["planner"], row["noise"], row["seed"])
-    return (row["cls"] or 0.0, row["token"], *key)
-
-
-def _what(violated: Mapping[str, float | None]) -> str:
-    """First violations in words, in the order of the metrics."""
-    known = [(words, violated[short]) for short, words in _WRONG.items() if short in violated]
-    return ", ".join(w if time is None else f"{w} {time:.1f}\u00a0s" for w, time in known)
-
-
-def _safe(text: str) -> str:
-    return html.escape(text)
 
 
 def galleries(runs: Sequence[Run], stores: Sequence[Any], choice: Choice) -> list[Gallery]:

@@ -258,8 +258,8 @@ def _rings(polygons: list[shapely.Polygon], box: FloatArray) -> list[FloatArray]
     if not polygons:
         return []
     clipped = shapely.clip_by_rect(np.array(polygons, object), *box)
-    whole = shapely.union_all(shapely.make_valid(clipped), grid_size=_MAP_STEP)
-    parts = shapely.get_parts(shapely.simplify(whole, _TOLERANCE))
+    union = shapely.union_all(shapely.make_valid(clipped), grid_size=_MAP_STEP)
+    parts = shapely.get_parts(shapely.simplify(union, _TOLERANCE))
     return [
         shapely.get_coordinates(ring)
         for part in parts
@@ -270,10 +270,10 @@ def _rings(polygons: list[shapely.Polygon], box: FloatArray) -> list[FloatArray]
 
 def _lines(lines: list[FloatArray], box: FloatArray) -> list[FloatArray]:
     """Lines inside the box, each once: neighbouring lanes share a boundary."""
-    made = [shapely.LineString(line) for line in lines if len(line) > 1]
-    if not made:
+    strings = [shapely.LineString(line) for line in lines if len(line) > 1]
+    if not strings:
         return []
-    clipped = shapely.clip_by_rect(np.array(made, object), *box)
+    clipped = shapely.clip_by_rect(np.array(strings, object), *box)
     parts = shapely.get_parts(shapely.simplify(clipped, _TOLERANCE))
     found = {part.normalize().wkb: part for part in parts if part.geom_type == "LineString"}
     return [coords for part in found.values() if len(coords := shapely.get_coordinates(part)) > 1]

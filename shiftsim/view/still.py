@@ -170,9 +170,9 @@ def before_and_after(recorded: Scenario, edited: Scenario) -> Any:
         MissingExtraError: matplotlib is missing.
     """
     points = [recorded.expert[:, :2], edited.expert[:, :2]]
-    made = _edited_tracks(edited)
-    if len(made):
-        points.append(edited.tracks.poses[edited.iteration_rows[0], made, :2])
+    changed = _edited_tracks(edited)
+    if len(changed):
+        points.append(edited.tracks.poses[edited.iteration_rows[0], changed, :2])
     extent = extent_of_points(np.concatenate(points))
     words = edited.script.words if edited.script else ()
     lines = [part for line in words for part in wrap(line, _EDIT_WIDTH)]
@@ -183,7 +183,7 @@ def before_and_after(recorded: Scenario, edited: Scenario) -> Any:
             f"{scenario.token}  {scenario.scenario_type}".replace("$", r"\$"), fontsize=9
         )
     tracks, row = edited.tracks, int(edited.iteration_rows[0])
-    x, y = tracks.poses[row, made, 0], tracks.poses[row, made, 1]
+    x, y = tracks.poses[row, changed, 0], tracks.poses[row, changed, 1]
     ring = {"s": 90, "facecolors": "none", "edgecolors": _EDITED, "linewidths": 1.4, "zorder": 8}
     both[1].scatter(x, y, label="edited", **ring)
     figure.supxlabel("\n".join(lines), fontsize=8)
@@ -233,14 +233,14 @@ def panels(rows: int, columns: int, extent: FloatArray) -> tuple[Any, Any]:
     height = width * sides[1] / sides[0]
     size = (width * columns + 0.4, (height + 0.1) * rows + 0.5)
     figure = new_figure(layout="compressed", figsize=size)
-    made = figure.subplots(rows, columns, squeeze=False)
-    for axes in made.flat:
+    grid_of_axes = figure.subplots(rows, columns, squeeze=False)
+    for axes in grid_of_axes.flat:
         axes.set_xlim(extent[0], extent[2])
         axes.set_ylim(extent[1], extent[3])
         axes.set_aspect("equal")
         axes.set_xticks([])
         axes.set_yticks([])
-    return figure, made
+    return figure, grid_of_axes
 
 
 def _width(columns: int, extent: FloatArray) -> float:

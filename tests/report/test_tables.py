@@ -227,7 +227,7 @@ def test_degraded_steps_are_counted(tmp_path):
 def test_published_rows_stand_beside_own_ones_of_the_same_cities(tmp_path):
     cities = ("Sindelfingen", "Berlin", "München", "Stuttgart")
     run = write_run(tmp_path / "a", planners=("pdm-closed",), cities=cities)
-    (table,) = semantic_shift(read_groups([run]), published(), beside=True)
+    (table,) = semantic_shift(read_groups([run]), published(), with_published=True)
     own = cells(table, "NR", "pdm-closed")
     theirs = cells(table, "NR", "PDM-Closed (published)")
     assert table.header[4:8] == ("SIFI", "MUC", "STR", "BER")
@@ -237,7 +237,9 @@ def test_published_rows_stand_beside_own_ones_of_the_same_cities(tmp_path):
 
 
 def test_published_rows_stand_alone_where_the_cities_are_others(tmp_path):
-    tables = semantic_shift(read_groups([write_run(tmp_path / "a")]), published(), beside=True)
+    tables = semantic_shift(
+        read_groups([write_run(tmp_path / "a")]), published(), with_published=True
+    )
     assert [t.name for t in tables] == ["semantic-shift_made-up", "semantic-shift_published"]
     assert cells(tables[1], "R", "CaRL (published)")["SFO"] == "87.67"
 

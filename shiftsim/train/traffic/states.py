@@ -3,6 +3,7 @@
 A label is what leads an agent back to its recorded drive, wherever its own has brought it.
 """
 
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -10,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shiftsim.geometry.boxes import wrap_angle
-from shiftsim.kernels import BoolArray, FloatArray, kernel
+from shiftsim.geometry.polylines import arc_lengths, point_on_polyline, project_on_polyline
+from shiftsim.kernels import BoolArray, FloatArray
 from shiftsim.sim.planner import rollout_rows
 from shiftsim.sim.traffic.learned.features import AHEAD, NUM_FEATURES, PATH, REACH
 from shiftsim.sim.traffic.learned.model import LAG, LearnedTraffic
@@ -148,7 +150,14 @@ def compute_labels(
     """
     known = np.zeros(len(poses), np.bool_)
     out = np.zeros((len(poses), 3))
-    _label(recorded.valid, recorded.poses, row, poses, speeds, known, out)
+    for agent in np.flatnonzero(recorded.valid[row] & ~np.isnan(poses[:, 0])).tolist():
+        valid = recorded.valid[:, agent]
+        last = _last_in_a_row(valid[row:]) + row
+        first = row - _last_in_a_row(valid[row::-1][: 2 * HORIZON + 1])
+        if last - row >= LEAST:
+            line = np.ascontiguousarray(recorded.poses[first : last + 1, agent, :2])
+            known[agent] = True
+            out[agent] = _label(line, row - first, poses[agent], float(speeds[agent]))
     need = np.where(
         closing[:, 1] > 0.0, closing[:, 1] ** 2 / (2.0 * np.maximum(closing[:, 0] - 1.0, 0.2)), 0.0
     )
@@ -157,64 +166,30 @@ def compute_labels(
     return Labels(known, *out.T)
 
 
-@kernel
+def _last_in_a_row(valid: BoolArray) -> int:
+    """Index of the last of the samples that are valid from the first one on."""
+    return len(valid) - 1 if valid.all() else int(np.argmin(valid)) - 1
+
+
 def _label(
-    valid: BoolArray,
-    recorded: FloatArray,
-    row: int,
-    poses: FloatArray,
-    speeds: FloatArray,
-    known: BoolArray,
-    out: FloatArray,
-) -> None:
-    """Write the labels (A, 3); arguments as in `labels_of`."""
-    for agent in range(len(poses)):
-        last = row
-        while last + 1 < len(valid) and valid[last + 1, agent]:
-            last += 1
-        x, y, heading = poses[agent]
-        if np.isnan(x) or not valid[row, agent] or last - row < LEAST:
-            continue
-        # the recorded way: where the agent stands on it now, and where it should be
-        first = row
-        while first > 0 and row - first < 2 * HORIZON and valid[first - 1, agent]:
-            first -= 1
-        best, here, length = np.inf, 0.0, 0.0
-        wanted_row = min(row + HORIZON, last)
-        wanted = 0.0
-        for knot in range(first, last):
-            ax, ay = recorded[knot, agent, 0], recorded[knot, agent, 1]
-            dx, dy = recorded[knot + 1, agent, 0] - ax, recorded[knot + 1, agent, 1] - ay
-            square = dx * dx + dy * dy
-            share = 0.0
-            if square > 0.0:
-                share = min(max(((x - ax) * dx + (y - ay) * dy) / square, 0.0), 1.0)
-            apart = (x - ax - share * dx) ** 2 + (y - ay - share * dy) ** 2
-            if apart < best:
-                best, here = apart, length + share * np.sqrt(square)
-            length += np.sqrt(square)
-            if knot + 1 == wanted_row:
-                wanted = length
-        span = (wanted_row - row) * _STEP
-        known[agent] = True
-        speed = speeds[agent]
-        out[agent, 0] = 2.0 * (wanted - here - speed * span) / (span * span)
-        if out[agent, 0] < 0.0:  # do not brake beyond standing
-            out[agent, 0] = max(out[agent, 0], -speed / 0.5)
-        ahead = max(LOOK_AHEAD * speed, NEAREST)
-        goal, passed = min(here + ahead, length), 0.0
-        if goal - here < 1.0:
-            continue
-        for knot in range(first, last):
-            ax, ay = recorded[knot, agent, 0], recorded[knot, agent, 1]
-            dx, dy = recorded[knot + 1, agent, 0] - ax, recorded[knot + 1, agent, 1] - ay
-            size = np.sqrt(dx * dx + dy * dy)
-            if passed + size >= goal and size > 0.0:
-                share = (goal - passed) / size
-                px, py = ax + share * dx - x, ay + share * dy - y
-                distance = max(np.hypot(px, py), 0.5)
-                angle = wrap_angle(np.arctan2(py, px) - heading)
-                out[agent, 1] = 2.0 * np.sin(angle) / distance
-                out[agent, 2] = distance
-                break
-            passed += size
+    line: FloatArray, row: int, pose: FloatArray, speed: float
+) -> tuple[float, float, float]:
+    """Acceleration, curvature and distance steered to that lead back to a recorded drive.
+
+    It has the positions `line` (V, 2), at `row` of which the agent should be; it is at `pose`.
+    """
+    x, y, heading = pose.tolist()
+    arc = arc_lengths(line, np.array([0, len(line)]))
+    here = project_on_polyline(line, arc, 0, len(line), x, y)
+    wanted_row = min(row + HORIZON, len(line) - 1)
+    span = (wanted_row - row) * _STEP
+    acceleration = 2.0 * (float(arc[wanted_row]) - here - speed * span) / (span * span)
+    if acceleration < 0.0:  # do not brake beyond standing
+        acceleration = max(acceleration, -speed / 0.5)
+    goal = min(here + max(LOOK_AHEAD * speed, NEAREST), float(arc[-1]))
+    if goal - here < 1.0:
+        return acceleration, 0.0, 0.0
+    px, py = point_on_polyline(line, arc, 0, len(line), goal)
+    distance = max(math.hypot(px - x, py - y), 0.5)
+    angle = wrap_angle(math.atan2(py - y, px - x) - heading)
+    return acceleration, 2.0 * math.sin(angle) / distance, distance
