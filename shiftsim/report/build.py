@@ -11,7 +11,13 @@ from shiftsim.errors import ConfigError, one_of
 from shiftsim.files import write_text
 from shiftsim.report import dataset, details, paper
 from shiftsim.report.figures import Figure
-from shiftsim.report.groups import Group, has_default_weights, synthetic_weights_note, weights_note
+from shiftsim.report.groups import (
+    Group,
+    has_default_weights,
+    planner_identities,
+    synthetic_weights_note,
+    weights_note,
+)
 from shiftsim.report.paper import Published
 from shiftsim.report.scores import scores
 from shiftsim.report.tables import ENDINGS, Table, latex_picture, markdown_escape, render
@@ -295,10 +301,8 @@ def _short(text: str) -> str:
 
 def _weights(run: Run) -> str:
     """What learned planners drove with: the label of the weights, or their hash."""
-    planners = run.manifest["determining"]["planners"]
     found = {
         name: str(identity.get("weights") or _short(str(identity.get("checkpoint", ""))))
-        for name, identity in planners.items()
-        if isinstance(identity, dict)
+        for name, identity in planner_identities(run).items()
     }
     return "; ".join(f"{name}: {words}" for name, words in found.items() if words)

@@ -9,7 +9,7 @@ import pyarrow.compute as pc
 from shiftsim.errors import ConfigError, beginning
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES, WEIGHTS
 from shiftsim.metrics.interplan import LANES, SORTS, role_of
-from shiftsim.report.words import COLLISIONS, REASONS, UNITS, in_words
+from shiftsim.report.words import COLLISIONS, REASONS, UNITS, in_words, task_of
 from shiftsim.runs.edited import edit_words
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
@@ -52,16 +52,16 @@ def select_tasks(
             f"run {run.path.name!r} has no task with {given}",
             hint="; ".join(f"{n}: {', '.join(map(str, config[n]))}" for n in _HAS),
         )
-    scores = {_key(row): row["cls"] for row in _rows_of(run.scores, full)}
+    scores = {task_of(row): row["cls"] for row in _rows_of(run.scores, full)}
     metrics: dict[Task, list[dict[str, Any]]] = {}
     for row in _rows_of(run.metrics, full):
-        metrics.setdefault(_key(row), []).append(row)
+        metrics.setdefault(task_of(row), []).append(row)
     for listed in metrics.values():
         _add_roles(listed)
     out, edits = [], edit_words(run.manifest, full)
     for row in rows:
-        known = sorted(metrics.get(_key(row), []), key=_place)
-        cls = scores.get(_key(row))
+        known = sorted(metrics.get(task_of(row), []), key=_place)
+        cls = scores.get(task_of(row))
         found = {"cls": cls, "why": why(cls, known), "edits": edits, "metrics": known}
         out.append({**row, **found})
     return out
@@ -136,10 +136,6 @@ def why(cls: float | None, metrics: list[dict[str, Any]]) -> str:
 
 def _partner(row: dict[str, Any]) -> str:
     return f", track {row['partner_token']}" if row["partner_token"] else ""
-
-
-def _key(row: dict[str, Any]) -> Task:
-    return Task(*(row[name] for name in Task._fields))
 
 
 def explain_lines(task: dict[str, Any]) -> list[str]:

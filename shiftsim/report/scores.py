@@ -25,7 +25,7 @@ from shiftsim.report.groups import (
     weights_note,
 )
 from shiftsim.report.tables import Cell, Number, Table, text
-from shiftsim.report.words import REASONS
+from shiftsim.report.words import REASONS, task_of
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
 
@@ -167,14 +167,11 @@ def worst_rollouts(run: Run, count: int = 10) -> list[dict[str, Any]]:
     rows = ordered.take(np.sort(firsts)[:count]).to_pylist()
     tokens = pa.array([row["token"] for row in rows], pa.string())
     metrics = run.metrics.filter(pc.is_in(run.metrics["token"], value_set=tokens)).to_pylist()
-    violated = {(_key(row), row["metric"]): row["first_violation_s"] for row in metrics}
+    violated = {(task_of(row), row["metric"]): row["first_violation_s"] for row in metrics}
     return [
-        {**_key(row)._asdict(), "cls": row["cls"], "reason": _reason(row, violated)} for row in rows
+        {**task_of(row)._asdict(), "cls": row["cls"], "reason": _reason(row, violated)}
+        for row in rows
     ]
-
-
-def _key(row: dict[str, Any]) -> Task:
-    return Task(*(row[name] for name in Task._fields))
 
 
 def _reason(row: dict[str, Any], violated: dict[tuple[Task, str], float | None]) -> str:
@@ -185,7 +182,7 @@ def _reason(row: dict[str, Any], violated: dict[tuple[Task, str], float | None])
     if not name or row[name] == 1.0:
         return ""
     words = REASONS[name] if below else f"{REASONS[name]} {row[name]:.2f}"
-    seconds = violated[_key(row), name]
+    seconds = violated[task_of(row), name]
     return words if seconds is None else f"{words} {seconds:.1f} s"
 
 

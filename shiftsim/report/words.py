@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES
+from shiftsim.runs.rollouts import Task
 from shiftsim.world.state import AgentKind, Tracks
 
 COLLISIONS = "no_ego_at_fault_collisions"
@@ -48,6 +49,11 @@ def in_words(metric: str, names: Mapping[str, str] = NAMES) -> str:
 def legend(shorts: Iterable[str], words: Mapping[str, str] = LONG) -> str:
     """What those of some headings mean that are short: "no at-fault collision (NCR), …"."""
     return ", ".join(f"{words[name]} ({name})" for name in shorts if name in words)
+
+
+def task_of(row: Mapping[str, Any]) -> Task:
+    """The task that a row of one of a run's tables is of."""
+    return Task(*(row[name] for name in Task._fields))
 
 
 def task_words(row: Mapping[str, Any]) -> str:

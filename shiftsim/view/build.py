@@ -11,7 +11,7 @@ import pyarrow as pa
 from shiftsim.errors import ConfigError, DataError, beginning
 from shiftsim.files import below, write_text
 from shiftsim.metrics import SHORT_NAMES
-from shiftsim.report.words import REASONS, violations, worst_violation
+from shiftsim.report.words import REASONS, task_of, violations, worst_violation
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
 from shiftsim.view.page import MAX_ROLLOUTS, POLICY, Page, data_element, framed, replay_page
@@ -266,5 +266,5 @@ def _by_task(table: pa.Table) -> dict[Task, list[dict[str, Any]]]:
     """The rows of each task."""
     out: dict[Task, list[dict[str, Any]]] = {}
     for row in table.to_pylist():
-        out.setdefault(Task(*(row[name] for name in Task._fields)), []).append(row)
+        out.setdefault(task_of(row), []).append(row)
     return out
