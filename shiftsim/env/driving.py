@@ -251,9 +251,10 @@ class ProcessVectorEnv(AsyncVectorEnv):
 
     def close_extras(self, timeout: float | None = None, terminate: bool = True) -> None:
         """End the processes; there is nothing that they would have to write."""
-        for process in self.processes:
+        processes = getattr(self, "processes", ())  # none where a setting was refused
+        for process in processes:
             process.terminate()
-        for process in self.processes:
+        for process in processes:
             process.join()
 
     def _close_on_error(self, call: Callable[..., Any], *arguments: Any) -> Any:

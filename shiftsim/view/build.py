@@ -15,7 +15,7 @@ from shiftsim.report.words import REASONS, task_of, violations, worst_violation
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
 from shiftsim.view.page import MAX_ROLLOUTS, POLICY, Page, data_element, framed, replay_page
-from shiftsim.view.scene import Shown
+from shiftsim.view.scene import ShownRollout
 
 _WRONG = {SHORT_NAMES[name]: reason for name, reason in REASONS.items()}  # in words, in their order
 
@@ -117,14 +117,16 @@ class Gallery:
             )
         return found[:MAX_ROLLOUTS]
 
-    def shown(self, token: str, scenario: Any) -> list[Shown]:
+    def shown(self, token: str, scenario: Any) -> list[ShownRollout]:
         """The rollouts of a page with what is known of them."""
         out = []
         for task in self.tasks(token):
             run, key = self._runs[task]
             score, metrics = self._results(task)
             log = run.rollout(key, scenario)
-            out.append(Shown(task.planner, task.noise, task.seed, log, score.get("cls"), metrics))
+            out.append(
+                ShownRollout(task.planner, task.noise, task.seed, log, score.get("cls"), metrics)
+            )
         return out
 
     def page(self, token: str, *, back: str = "") -> Page:

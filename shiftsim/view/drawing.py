@@ -14,7 +14,7 @@ from shiftsim.kernels import FloatArray
 from shiftsim.report.palette import AGENTS, ALARM, OTHER_AGENT, RECORDED, Style, dashes
 from shiftsim.report.words import violation_words, violations, worst_violation
 from shiftsim.sim.log import SimulationLog
-from shiftsim.view.scene import Shown, map_lines
+from shiftsim.view.scene import ShownRollout, map_lines
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import PACIFICA, AgentKind, center_poses
 
@@ -69,7 +69,7 @@ def draw_scale(axes: Any, extent: FloatArray) -> None:
     axes.annotate(f"{length} m", (x + length / 2.0, y), fontsize=SMALL, bbox=box, zorder=9, **place)
 
 
-def draw_paths(axes: Any, shown: Sequence[Shown], styles: Mapping[str, Style]) -> None:
+def draw_paths(axes: Any, shown: Sequence[ShownRollout], styles: Mapping[str, Style]) -> None:
     """The recorded driver's path, and those of the rollouts with what a legend says of them."""
     draw_recorded(axes, shown[0].log)
     for number, item in enumerate(shown):
@@ -86,7 +86,7 @@ def draw_recorded(axes: Any, log: SimulationLog) -> None:
     axes.plot(log.expert_ego[:, 0], log.expert_ego[:, 1], label="recorded driver", **dotted)
 
 
-def caption(item: Shown) -> str:
+def caption(item: ShownRollout) -> str:
     """Planner, noise, score, and what cost most of it, as "… at-fault collision (NCR) at 4.3 s"."""
     name = item.planner if item.noise == "none" else f"{item.planner}, {item.noise}"
     score = "" if item.cls is None else f": score {100.0 * item.cls:.0f}"
@@ -105,7 +105,9 @@ class Mark(NamedTuple):
     label: Any  # its words
 
 
-def draw_violation(axes: Any, item: Shown, style: Style, *, in_short: bool = False) -> Mark | None:
+def draw_violation(
+    axes: Any, item: ShownRollout, style: Style, *, in_short: bool = False
+) -> Mark | None:
     """A burst where the worst violation began, and what it was; `in_short` without numbers."""
     worst = worst_violation(violations(item.metrics))
     if worst is None or worst.time is None:
@@ -134,7 +136,7 @@ def draw_violation(axes: Any, item: Shown, style: Style, *, in_short: bool = Fal
 
 
 def draw_boxes(
-    axes: Any, shown: Sequence[Shown], row: int, styles: Mapping[str, Style]
+    axes: Any, shown: Sequence[ShownRollout], row: int, styles: Mapping[str, Style]
 ) -> list[Any]:
     """All that moves, at one sample: the others, and the egos of the rollouts."""
     drawn = draw_others(axes, shown[0].log, row)

@@ -27,7 +27,7 @@ from shiftsim.runs.rollouts import complete_rollout
 from shiftsim.runs.rollouts.columns import decode_rows
 from shiftsim.view.local import TOKEN_HEADER, LocalHandler, LocalServer
 from shiftsim.view.page import framed, replay_page
-from shiftsim.view.scene import Shown
+from shiftsim.view.scene import ShownRollout
 from shiftsim.world.scenario import Scenario
 
 _WORST, _FAILURES = 20, 50  # that the page lists
@@ -164,7 +164,7 @@ class LiveRun:
         scenario = self._read(result.task.token)
         log = complete_rollout(decode_rows(result.rollout), scenario, result.task)
         planner, noise, seed, _ = result.task
-        shown = Shown(planner, noise, seed, log, result.scores["cls"], result.metrics)
+        shown = ShownRollout(planner, noise, seed, log, result.scores["cls"], result.metrics)
         return replay_page(scenario, [shown])
 
 

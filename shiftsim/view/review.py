@@ -34,7 +34,7 @@ from shiftsim.view.page import framed
 from shiftsim.view.scene import (
     Fields,
     Replay,
-    Shown,
+    ShownRollout,
     describe_scene,
     indices_near,
     rollout_fields,
@@ -93,7 +93,7 @@ class ReviewService:
             DataError: The store has no such scenario.
         """
         recorded = self.store.read_recorded(token)
-        replay = Replay(recorded, [Shown("recorded", "none", 0, as_recorded(recorded))])
+        replay = Replay(recorded, [ShownRollout("recorded", "none", 0, as_recorded(recorded))])
         blocks = _blocks_near(replay)
         result = self._filter_results.get(token) or {}
         numbers = ("max_outside_m", "path_m", "progress_m", "first_violation_s", "partner_token")

@@ -33,7 +33,7 @@ _TOLERANCE = 0.05  # m, of simplified map lines
 
 
 @dataclass(frozen=True)
-class Shown:
+class ShownRollout:
     """One rollout in a replay."""
 
     planner: str  # its planner
@@ -49,7 +49,7 @@ class Replay:
     """A scenario and the rollouts of it that are shown together."""
 
     scenario: Scenario
-    shown: Sequence[Shown]
+    shown: Sequence[ShownRollout]
 
     @cached_property
     def box(self) -> FloatArray:
@@ -187,7 +187,7 @@ def _track_names(tracks: Tracks) -> list[str]:
     return [tracks.tokens[i] for i in _used(tracks)]
 
 
-def describe_violations(item: Shown) -> list[dict[str, Any]]:
+def describe_violations(item: ShownRollout) -> list[dict[str, Any]]:
     """First violations of scored metrics as JSON values, by time; `words` say what happened."""
     return [
         {

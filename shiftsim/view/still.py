@@ -29,7 +29,7 @@ from shiftsim.view.drawing import (
     draw_violation,
     spread_labels,
 )
-from shiftsim.view.scene import Shown
+from shiftsim.view.scene import ShownRollout
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 
@@ -48,7 +48,7 @@ _WIDTH = 7.2  # inches, of a grid: the text of a paper in two columns
 def save_figure(
     path: Path,
     scenario: Scenario,
-    shown: Sequence[Shown],
+    shown: Sequence[ShownRollout],
     *,
     at: Sequence[float] = (0.0,),
     in_grid: bool = False,
@@ -75,7 +75,7 @@ def save_figure(
         save_picture(still(scenario, shown, at=at[0]), path)
 
 
-def still(scenario: Scenario, shown: Sequence[Shown], *, at: float) -> Any:
+def still(scenario: Scenario, shown: Sequence[ShownRollout], *, at: float) -> Any:
     """A matplotlib figure of the moment `at` seconds from the start.
 
     Raises:
@@ -88,7 +88,9 @@ def still(scenario: Scenario, shown: Sequence[Shown], *, at: float) -> Any:
     return figure
 
 
-def _scene(scenario: Scenario, shown: Sequence[Shown], at: float) -> tuple[Any, Any, list[Mark]]:
+def _scene(
+    scenario: Scenario, shown: Sequence[ShownRollout], at: float
+) -> tuple[Any, Any, list[Mark]]:
     """Figure and axes with all that does not move, and the marks of violations."""
     extent = _extent_of(scenario, shown)
     figure, ((axes,),) = panels(1, 1, extent)
@@ -104,7 +106,7 @@ def _scene(scenario: Scenario, shown: Sequence[Shown], at: float) -> tuple[Any, 
     return figure, axes, marks
 
 
-def grid(scenario: Scenario, shown: Sequence[Shown], *, at: Sequence[float]) -> Any:
+def grid(scenario: Scenario, shown: Sequence[ShownRollout], *, at: Sequence[float]) -> Any:
     """A matplotlib figure with a row per rollout and a column per moment [s from the start].
 
     Raises:
@@ -214,7 +216,7 @@ def _sample_at(time_us: IntArray, at: float) -> int:
     return int(np.argmin(np.abs(times - at)))
 
 
-def _extent_of(scenario: Scenario, shown: Sequence[Shown]) -> FloatArray:
+def _extent_of(scenario: Scenario, shown: Sequence[ShownRollout]) -> FloatArray:
     paths = [scenario.expert[:, :2], *(item.log.ego[:, :2] for item in shown)]
     return extent_of_points(np.concatenate(paths))
 
@@ -282,7 +284,7 @@ def _heading(axes: Any, scenario: Scenario, time: float) -> None:
     axes.set_title(f"{_words(scenario)}  {time:.1f} s", fontsize=SMALL + 1)
 
 
-def _film(path: Path, scenario: Scenario, shown: Sequence[Shown]) -> None:
+def _film(path: Path, scenario: Scenario, shown: Sequence[ShownRollout]) -> None:
     """All samples, one after the other; a violation is marked from its first moment on."""
     figure, axes, marks = _scene(scenario, shown, 0.0)
     from matplotlib.animation import FFMpegWriter, PillowWriter

@@ -152,6 +152,7 @@ def test_an_error_in_a_process_is_that_error(toy):
         ({"num_workers": 3}, "3 workers for 2 environments"),
         ({"num_workers": 0}, "0 workers for 2 environments"),
         ({"reward": "regulr"}, "reward 'regulr' unknown"),
+        ({"num_workers": 2, "reward": "regulr"}, "reward 'regulr' unknown"),
     ],
 )
 def test_settings_that_are_wrong_are_named(toy, settings, message):
