@@ -3,16 +3,14 @@
 from collections.abc import Sequence
 from typing import Any
 
-import pyarrow as pa
 import pyarrow.compute as pc
 
 from shiftsim.errors import ConfigError, beginning
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES, WEIGHTS
 from shiftsim.metrics.interplan import LANES, SORTS, role_of
-from shiftsim.report.words import COLLISIONS, REASONS, UNITS, in_words, task_of
+from shiftsim.report.words import COLLISIONS, REASONS, UNITS, in_words, rows_by_task, task_of
 from shiftsim.runs.edited import edit_words
 from shiftsim.runs.results import Run
-from shiftsim.runs.rollouts import Task
 
 _HAS = ("planners", "noise", "seeds")
 
@@ -40,7 +38,7 @@ def select_tasks(
     wanted = {"planner": planner, "noise": noise, "seed": seed}
     rows = [
         row
-        for row in _rows_of(run.tasks, full)
+        for row in run.tasks.filter(pc.equal(run.tasks["token"], full)).to_pylist()
         if all(value is None or row[name] == value for name, value in wanted.items())
     ]
     if not rows:
@@ -52,18 +50,18 @@ def select_tasks(
             f"run {run.path.name!r} has no task with {given}",
             hint="; ".join(f"{n}: {', '.join(map(str, config[n]))}" for n in _HAS),
         )
-    scores = {task_of(row): row["cls"] for row in _rows_of(run.scores, full)}
-    metrics: dict[Task, list[dict[str, Any]]] = {}
-    for row in _rows_of(run.metrics, full):
-        metrics.setdefault(task_of(row), []).append(row)
-    for listed in metrics.values():
-        _add_roles(listed)
+    scores, metrics = (
+        rows_by_task(table.filter(pc.equal(table["token"], full)))
+        for table in (run.scores, run.metrics)
+    )
     out, edits = [], edit_words(run.manifest, full)
     for row in rows:
-        known = sorted(metrics.get(task_of(row), []), key=_place)
-        cls = scores.get(task_of(row))
-        found = {"cls": cls, "why": why(cls, known), "edits": edits, "metrics": known}
-        out.append({**row, **found})
+        task = task_of(row)
+        cls = scores[task][0]["cls"] if task in scores else None
+        listed = metrics.get(task, [])
+        _add_roles(listed)
+        listed.sort(key=_place)
+        out.append(row | {"cls": cls, "why": why(cls, listed), "edits": edits, "metrics": listed})
     return out
 
 
@@ -104,11 +102,6 @@ def explain_tasks(
     if not found:
         raise refused
     return found
-
-
-def _rows_of(table: pa.Table, token: str) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = table.filter(pc.equal(table["token"], token)).to_pylist()
-    return rows
 
 
 def why(cls: float | None, metrics: list[dict[str, Any]]) -> str:

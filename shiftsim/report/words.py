@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
 
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES
 from shiftsim.runs.rollouts import Task
@@ -54,6 +55,14 @@ def legend(shorts: Iterable[str], words: Mapping[str, str] = LONG) -> str:
 def task_of(row: Mapping[str, Any]) -> Task:
     """The task that a row of one of a run's tables is of."""
     return Task(*(row[name] for name in Task._fields))
+
+
+def rows_by_task(table: pa.Table) -> dict[Task, list[dict[str, Any]]]:
+    """The rows of each task in a run's table."""
+    out: dict[Task, list[dict[str, Any]]] = {}
+    for row in table.to_pylist():
+        out.setdefault(task_of(row), []).append(row)
+    return out
 
 
 def task_words(row: Mapping[str, Any]) -> str:

@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-
 from shiftsim.errors import ConfigError, DataError, beginning
 from shiftsim.files import below, write_text
 from shiftsim.metrics import SHORT_NAMES
-from shiftsim.report.words import REASONS, task_of, violations, worst_violation
+from shiftsim.report.words import REASONS, rows_by_task, violations, worst_violation
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
 from shiftsim.view.page import MAX_ROLLOUTS, POLICY, Page, data_element, framed, replay_page
@@ -70,8 +68,8 @@ class Gallery:
                 if place is not None:
                     planner = f"{task.planner} ({name})" if name else task.planner
                     self._runs[task._replace(planner=planner)] = (run, task)
-        self._scores = {run.path: _by_task(run.scores) for run in runs}
-        self._metrics = {run.path: _by_task(run.metrics) for run in runs}
+        self._scores = {run.path: rows_by_task(run.scores) for run in runs}
+        self._metrics = {run.path: rows_by_task(run.metrics) for run in runs}
         self._tokens: dict[str, list[Task]] = {}
         for task in self._runs:
             self._tokens.setdefault(task.token, []).append(task)
@@ -262,11 +260,3 @@ def _names(runs: Sequence[Run]) -> list[str]:
         return [""]
     traffic = [str(run.manifest["determining"]["traffic"]) for run in runs]
     return traffic if len(set(traffic)) == len(runs) else [run.path.name for run in runs]
-
-
-def _by_task(table: pa.Table) -> dict[Task, list[dict[str, Any]]]:
-    """The rows of each task."""
-    out: dict[Task, list[dict[str, Any]]] = {}
-    for row in table.to_pylist():
-        out.setdefault(task_of(row), []).append(row)
-    return out

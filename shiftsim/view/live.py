@@ -8,7 +8,6 @@ opened, and nothing is added to what the workers do.
 import json
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from http import HTTPStatus
 from threading import Event, Lock, Thread
 from time import monotonic
@@ -241,13 +240,11 @@ class _Handler(LocalHandler):
             self.refuse(HTTPStatus.NOT_FOUND, "no such page")
 
     def _replay(self, number: str) -> None:
-        page = None
-        with suppress(ValueError):
-            try:
-                page = self.server.run.replay(int(number))
-            except (ShiftsimError, OSError) as error:
-                self.refuse(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
-                return
+        try:
+            page = self.server.run.replay(int(number)) if number.isdecimal() else None
+        except (ShiftsimError, OSError) as error:
+            self.refuse(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
+            return
         if page is None:
             self.refuse(HTTPStatus.NOT_FOUND, "no longer one of the worst")
         else:
