@@ -26,6 +26,7 @@ class ShiftsimError(Exception):
     """
 
     def __init__(self, message: str, hint: str = "") -> None:
+        message = str(message)  # Gymnasium makes an error of an error
         if len(message) > _MAX_MESSAGE or "\n" in message:  # with texts of other libraries in it
             message = " ".join(message.split())
         if len(message) > _MAX_MESSAGE:

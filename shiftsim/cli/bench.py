@@ -154,7 +154,7 @@ def _report(plan: "Plan", *, published: bool, allow_partial: bool, as_json: bool
     from shiftsim.report.build import TABLES, Options, make_tables, write_report
     from shiftsim.report.groups import read_groups
     from shiftsim.report.scores import summary
-    from shiftsim.report.writers import FORMATS, render
+    from shiftsim.report.tables import FORMATS, render
 
     runs, own, extra = open_runs([plan.folder])
     groups = read_groups(runs, (*known_sets(), *own))

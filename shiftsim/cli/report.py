@@ -66,7 +66,7 @@ def report(
     from shiftsim.report.build import BRIEF, TABLES, Options, make_tables, write_report
     from shiftsim.report.groups import read_groups
     from shiftsim.report.scores import summary
-    from shiftsim.report.writers import FORMATS, render
+    from shiftsim.report.tables import FORMATS, render
 
     opened, own_lists, extra = open_runs(runs)
     if as_json:

@@ -129,8 +129,7 @@ def inspect(
     """Review scenarios in the browser: accept, reject, comment, correct the route."""
     from shiftsim.data.store.tables import REVIEW
     from shiftsim.runs.scenarios import open_named_store
-    from shiftsim.view.review.server import ReviewServer
-    from shiftsim.view.review.service import ReviewService
+    from shiftsim.view.review import ReviewServer, ReviewService
 
     path = open_named_store(store).path
     with ReviewServer(ReviewService(path, reviewer), port) as server:
