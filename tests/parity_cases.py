@@ -32,7 +32,8 @@ KINDS = {
     "route_correction": ["route_correction_*.json"],
     "network": ["state_dict.json|*.npz"],
     "dynamics": [
-        "bicycle_*.npz|lqr_commands.npz|closed_loop*.npz|idm_*.npz|idm_world_*.json|comfort_*.npz|ego_*.npz|traj*.npz"
+        "bicycle_*.npz|lqr_commands.npz|closed_loop*.npz|idm_*.npz|idm_world_*.json|comfort_*.npz"
+        "|ego_*.npz|traj*.npz"
     ],
     "dsc3d_sample": ["expected_rows.parquet", "data"],
     "dsc3d_synthetic": ["expected_ego_20hz.parquet|*/expected_ego_20hz.parquet"],
@@ -47,7 +48,10 @@ KINDS = {
     ],
 }
 # folders without a kind: where they are compared instead
-COMPARED_ELSEWHERE = {"paper": "published figures"}
+COMPARED_ELSEWHERE = {
+    "open_data": "compared by tests/data/readers/open_data/test_samples.py",
+    "paper": "published figures, compared by tests/benchmarks/test_tracks.py",
+}
 
 
 @dataclass

@@ -119,7 +119,8 @@ def test_the_core_works_without_torch():
     code = (
         "import sys; sys.modules['torch'] = None\n"
         "import shiftsim.runs.execute, shiftsim.runs.derive, shiftsim.report.explain\n"
-        "import shiftsim.planners.registry, shiftsim.data.store.reading, shiftsim.verify.experiment\n"
+        "import shiftsim.planners.registry, shiftsim.data.store.reading\n"
+        "import shiftsim.verify.experiment\n"
         "import shiftsim.cli.doctor\n"
         "print(shiftsim.cli.doctor._torch())\n"
     )

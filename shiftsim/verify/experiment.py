@@ -104,14 +104,14 @@ def verify_experiment(folder: Path, find: FindScenario, mode: str | None = None)
     Raises:
         DataError: There is no result folder, or nothing says what was simulated.
     """
-    made = {path.parent for name in _PARTS for path in folder.rglob(name) if path.is_dir()}
-    if not made:
+    folders = {path.parent for name in _PARTS for path in folder.rglob(name) if path.is_dir()}
+    if not folders:
         raise DataError(
             f"{folder}: no results of nuPlan are in this folder",
             hint=f"run_simulation.py makes a folder with {', '.join(_PARTS)}: name that one",
         )
     report = Report()
-    for path in sorted(made):
+    for path in sorted(folders):
         challenge = _challenge(path, mode)
         if mode in (None, challenge):
             _compare_results(path, challenge, find, report)

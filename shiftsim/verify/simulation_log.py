@@ -5,7 +5,6 @@ so. Every object becomes a plain record, whatever its class: nothing that a log 
 called. Classes that are not listed here are named as left out.
 """
 
-import gc
 import lzma
 import pickle
 from collections.abc import Iterable, Mapping, Sequence
@@ -161,8 +160,6 @@ def read_simulation_log(path: Path, report: Report) -> Recorded:
     Raises:
         DataError: It is damaged, or not as the known version of the devkit writes it.
     """
-    collects = gc.isenabled()
-    gc.disable()  # nothing can be collected while hundreds of thousands of objects are made
     try:
         reader = _LogReader(_unpacked(path))
         return _recorded(reader.load(), report, frozenset(reader.left_out))
@@ -170,9 +167,6 @@ def read_simulation_log(path: Path, report: Report) -> Recorded:
         raise DataError(f"{path}: {error}", OTHER_VERSION) from error
     except _BROKEN as error:
         raise DataError(f"{path}: not a readable simulation log ({error})", DAMAGED) from error
-    finally:
-        if collects:
-            gc.enable()
 
 
 def _unpacked(path: Path) -> bytes:

@@ -202,7 +202,7 @@ class Total:
                     if why := COMPARED_ELSEWHERE.get(path.name):
                         self.cases.note(f"{path.name}: {why}")
                     else:
-                        self.cases.skip(f"{path.name}: no comparison of this kind")
+                        self.cases.skip(f"{path.name}: no comparison yet")
         if not self.cases.num_cases:
             session.exitstatus = 1
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shiftsim.compat.nuplan.bridge.world import (
-    SeenTracks,
+    ObservedTracks,
     ego_state,
     traffic_lights,
     vehicle_parameters,
@@ -193,7 +193,7 @@ def _tracks():
 
 
 def test_objects_come_sorted_by_type_and_absent_ones_not_at_all():
-    seen = SeenTracks(START_US, _tracks()).tracked_objects
+    seen = ObservedTracks(START_US, _tracks()).tracked_objects
     assert [item.track_token for item in seen] == ["c", "b", "a"]
     vehicle, pedestrian, barrier = seen
     assert isinstance(vehicle, Agent)
@@ -218,7 +218,7 @@ def test_objects_come_sorted_by_type_and_absent_ones_not_at_all():
 
 
 def test_predictions_must_add_up_to_one():
-    agent = next(iter(SeenTracks(START_US, _tracks()).tracked_objects))
+    agent = next(iter(ObservedTracks(START_US, _tracks()).tracked_objects))
     with pytest.raises(ValueError, match="probabilit"):
         agent.predictions = [PredictedTrajectory(0.4, [None])]
     agent.predictions = [PredictedTrajectory(0.4, [None]), PredictedTrajectory(0.6, [None])]

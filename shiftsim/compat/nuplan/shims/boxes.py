@@ -175,9 +175,9 @@ class CarFootprint(OrientedBox):
     ) -> "CarFootprint":
         """From the pose of the rear axle, which is kept as it is."""
         distance = vehicle_parameters.rear_axle_to_center
-        made = cls(translate_longitudinally(rear_axle_pose, distance), vehicle_parameters)
-        made.__dict__["rear_axle"] = rear_axle_pose  # nuPlan computes it back, off by one bit
-        return made
+        footprint = cls(translate_longitudinally(rear_axle_pose, distance), vehicle_parameters)
+        footprint.__dict__["rear_axle"] = rear_axle_pose  # nuPlan computes it back, off by one bit
+        return footprint
 
     @classmethod
     def build_from_center(

@@ -99,17 +99,13 @@ class PolygonMapObject(AbstractMapObject):
 class PolylineMapObject(AbstractMapObject):
     """A line."""
 
-    def get_nearest_arc_length_from_position(self, point: Point2D) -> float:
-        """Where along the line the point nearest to another one is [m]."""
-        raise NotImplementedError
-
-    def get_curvature_at_arc_length(self, arc_length: float) -> float:
-        """Signed curvature [1/m]."""
-        raise NotImplementedError
+    get_nearest_arc_length_from_position: Any
+    get_curvature_at_arc_length: Any
 
     def get_nearest_curvature_from_position(self, point: Point2D) -> float:
         """Signed curvature where the line is nearest to a point [1/m]."""
-        return self.get_curvature_at_arc_length(self.get_nearest_arc_length_from_position(point))
+        arc_length = self.get_nearest_arc_length_from_position(point)
+        return float(self.get_curvature_at_arc_length(arc_length))
 
 
 class GraphEdgeMapObject(PolygonMapObject):

@@ -308,9 +308,9 @@ class AbstractPlanner(ABC):
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Any:
         """An instance whose times are counted, also where `__init__` does not call this class's."""
-        made = super().__new__(cls)
-        made._compute_trajectory_runtimes = []
-        return made
+        planner = super().__new__(cls)
+        planner._compute_trajectory_runtimes = []
+        return planner
 
     @abstractmethod
     def name(self) -> str:
