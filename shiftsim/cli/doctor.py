@@ -127,17 +127,16 @@ def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
     from shiftsim.kernels import CACHE_FOLDER
     from shiftsim.runs.config import default_workers
     from shiftsim.runs.manifest import versions
-    from shiftsim.verify.self_check import check_dynamics, check_metrics
+    from shiftsim.verify.report import Report
+    from shiftsim.verify.self_check import CHECKS, check_reference
 
-    began = perf_counter()
-    reports = []
-    advance(0, 3, "torch")
+    began, report = perf_counter(), Report()
+    advance(0, len(CHECKS) + 1, "torch")
     torch = _torch()
-    advance(1, 3, "dynamics")
-    reports.append(check_dynamics())
-    advance(2, 3, "metrics")
-    reports.append(check_metrics())
-    advance(3, 3, "")
+    for number, name in enumerate(CHECKS, start=1):
+        advance(number, len(CHECKS) + 1, name)
+        check_reference(name, report)
+    advance(len(CHECKS) + 1, len(CHECKS) + 1, "")
     return Diagnosis(
         versions=versions(),
         torch=torch,
@@ -146,8 +145,8 @@ def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
         workers=default_workers(),
         kernel_cache=CACHE_FOLDER or "none can be written",
         seconds=perf_counter() - began,
-        cases=sum(report.num_cases for report in reports),
-        mismatches=tuple(line for report in reports for line in report.mismatches),
+        cases=report.num_cases,
+        mismatches=tuple(report.mismatches),
     )
 
 

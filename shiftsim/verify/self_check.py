@@ -21,27 +21,6 @@ REFERENCE = PACKAGE / "verify" / "reference"
 _SIGNALS = ("heading", "vx", "ax", "ay", "omega", "alpha")
 
 
-def check_dynamics() -> Report:
-    """Compare vehicle model, tracker and comfort limits with `bicycle_steps.npz` and the others.
-
-    Raises:
-        DataError: A file is missing or damaged.
-    """
-    report = Report()
-    for name, check in (
-        ("bicycle_steps", _check_bicycle),
-        ("lqr_commands", _check_tracker),
-        ("comfort_signals", _check_comfort),
-    ):
-        path = REFERENCE / f"{name}.npz"
-        try:
-            with np.load(path, allow_pickle=False) as archive:
-                check(dict(archive), report)
-        except (OSError, BadZipFile, LookupError, ValueError) as error:
-            raise DataError(f"{path}: {error}", hint="install shiftsim again") from error
-    return report
-
-
 def _check_bicycle(arrays: Named, report: Report) -> None:
     state = np.empty(arrays["in_state"].shape[1])
     for case, (before, command, dt_us, after) in enumerate(
@@ -75,23 +54,38 @@ def _bounds(ends: np.ndarray) -> tuple[list[int], list[int]]:
     return ends[:-1].tolist(), ends[1:].tolist()
 
 
-def check_metrics() -> Report:
-    """Compare the scores of a recorded rollout, `metric_world.json`, under both profiles.
+def _check_metrics(world: Named, report: Report) -> None:
+    measured = measure(*read_world(world))
+    for name, profile in PROFILES.items():
+        theirs = world["expected"]["scores_default" if name == "nuplan" else f"scores_{name}"]
+        result = judge(measured, profile)
+        for metric, score in {**result.scores, "score": result.score}.items():
+            if score is not None:
+                atol = SCORES.get(metric, EXACT)
+                report.compare(f"score {metric}", name, score, theirs[metric], atol=atol)
+
+
+CHECKS = {
+    "bicycle_steps.npz": _check_bicycle,
+    "lqr_commands.npz": _check_tracker,
+    "comfort_signals.npz": _check_comfort,
+    "metric_world.json": _check_metrics,
+}
+
+
+def check_reference(name: str, report: Report) -> None:
+    """Compare with one file, a name in `CHECKS`.
 
     Raises:
         DataError: The file is missing or damaged.
     """
-    report, path = Report(), REFERENCE / "metric_world.json"
+    path = REFERENCE / name
     try:
-        world = json.loads(path.read_text("utf-8"))
-        measured = measure(*read_world(world))
-        for name, profile in PROFILES.items():
-            theirs = world["expected"]["scores_default" if name == "nuplan" else f"scores_{name}"]
-            result = judge(measured, profile)
-            for metric, score in {**result.scores, "score": result.score}.items():
-                if score is not None:
-                    atol = SCORES.get(metric, EXACT)
-                    report.compare(f"score {metric}", name, score, theirs[metric], atol=atol)
-    except (OSError, LookupError, ValueError) as error:
+        if path.suffix == ".json":
+            content = json.loads(path.read_text("utf-8"))
+        else:
+            with np.load(path, allow_pickle=False) as archive:
+                content = dict(archive)
+        CHECKS[name](content, report)
+    except (OSError, BadZipFile, LookupError, ValueError) as error:
         raise DataError(f"{path}: {error}", hint="install shiftsim again") from error
-    return report

@@ -98,9 +98,9 @@ class _LogReader(pickle.Unpickler):
                 raise ValueError(f"object number {argument} in a pickle of {len(content)} bytes")
         super().__init__(BytesIO(content), encoding="utf-8")
         self.left_out: set[str] = set()
-        self._classes: dict[tuple[str, str], type[_Record]] = {}
+        self._classes: dict[tuple[str, str], Any] = {}
 
-    def find_class(self, module: str, name: str) -> type[_Record]:
+    def find_class(self, module: str, name: str) -> Any:
         """A class of records for a name in the log."""
         is_known = name in _CLASSES and module.partition(".")[0] in ("nuplan", "numpy")
         if not is_known:

@@ -237,8 +237,19 @@ class TrackedObjects:
 # nuplan.planning.simulation.observation.observation_type
 
 
-_CAMERAS = ("F0", "B0", "L0", "L1", "L2", "R0", "R1", "R2")
-CameraChannel = Enum("CameraChannel", {f"CAM_{name}": f"CAM_{name}" for name in _CAMERAS})
+CameraChannel = Enum(
+    "CameraChannel",
+    {
+        "CAM_F0": "CAM_F0",
+        "CAM_B0": "CAM_B0",
+        "CAM_L0": "CAM_L0",
+        "CAM_L1": "CAM_L1",
+        "CAM_L2": "CAM_L2",
+        "CAM_R0": "CAM_R0",
+        "CAM_R1": "CAM_R1",
+        "CAM_R2": "CAM_R2",
+    },
+)
 LidarChannel = Enum("LidarChannel", {"MERGED_PC": "MergedPointCloud"})
 
 
