@@ -280,7 +280,7 @@ def one_run(source: Path, target: Path, scene: str, challenge: str) -> Path:
         *((compare_simulations, "ego", name) for name in ("x", "heading", "vx", "center_y")),
         *((compare_simulations, "ego", name) for name in ("ay", "tire_steering_rate")),
         (compare_simulations, "scores", "score"),
-        *((compare_metrics, "ego", name) for name in ("vx", "time_us", "center_heading")),
+        *((compare_metrics, "ego", name) for name in ("x", "time_us", "center_heading")),
         *((compare_metrics, "route", name) for name in ("center", "rear_left")),
         *((compare_metrics, "metrics", name) for name in ("category", "score")),
         *((compare_metrics, "statistics", name) for name in ("statistic", "unit", "value")),
