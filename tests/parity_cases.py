@@ -53,6 +53,9 @@ COMPARED_ELSEWHERE = {
     "paper": "published figures, compared by tests/benchmarks/test_tracks.py",
 }
 
+# of a known kind, but their files are not compared yet; --reference names them as not covered
+NOT_COMPARED_YET = {"pluto_vertex", "training"}
+
 
 @dataclass
 class Cases(Report):
