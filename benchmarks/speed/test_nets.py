@@ -21,6 +21,7 @@ from time import perf_counter, process_time
 
 import numpy as np
 import pytest
+from parity_cases import Scenes
 
 from shiftsim.benchmarks.speed import gpu
 from shiftsim.benchmarks.speed.conftest import median_seconds
@@ -30,7 +31,6 @@ from shiftsim.planners.learned.owner import InferenceClient, InferenceServer, ne
 from shiftsim.planners.registry import load_planner
 from shiftsim.processes import in_background
 from shiftsim.sim.loop import Rollout
-from shiftsim.verify.files import Scenes
 from shiftsim.world.state import center_poses
 
 pytest.importorskip("torch")

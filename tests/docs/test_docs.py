@@ -98,7 +98,6 @@ def material(tmp_path_factory: pytest.TempPathFactory) -> Path:
     golden = REPOSITORY / "tests" / "golden" / "nuplan_format"
     for name in ("logs", "maps"):
         shutil.copytree(golden / name, folder / "nuplan" / name)
-    shutil.copytree(REPOSITORY / "shiftsim" / "verify" / "reference", folder / "reference")
     _write_results(folder, golden.parent)
     if importlib.util.find_spec("torch"):
         from checkpoint_files import state_of, write_published
