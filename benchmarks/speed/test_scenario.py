@@ -9,6 +9,7 @@ from time import process_time
 
 import numpy as np
 import pytest
+from parity_cases import Scenes
 
 from shiftsim.data.demo.store import bench_scene
 from shiftsim.data.recording import EgoTrace, Recording, Window
@@ -23,7 +24,6 @@ from shiftsim.sim import loop
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.noise import parse_noise
 from shiftsim.sim.planner import HISTORY_SAMPLES, History, Observation, ObservationBuilder
-from shiftsim.verify.files import Scenes
 
 GOLDEN = Path(__file__).resolve().parents[2] / "tests" / "golden" / "nuplan.tar.xz"
 WHOLE_TARGET, SEALING_TARGET = 25e-3, 1e-6  # s

@@ -45,7 +45,7 @@ from shiftsim.metrics import MULTIPLIERS, PROFILES, SHORT_NAMES, WEIGHTS
 from shiftsim.planners.registry import PLANNERS
 from shiftsim.report.words import LONG
 from shiftsim.runs import config
-from shiftsim.runs.results import TABLES
+from shiftsim.runs.tables import TABLES
 
 DOCS = REPOSITORY / "docs"
 BLOCKS = [block for page in PAGES for block in read_blocks(page)]
@@ -98,7 +98,6 @@ def material(tmp_path_factory: pytest.TempPathFactory) -> Path:
     golden = REPOSITORY / "tests" / "golden" / "nuplan_format"
     for name in ("logs", "maps"):
         shutil.copytree(golden / name, folder / "nuplan" / name)
-    shutil.copytree(REPOSITORY / "shiftsim" / "verify" / "reference", folder / "reference")
     _write_results(folder, golden.parent)
     if importlib.util.find_spec("torch"):
         from checkpoint_files import state_of, write_published
@@ -313,7 +312,7 @@ def test_column_tables_are_those_of_the_files(page: Path, heading: str, table: p
 
 
 def test_verdicts_of_the_filter_are_described() -> None:
-    from shiftsim.runs.verdicts import SCHEMA
+    from shiftsim.runs.filter import SCHEMA
 
     rows = table_below(DOCS / "store_format.md", "### filter/verdicts.parquet")
     assert [row[:3] for row in rows] == _described(SCHEMA)

@@ -110,9 +110,9 @@ def write_results(folder: Path) -> None:
 
 def read_results(folder: Path) -> Any:
     """As `shiftsim verify --experiment` does it; what is found there is compared, not used."""
-    from shiftsim.verify.nuplan.experiment import _read
-    from shiftsim.verify.nuplan.simulation_log import read_simulation_log
+    from shiftsim.verify.experiment import _read
     from shiftsim.verify.report import Report
+    from shiftsim.verify.simulation_log import read_simulation_log
 
     report = Report()
     _read(folder, "scores", "scenario", report)
