@@ -9,15 +9,8 @@ import numpy as np
 import shapely
 
 from shiftsim.geometry.boxes import box_corners, circle_around, wrap_angle
-from shiftsim.geometry.polylines import (
-    CLEAR,
-    OPEN,
-    RUN,
-    Path,
-    is_run_near,
-    pose_before,
-    project,
-)
+from shiftsim.geometry.corridor import CLEAR, UNDECIDED, is_run_near
+from shiftsim.geometry.polylines import RUN, Path, pose_before, project
 from shiftsim.geometry.rings import (
     SLACK,
     point_segment_distance,
@@ -163,7 +156,7 @@ def _roll(
 
     Returns:
         Path and time index to go on from, and what must be known first: _TIED for the ranks, or
-        whether the corridor of the path holds something that is OPEN; _DONE where nothing is left.
+        whether the corridor of the path holds something that is UNDECIDED; _DONE where nothing is left.
     """
     begin, last = part.steps
     step = first_step
@@ -177,7 +170,7 @@ def _roll(
             if begin == 1:
                 _start(path, made, number, ego)
             fill_corridor(path, made.corridors, forecast, number, (begin + 1) // 2, last // 2 + 1)
-        sides, along = made.corridors.sides[number], made.corridors.progress[number]
+        sides, along = made.corridors.occupancy[number], made.corridors.progress[number]
         while step <= last:
             wanted = _follow_leads(
                 step,
@@ -268,7 +261,7 @@ def _follow_leads(
                 found, distance = _nearest(
                     hits, num_hits, along, progress, footprint, forecast, row, ranks
                 )
-                if found == _TIED or sides[found] == OPEN:
+                if found == _TIED or sides[found] == UNDECIDED:
                     return found
                 lead[0] = progress + distance
                 if found < num_boxes:

@@ -17,7 +17,8 @@ from worlds import (
 )
 
 from shiftsim.errors import ConfigError, PlannerError
-from shiftsim.geometry.polylines import HIT, OPEN, make_path
+from shiftsim.geometry.corridor import HIT, UNDECIDED
+from shiftsim.geometry.polylines import make_path
 from shiftsim.planners.pdm.corridor import corridor_shape, decide, fill_corridor, make_corridors
 from shiftsim.planners.pdm.forecast import make_forecast, ring_of, select_tracks
 from shiftsim.planners.pdm.parameters import DEFAULT, PdmParameters
@@ -191,13 +192,13 @@ def test_tracks_of_a_corridor_are_those_its_polygon_touches(seed):
     for first, last in ((1, 11), (11, 21)):
         fill_corridor(path, corridors, forecast, 0, first, last)
     polygon = corridor_shape(path, 10.3, 42.0, 1.1485)
-    for row, it in np.argwhere(corridors.sides[0] == OPEN).tolist():
+    for row, it in np.argwhere(corridors.occupancy[0] == UNDECIDED).tolist():
         decide(polygon, corridors, forecast, 0, row, it)
     for row in range(1, 21):
         touches = [
             polygon.intersects(shapely.Polygon(ring_of(forecast, i, row))) for i in range(40)
         ]
-        np.testing.assert_array_equal(corridors.sides[0, row] == HIT, touches)
+        np.testing.assert_array_equal(corridors.occupancy[0, row] == HIT, touches)
 
 
 def test_the_nearest_of_each_kind_are_seen_static_objects_first():
