@@ -215,8 +215,8 @@ class Idm:
         objects = objects_around(observation.history.tracks, centers[0], red)
         count = len(objects.speeds)
         apart, footprint = np.empty(count), np.empty((4, 2))
-        known = np.full((STEPS, count), UNKNOWN)
-        step = 0
+        known, step = np.full((STEPS, count), UNKNOWN), 0
+        trees: dict[tuple[int, ...], shapely.STRtree] = {}
         while True:
             step, lead = _roll_on(
                 step, path.driven, objects, policy, centers, motion, apart, known, footprint
@@ -224,15 +224,16 @@ class Idm:
             if lead == _DONE:
                 break
             unsure = np.flatnonzero(known[step] == UNDECIDED) if lead == _TIED else [lead]
-            line = sub_path(path.driven, *_reach(path.driven, motion[step, 0], policy))
-            corridor = corridor_polygon(shapely.LineString(line[:, :2]), 0.5 * policy.width)
-            corridor = corridor.union(shapely.Polygon(footprint))
+            if len(unsure):
+                line = sub_path(path.driven, *_reach(path.driven, motion[step, 0], policy))
+                corridor = corridor_polygon(shapely.LineString(line[:, :2]), 0.5 * policy.width)
+                corridor = corridor.union(shapely.Polygon(footprint))
             for index in unsure:
                 ring = objects.xy[objects.ptr[index] : objects.ptr[index + 1]]
                 touches = corridor.intersects(shapely.Polygon(ring))
                 known[step, index] = HIT if touches else CLEAR
             if lead == _TIED:
-                keep_one_overlap(objects, known[step], footprint)
+                keep_one_overlap(objects, known[step], footprint, trees)
         centers[0] = pose_at(path.driven, start)
         centers[0, 2] = wrap_angle(centers[0, 2])
         return centers, motion[:, 1]
@@ -334,10 +335,10 @@ def _roll_on(
         progress, speed, heading = motion[step, 0], motion[step, 1], centers[step, 2]
         box_corners(centers[step, 0], centers[step, 1], heading, length, policy.width, footprint)
         low, high = _reach(path, progress, policy)
-        stretch = sub_path(path, low, high)
-        line, runs = np.empty((len(stretch), 2)), np.empty((runs_of(len(stretch)), 4))
-        for vertex in range(len(stretch)):
-            line[vertex, 0], line[vertex, 1] = stretch[vertex, 0], stretch[vertex, 1]
+        poses = sub_path(path, low, high)
+        line, runs = np.empty((len(poses), 2)), np.empty((runs_of(len(poses)), 4))
+        for vertex in range(len(poses)):
+            line[vertex, 0], line[vertex, 1] = poses[vertex, 0], poses[vertex, 1]
         bound_runs(line, runs)
         begin, end = without_repeats(line, 0, len(line))
         corridor = Corridor(line, runs, begin, end, half_width)

@@ -59,7 +59,7 @@ def decide(
     row: int,
     it: int,
 ) -> None:
-    """Decide by the polygon of a path's corridor what is UNDECIDED; what stands still, for all rows."""
+    """Decide by the polygon of a path's corridor what is UNDECIDED; what stands, for all rows."""
     answer = HIT if polygon.intersects(shapely.Polygon(ring_of(forecast, it, row))) else CLEAR
     stands = it >= len(forecast.moves) or not forecast.moves[it]
     rows = (

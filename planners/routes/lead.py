@@ -58,16 +58,23 @@ def find_lead(footprint: FloatArray, objects: Objects, occupancy: IntArray) -> t
     return found, best_gap
 
 
-def keep_one_overlap(objects: Objects, occupancy: IntArray, footprint: FloatArray) -> None:
+def keep_one_overlap(
+    objects: Objects,
+    occupancy: IntArray,
+    footprint: FloatArray,
+    trees: dict[tuple[int, ...], shapely.STRtree],
+) -> None:
     """Keep one of the objects that the footprint (4, 2) overlaps; the others become CLEAR.
 
-    No entry of `occupancy` (M,) may be UNDECIDED.
+    No entry of `occupancy` (M,) may be UNDECIDED. `trees` keeps the indices of these objects.
     """
     # nuPlan rule 159: the index of what is in the corridor answers with the first that it finds
-    present = np.flatnonzero(occupancy != CLEAR)
-    xy, ptr = objects.xy, objects.ptr
-    tree = shapely.STRtree([shapely.Polygon(xy[ptr[i] : ptr[i + 1]]) for i in present])
-    lead = present[tree.nearest(shapely.polygons(footprint))]
+    present, xy, ptr = tuple(np.flatnonzero(occupancy != CLEAR).tolist()), objects.xy, objects.ptr
+    if present not in trees:
+        trees[present] = shapely.STRtree(
+            [shapely.Polygon(xy[ptr[i] : ptr[i + 1]]) for i in present]
+        )
+    lead = present[trees[present].nearest(shapely.polygons(footprint))]
     overlapping = np.flatnonzero(occupancy == OVERLAPPING)
     occupancy[overlapping[overlapping != lead]] = CLEAR
 

@@ -7,7 +7,13 @@ rear-right, front-right.
 
 import numpy as np
 
-from shiftsim.geometry.rings import EXTERIOR, locate_in_ring, segments_intersect
+from shiftsim.geometry.rings import (
+    EXTERIOR,
+    SLACK,
+    convex_intersect,
+    locate_in_ring,
+    segments_intersect,
+)
 from shiftsim.kernels import FloatArray, kernel
 
 # rad, bearings from the rear axle that at-fault tests compare with
@@ -32,6 +38,23 @@ def circle_around(box: FloatArray) -> tuple[float, float, float]:
     """Centre and radius of a circle around a box (4, 2), a little larger than it [m]."""
     x, y = 0.5 * (box[0, 0] + box[2, 0]), 0.5 * (box[0, 1] + box[2, 1])
     return x, y, np.hypot(box[0, 0] - x, box[0, 1] - y) + 1e-6
+
+
+@kernel
+def boxes_touch(a: FloatArray, b: FloatArray) -> bool:
+    """Whether two boxes (4, 2) share a point; touching counts."""
+    # most that are near one another are clearly apart along an axis of the first
+    x, y = 0.5 * (a[0, 0] + a[2, 0]), 0.5 * (a[0, 1] + a[2, 1])
+    for axis in range(1, 4, 2):
+        axis_x, axis_y = a[0, 0] - a[axis, 0], a[0, 1] - a[axis, 1]
+        size = np.sqrt(axis_x * axis_x + axis_y * axis_y)
+        least, most = np.inf, -np.inf
+        for corner in range(4):
+            along = axis_x * (b[corner, 0] - x) + axis_y * (b[corner, 1] - y)
+            least, most = min(least, along), max(most, along)
+        if max(least, -most) > size * (0.5 * size + SLACK):
+            return False
+    return convex_intersect(a, b)
 
 
 @kernel

@@ -13,7 +13,7 @@ import shapely
 
 from shiftsim.errors import DataError
 from shiftsim.kernels import FloatArray, IntArray
-from shiftsim.metrics import DEEPPLAN, NUPLAN, Measurements, MetricResult, judge, measure
+from shiftsim.metrics import DEEPPLAN, NUPLAN, Measurements, MetricResult, evaluate, measure
 from shiftsim.metrics.collision import at_fault_counts
 from shiftsim.metrics.comfort import BOUNDED_SIGNALS, within_bounds
 from shiftsim.sim.log import SimulationLog, as_recorded
@@ -181,7 +181,7 @@ def _compare_world(world: Source, where: str) -> None:
     report.compare("kind of edges and their roadblocks", where, kinds, is_connector)
     expected, measured, flags = world.each("expected")[0], measure(log, road), {}
     for name, profile in (("deepplan", DEEPPLAN), ("default", NUPLAN)):
-        scores, result = expected.each(f"scores_{name}")[0], judge(measured, profile)
+        scores, result = expected.each(f"scores_{name}")[0], evaluate(measured, profile)
         scores.match(f"{where} {name}", known_scores(result), SCORE_TOLERANCES, quantity="score")
         flags[name] = within_bounds(measured.comfort, profile)
     order = list(BOUNDED_SIGNALS.values())

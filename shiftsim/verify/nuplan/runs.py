@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from shiftsim.errors import DataError
-from shiftsim.metrics import MetricResult, judge, measure
+from shiftsim.metrics import MetricResult, evaluate, measure
 from shiftsim.planners.registry import PLANNERS, load_planner
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import simulate
@@ -78,7 +78,7 @@ def verify_nuplan_metrics(
             for name, rows in TABLES.items():
                 rows.match(tables[name][run], " ".join(run), **names)
             for thresholds, profile in PROFILES.items():
-                result = judge(measured, profile)
+                result = evaluate(measured, profile)
                 _compare_profile((*run, thresholds), result, entry, tables)
                 if profile == "nuplan":
                     _compare_series(run, result, tables["time_series"])
@@ -151,7 +151,7 @@ def verify_simulation(
                 objects.match(key, _objects(log, replayed[scene, "NR", "*"]), quantity="reactive")
             measured = measure(log, scenes[scene].map)
             for thresholds, profile in PROFILES.items():
-                rated = worlds.known_scores(judge(measured, profile))
+                rated = worlds.known_scores(evaluate(measured, profile))
                 columns = {name: [score] for name, score in rated.items()}
                 scores.match((*key, thresholds), columns, quantity="simulated score")
     if report.mode in (None, "R"):

@@ -106,7 +106,7 @@ def _path(case: Source, where: str) -> None:
     poses, queries = case.take("vertices", -1, 3), case.take("query_s", -1)
     path, at = make_path(poses), np.empty((len(queries), 3))
     for progress, pose in zip(queries.tolist(), at, strict=True):
-        rollout.read_pose(path, progress, np.full(3, np.nan), pose)
+        rollout.read_pose(path, progress, pose)
     projection = [project(path, *xy, 0)[0] for xy in case.take("query_xy", -1, 2).tolist()]
     ours: dict[str, Any] = {"progress": path.progress, "projection": projection, "poses": at}
     ours["offset_m"] = routes.offset_poses(poses, -1.0)

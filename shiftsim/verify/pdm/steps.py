@@ -11,7 +11,7 @@ from shiftsim.kernels import BoolArray, FloatArray
 from shiftsim.planners.pdm import forecast as around
 from shiftsim.planners.pdm.parameters import DEFAULT
 from shiftsim.planners.pdm.planner import PdmClosed, Seen
-from shiftsim.planners.pdm.scorer import TTC_STEPS, Place, Scores, score, weigh
+from shiftsim.planners.pdm.scorer import TTC_STEPS, Place, Scores, score, weighted_mean
 from shiftsim.planners.pdm.step import Step, choose
 from shiftsim.planners.proposals.areas import areas_of
 from shiftsim.planners.proposals.contacts import Obstacles
@@ -133,7 +133,9 @@ def _settled(where: str, seen: Seen, step: Step, theirs: Source) -> Scores:
         ttc, ttc_index = np.where(rows, (other.ttc, index), (ours.ttc, ours.ttc_index))
         ours = ours._replace(ttc=ttc, ttc_index=ttc_index)
     factor = ours.no_collision * ours.drivable * ours.direction
-    return ours._replace(total=factor * weigh(ours.progress, ours.ttc, ours.comfort, DEFAULT))
+    return ours._replace(
+        total=factor * weighted_mean(ours.progress, ours.ttc, ours.comfort, DEFAULT)
+    )
 
 
 def _in_line(states: FloatArray, others: Obstacles) -> BoolArray:

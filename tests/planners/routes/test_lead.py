@@ -42,5 +42,5 @@ def test_of_two_objects_that_are_touched_the_lower_one_leads_whatever_their_orde
     low, high, far = (footprint + shift for shift in ((1.0, -1.0), (-1.0, 1.0), (30.0, -9.0)))
     for rings, lead in (([high, far, low], 2), ([low, far, high], 0)):
         occupancy = np.array([OVERLAPPING, HIT, OVERLAPPING])
-        keep_one_overlap(objects_of(rings), occupancy, footprint)
+        keep_one_overlap(objects_of(rings), occupancy, footprint, {})
         assert occupancy.tolist() == [{1: HIT, lead: OVERLAPPING}.get(i, CLEAR) for i in range(3)]
