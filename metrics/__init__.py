@@ -1,7 +1,7 @@
 """Closed-loop metrics and the score of one rollout, from its arrays and the map alone.
 
-`compute_metrics` is `evaluate(measure(log, road), thresholds)`: the geometry is measured once, and any
-number of threshold profiles can be applied to it.
+`compute_metrics` is `evaluate(measure(log, road), thresholds)`: the geometry is measured once, and
+any number of threshold profiles can be applied to it.
 """
 
 from collections.abc import Callable, Sequence

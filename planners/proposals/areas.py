@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 
 from shiftsim.geometry.polylines import RUN
-from shiftsim.geometry.rings import ray_crossings
+from shiftsim.geometry.rings import ray_crossings, ring_bounds
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.per_map import PerMap
 from shiftsim.world.layers import Polygons, index_polygons, meeting, square_around
@@ -80,24 +80,31 @@ def select_areas(road: VectorMap, x: float, y: float, half_width: float) -> IntA
 
 
 @kernel
-def holds(
-    polygons: Polygons, run_ptr: IntArray, runs: FloatArray, area: int, x: float, y: float
-) -> bool:
-    """Whether an area holds a point in its interior; `run_ptr` and `runs` as in `Areas`."""
-    is_inside = False
+def held_points(
+    polygons: Polygons, run_ptr: IntArray, runs: FloatArray, area: int, points: FloatArray
+) -> int:
+    """Which of some points (K, 2) an area holds in its interior, one bit each.
+
+    `run_ptr` and `runs` are those of `Areas`.
+    """
+    low_x, low_y, _, high_y = ring_bounds(points)
+    inside = on_boundary = 0
     for ring in range(polygons.poly_ptr[area], polygons.poly_ptr[area + 1]):
         first, end = polygons.ring_ptr[ring], polygons.ring_ptr[ring + 1]
         for run in range(run_ptr[ring], run_ptr[ring + 1]):
-            if y < runs[run, 0] or y > runs[run, 1] or x > runs[run, 2]:
-                continue  # most often: no edge of the run is met by a ray to +x
+            if high_y < runs[run, 0] or low_y > runs[run, 1] or low_x > runs[run, 2]:
+                continue  # most often: no ray from a point to +x meets an edge of the run
             start = first + RUN * (run - run_ptr[ring])
             before = start - 1 if start > first else end - 1
             stop = min(start + RUN, end)
-            parity, on_edge = ray_crossings(polygons.xy, before, start, stop, x, y)
-            if on_edge:
-                return False
-            is_inside = is_inside != parity
-    return is_inside
+            for point in range(len(points)):
+                x, y = points[point, 0], points[point, 1]
+                is_odd, on_edge = ray_crossings(polygons.xy, before, start, stop, x, y)
+                if on_edge:
+                    on_boundary |= 1 << point
+                elif is_odd:
+                    inside ^= 1 << point
+    return inside & ~on_boundary
 
 
 def index_ranks(bounds: FloatArray) -> IntArray:

@@ -10,11 +10,11 @@ import numpy as np
 from shiftsim.geometry.boxes import box_corners
 from shiftsim.geometry.rings import ring_bounds
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.planners.proposals.areas import Areas, holds
+from shiftsim.planners.proposals.areas import Areas, held_points
 from shiftsim.world.state import VehicleParameters, X, Y
 
 MULTIPLE, OFF_ROAD, OFF_ROUTE = 0, 1, 2  # flags of a pose
-_ALL_CORNERS = 0b1111
+_ALL_CORNERS, _MIDDLE = 0b1111, 0b10000  # bits of the points of a pose
 
 
 class EgoBox(NamedTuple):
@@ -84,6 +84,7 @@ def _locate(
 ) -> None:
     """Fill in boxes, flags and speed limits."""
     polygons, bounds = areas.polygons, areas.polygons.bounds
+    points = np.empty((5, 2))  # corners of the ego, and what decides whether it is on the route
     for row in range(places.states.shape[0]):
         for step in range(places.states.shape[1]):
             x, y = ego_corners(places.states[row, step], size, places.corners[row, step])
@@ -103,17 +104,19 @@ def _locate(
         for step in range(places.states.shape[1]):
             box = places.corners[row, step]
             low_x, low_y, high_x, high_y = ring_bounds(box)
-            x, y = places.states[row, step, X], places.states[row, step, Y]
+            for corner in range(4):
+                points[corner, 0], points[corner, 1] = box[corner, 0], box[corner, 1]
+            points[4, 0], points[4, 1] = places.states[row, step, X], places.states[row, step, Y]
             if by_center:
-                x, y = places.centers[row, step, 0], places.centers[row, step, 1]
+                points[4, 0] = places.centers[row, step, 0]
+                points[4, 1] = places.centers[row, step, 1]
             num_touched, held, is_whole, is_on_route, limit = 0, 0, False, False, 0.0
             for entry in range(-1, num_near):
                 # the area that held the whole ego last probably holds it again
                 area = latest if entry < 0 else near[entry]
                 if area < 0 or (entry >= 0 and area == latest):
                     continue
-                is_known = is_on_route and limit >= highest
-                if is_whole and is_known:
+                if is_whole and is_on_route and limit >= highest:
                     break
                 if (
                     bounds[area, 0] > high_x
@@ -122,16 +125,13 @@ def _locate(
                     or bounds[area, 3] < low_y
                 ):
                     continue
-                if not is_known and holds(polygons, areas.run_ptr, areas.runs, area, x, y):
+                within = held_points(polygons, areas.run_ptr, areas.runs, area, points)
+                if within & _MIDDLE:
                     limit, is_on_route = (
                         max(limit, limits[area]),
                         is_on_route or areas.on_route[area],
                     )
-                within = 0
-                for corner in range(0 if is_whole else 4):
-                    at_x, at_y = box[corner, 0], box[corner, 1]
-                    if holds(polygons, areas.run_ptr, areas.runs, area, at_x, at_y):
-                        within |= 1 << corner
+                within &= _ALL_CORNERS
                 if within == _ALL_CORNERS:
                     is_whole, latest = True, area
                 elif within > 0:

@@ -4,6 +4,7 @@ The vertices of a path are grouped in short runs with bounding boxes, so that a 
 looks at a few segments instead of all of them.
 """
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -112,21 +113,10 @@ def arc_lengths(xy: FloatArray, ptr: IntArray) -> FloatArray:
     steps = np.diff(xy, axis=0)
     out = np.zeros(len(xy))
     np.hypot(steps[:, 0], steps[:, 1], out=out[1:])
-    if len(ptr) == 2:  # most often; no kernel needs to be compiled for it
-        np.cumsum(out, out=out)
-    else:
-        _sum_up(out, ptr)
+    for start, stop in pairwise(ptr.tolist()):
+        out[start:stop][:1] = 0.0
+        np.cumsum(out[start:stop], out=out[start:stop])
     return out
-
-
-@kernel
-def _sum_up(steps: FloatArray, ptr: IntArray) -> None:
-    """Make lengths (V,) of the segments that end at the vertices of lines arc lengths of these."""
-    for line in range(len(ptr) - 1):
-        total = 0.0
-        for vertex in range(ptr[line], ptr[line + 1]):
-            total = 0.0 if vertex == ptr[line] else total + steps[vertex]
-            steps[vertex] = total
 
 
 class Path(NamedTuple):
@@ -167,27 +157,13 @@ def bound_runs(xy: FloatArray, runs: FloatArray) -> None:
 
 
 @kernel
-def is_run_within(runs: FloatArray, run: int, x: float, y: float, limit: float) -> bool:
-    """Whether the bounds of a run come within `limit` [m] of a point."""
-    dx = max(runs[run, 0] - x, 0.0, x - runs[run, 2])
-    dy = max(runs[run, 1] - y, 0.0, y - runs[run, 3])
-    return not dx * dx + dy * dy > limit * limit
-
-
-@kernel
 def pose_at(path: Path, progress: float) -> tuple[float, float, float]:
     """Pose x [m], y [m], heading [rad] at a progress, clamped to the path; heading not wrapped."""
     last = len(path.progress) - 1
     s = min(max(progress, path.progress[0]), path.progress[last])
-    return pose_before(path, min(max(int(np.searchsorted(path.progress, s)), 1), last), s)
-
-
-@kernel
-def pose_before(path: Path, upper: int, progress: float) -> tuple[float, float, float]:
-    """As `pose_at`, between a vertex and the one before, which have the progress between them."""
+    upper = min(max(int(np.searchsorted(path.progress, s)), 1), last)
     lower = upper - 1
-    ahead = progress - path.progress[lower]
-    span = path.progress[upper] - path.progress[lower]
+    ahead, span = s - path.progress[lower], path.progress[upper] - path.progress[lower]
     return (
         interpolate(path.xy[lower, 0], path.xy[upper, 0], span, ahead),
         interpolate(path.xy[lower, 1], path.xy[upper, 1], span, ahead),
@@ -207,12 +183,14 @@ def project(path: Path, x: float, y: float, guess: int) -> tuple[float, float, i
     bound = least + SLACK
     best, found, run_found = np.inf, 0.0, guess
     for run in range(num_runs):
-        if run == guess:
-            distance, progress = least, along
-        elif is_run_within(path.runs, run, x, y, min(bound, best + SLACK)):
+        distance, progress = least, along
+        if run != guess:
+            dx = max(path.runs[run, 0] - x, 0.0, x - path.runs[run, 2])
+            dy = max(path.runs[run, 1] - y, 0.0, y - path.runs[run, 3])
+            reach = min(bound, best + SLACK)
+            if dx * dx + dy * dy > reach * reach:
+                continue
             distance, progress = _project_on_run(path, run, x, y)
-        else:
-            continue
         if distance < best:
             best, found, run_found = distance, progress, run
     return found, best, run_found
