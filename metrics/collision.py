@@ -7,7 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.geometry.boxes import BEHIND, bearing, box_corners, front_touches
+from shiftsim.geometry.boxes import (
+    ACTIVE_FRONT,
+    ACTIVE_LATERAL,
+    STOPPED_TRACK,
+    box_corners,
+    contact_type,
+)
 from shiftsim.geometry.rings import SLACK, convex_intersect
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.metrics.result import (
@@ -29,8 +35,6 @@ from shiftsim.world.state import (
 
 NAME = "no_ego_at_fault_collisions"
 COLLISION_TYPES = ("stopped_ego", "stopped_track", "active_rear", "active_front", "active_lateral")
-STOPPED_EGO, STOPPED_TRACK, ACTIVE_REAR, ACTIVE_FRONT, ACTIVE_LATERAL = range(5)
-STOPPED_SPEED = 5e-2  # m/s, nuPlan at-fault collisions
 BOX_SIZE = 8  # numbers that make a box in kernels
 GROUPS = {
     "VRUs": (AgentKind.PEDESTRIAN, AgentKind.BICYCLE),
@@ -230,15 +234,8 @@ def _first_contacts(ego: Ego, tracks: FlatTracks, out: Contacts) -> None:
             v, w = ego.speeds[i], 0.0
             if not tracks.is_static[j]:
                 w = np.hypot(tracks.velocities[i, j, 0], tracks.velocities[i, j, 1])
-            if v <= STOPPED_SPEED:
-                kind = STOPPED_EGO
-            elif w <= STOPPED_SPEED:
-                kind = STOPPED_TRACK
-            elif bearing(ego.states[i], other[0], other[1]) > BEHIND:
-                kind = ACTIVE_REAR
-            else:  # `collide` left the corners of the track
-                is_front = front_touches(ego.corners[i], scratch[1])
-                kind = ACTIVE_FRONT if is_front else ACTIVE_LATERAL
+            # `collide` left the corners of the track
+            kind = contact_type(ego.states[i], v, ego.corners[i], other[0], other[1], w, scratch[1])
             out.first[j], out.types[j] = i, kind
             angle = ego.states[i, 2] - poses[i, j, 2]
             out.delta_v[j] = 0.5 * np.sqrt(max(0.0, v * v + w * w - 2.0 * v * w * np.cos(angle)))

@@ -53,8 +53,8 @@ def comfort(states: FloatArray, bounds: ComfortBounds) -> Comfort:
     low, *high = bounds
     highs = np.array(high)[:, None]
     lows = np.where(np.arange(len(high))[:, None] == 0, low, -highs)
-    is_within = ((lows < signals) & (signals < highs)).all(axis=2)
-    return Comfort(signals, is_within, is_within.all(axis=1).astype(np.float64))
+    is_within: BoolArray = np.all((lows < signals) & (signals < highs), axis=2)
+    return Comfort(signals, is_within, np.where(np.all(is_within, axis=1), 1.0, 0.0))
 
 
 @kernel

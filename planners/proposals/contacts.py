@@ -7,13 +7,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.geometry.boxes import BEHIND, bearing, boxes_touch, circle_around, front_touches
+from shiftsim.geometry.boxes import (
+    ACTIVE_FRONT,
+    ACTIVE_LATERAL,
+    STOPPED_TRACK,
+    boxes_touch,
+    circle_around,
+    contact_type,
+)
 from shiftsim.geometry.rings import SLACK
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.proposals.places import ProposalStates
 from shiftsim.world.state import HEADING, VX, VY
 
-STOPPED = 5e-2  # m/s, of the ego and of others in a collision
 TTC_STOPPED = 5e-3  # m/s, of the ego
 NEVER = np.inf
 
@@ -104,13 +110,9 @@ def is_at_fault(
 
     `state` (11,) and `box` (4, 2) are the ego's; `is_off_lane`: on several lanes or off the road.
     """
-    if np.hypot(state[VX], state[VY]) <= STOPPED:
-        return False
-    if speed <= STOPPED:
-        return True
-    if bearing(state, centroid[0], centroid[1]) > BEHIND:
-        return False
-    return is_off_lane or front_touches(box, other)
+    x, y = centroid[0], centroid[1]
+    kind = contact_type(state, np.hypot(state[VX], state[VY]), box, x, y, speed, other)
+    return kind == STOPPED_TRACK or kind == ACTIVE_FRONT or (kind == ACTIVE_LATERAL and is_off_lane)
 
 
 @kernel

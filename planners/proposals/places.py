@@ -116,7 +116,8 @@ def _locate(
                 area = latest if entry < 0 else near[entry]
                 if area < 0 or (entry >= 0 and area == latest):
                     continue
-                if is_whole and is_on_route and limit >= highest:
+                is_known = is_on_route and limit >= highest
+                if is_whole and is_known:
                     break
                 if (
                     bounds[area, 0] > high_x
@@ -125,6 +126,12 @@ def _locate(
                     or bounds[area, 3] < low_y
                 ):
                     continue
+                if num_touched > 1 and held == _ALL_CORNERS and is_known:
+                    # only an area that holds the whole ego changes anything
+                    if low_x < bounds[area, 0] or low_y < bounds[area, 1]:
+                        continue
+                    if high_x > bounds[area, 2] or high_y > bounds[area, 3]:
+                        continue
                 within = held_points(polygons, areas.run_ptr, areas.runs, area, points)
                 if within & _MIDDLE:
                     limit, is_on_route = (

@@ -18,6 +18,9 @@ from shiftsim.kernels import FloatArray, kernel
 
 # rad, bearings from the rear axle that at-fault tests compare with
 BEHIND, AHEAD = np.deg2rad(150.0), np.deg2rad(30.0)
+STOPPED_SPEED = 5e-2  # m/s, of the ego and of others in a collision
+# how the ego and another box come into contact
+STOPPED_EGO, STOPPED_TRACK, ACTIVE_REAR, ACTIVE_FRONT, ACTIVE_LATERAL = range(5)
 
 
 @kernel
@@ -80,6 +83,30 @@ def front_touches(box: FloatArray, ring: FloatArray) -> bool:
         if segments_intersect(box[0], box[3], ring[index - 1], ring[index]):
             return True
     return False
+
+
+@kernel
+def contact_type(
+    pose: FloatArray,
+    speed: float,
+    box: FloatArray,
+    x: float,
+    y: float,
+    other_speed: float,
+    other: FloatArray,
+) -> int:
+    """STOPPED_EGO … ACTIVE_LATERAL: the kind of a contact of the ego with another box.
+
+    The ego has the rear-axle pose (3,), a speed [m/s] and the box (4, 2), the other one the middle
+    (x, y) that the bearing is taken to, a speed and the box (4, 2).
+    """
+    if speed <= STOPPED_SPEED:
+        return STOPPED_EGO
+    if other_speed <= STOPPED_SPEED:
+        return STOPPED_TRACK
+    if bearing(pose, x, y) > BEHIND:
+        return ACTIVE_REAR
+    return ACTIVE_FRONT if front_touches(box, other) else ACTIVE_LATERAL
 
 
 @kernel
