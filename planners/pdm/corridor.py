@@ -9,8 +9,6 @@ from shapely.ops import substring
 from shiftsim.geometry.corridor import (
     BAND,
     CLEAR,
-    HIT,
-    UNDECIDED,
     Corridor,
     corridor_polygon,
     is_run_near,
@@ -20,7 +18,7 @@ from shiftsim.geometry.corridor import (
 from shiftsim.geometry.polylines import RUN, Path, project, window
 from shiftsim.geometry.rings import centroid, ring_bounds
 from shiftsim.kernels import FloatArray, IntArray, kernel
-from shiftsim.planners.pdm.forecast import NUM_FORECASTS, Forecast, ring_of
+from shiftsim.planners.pdm.forecast import Forecast
 
 
 class Paths(NamedTuple):
@@ -43,31 +41,6 @@ class Corridors(NamedTuple):
     half_width: float  # radius of the buffer [m]
     occupancy: IntArray  # (L, 41, M) CLEAR, HIT or UNDECIDED on every forecast map
     progress: FloatArray  # (L, 41, M) projection of the centroid on the path, where not CLEAR [m]
-
-
-def make_corridors(num_paths: int, half_width: float, count: int) -> Corridors:
-    """Corridors of no length that nothing is known of yet."""
-    shape = (num_paths, NUM_FORECASTS, count)
-    return Corridors(np.zeros((num_paths, 2)), half_width, np.full(shape, CLEAR), np.zeros(shape))
-
-
-def decide(
-    polygon: shapely.Polygon,
-    corridors: Corridors,
-    forecast: Forecast,
-    index: int,
-    row: int,
-    it: int,
-) -> None:
-    """Decide by the polygon of a path's corridor what is UNDECIDED; what stands, for all rows."""
-    answer = HIT if polygon.intersects(shapely.Polygon(ring_of(forecast, it, row))) else CLEAR
-    stands = it >= len(forecast.moves) or not forecast.moves[it]
-    rows = (
-        corridors.occupancy[index, :, it]
-        if stands
-        else corridors.occupancy[index, row : row + 1, it]
-    )
-    rows[rows == UNDECIDED] = answer
 
 
 def corridor_shape(path: Path, low: float, high: float, half_width: float) -> shapely.Polygon:

@@ -9,19 +9,12 @@ import numpy as np
 import shapely
 
 from shiftsim.geometry.boxes import circle_around, wrap_angle
-from shiftsim.geometry.corridor import CLEAR, UNDECIDED
+from shiftsim.geometry.corridor import CLEAR, HIT, UNDECIDED
 from shiftsim.geometry.polylines import Path, pose_at, project
 from shiftsim.geometry.rings import ring_bounds, ring_distance
 from shiftsim.kernels import FloatArray, IntArray, kernel
-from shiftsim.planners.pdm.corridor import (
-    Corridors,
-    Paths,
-    corridor_shape,
-    decide,
-    fill_corridor,
-    make_corridors,
-)
-from shiftsim.planners.pdm.forecast import NUM_FORECASTS, Forecast, forecast_ranks
+from shiftsim.planners.pdm.corridor import Corridors, Paths, corridor_shape, fill_corridor
+from shiftsim.planners.pdm.forecast import NUM_FORECASTS, Forecast, forecast_ranks, ring_of
 from shiftsim.planners.pdm.parameters import FollowingModel
 from shiftsim.planners.proposals.places import EgoBox, ego_corners
 from shiftsim.planners.proposals.tracker import DT, SCORED, STEPS
@@ -61,7 +54,12 @@ def roll_out(scene: Scene, ego: FloatArray, targets: FloatArray) -> Proposals:
         np.zeros((*shape, 3)),
         np.zeros((*shape, 2)),
         np.zeros((*shape, 3)),
-        make_corridors(num_paths, 0.5 * scene.size.width, count),
+        Corridors(
+            np.zeros((num_paths, 2)),
+            0.5 * scene.size.width,
+            np.full((num_paths, NUM_FORECASTS, count), CLEAR),
+            np.zeros((num_paths, NUM_FORECASTS, count)),
+        ),
         np.full((NUM_FORECASTS, count), -1),
     )
     for number in range(num_paths):
@@ -104,7 +102,8 @@ def _roll_on(
             low, high = corridors.spans[number].tolist()
             polygon = corridor_shape(path, low, high, corridors.half_width)
             shapely.prepare(polygon)
-        decide(polygon, corridors, forecast, number, step // 2, wanted)
+        touches = polygon.intersects(shapely.Polygon(ring_of(forecast, wanted, step // 2)))
+        corridors.occupancy[number, step // 2, wanted] = HIT if touches else CLEAR
 
 
 @kernel
