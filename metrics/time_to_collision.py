@@ -144,10 +144,24 @@ def _time_to_collision(
                 steps[num + 1, 0], steps[num + 1, 1] = box[2] * speed * STEP, box[3] * speed * STEP
                 listed[num] = j
                 num += 1
-        hit = _first_hit(boxes[: num + 1], steps, scratch)
-        if hit[0] > 0:
-            # nuPlan rule 63: times are numpy's arange, whose values are multiples of the step
-            ttc[i], partners[i] = STEP * hit[0], listed[hit[1]]
+        hit = 0
+        for k in range(1, _NUM_TESTS + 1 if num > 0 else 1):
+            # nuPlan rule 67: positions accumulate rounding step by step
+            boxes[0, 0] += steps[0, 0]
+            boxes[0, 1] += steps[0, 1]
+            for index in range(1, num + 1):
+                boxes[index, 0] += steps[index, 0]
+                boxes[index, 1] += steps[index, 1]
+                dx, dy = boxes[index, 0] - boxes[0, 0], boxes[index, 1] - boxes[0, 1]
+                reach = boxes[0, 7] + boxes[index, 7]
+                # most are too far away, which is decided without a call
+                if dx * dx + dy * dy <= reach * reach and collide(boxes[0], boxes[index], scratch):
+                    hit = index
+                    break
+            if hit > 0:
+                # nuPlan rule 63: times are numpy's arange, whose values are multiples of the step
+                ttc[i], partners[i] = STEP * k, listed[hit - 1]
+                break
 
 
 @kernel
@@ -160,23 +174,3 @@ def _stretch(box: FloatArray, speed: float, out: FloatArray) -> None:
     out[1] += 0.5 * distance * box[3]
     length, width = 2.0 * box[5] + distance, 2.0 * box[6]
     out[5], out[7] = 0.5 * length, 0.5 * np.sqrt(length * length + width * width)
-
-
-@kernel
-def _first_hit(boxes: FloatArray, steps: FloatArray, scratch: FloatArray) -> tuple[int, int]:
-    """First step at which box 0 meets another, and which; 0 when none does. Moves the boxes."""
-    if len(boxes) < 2:
-        return 0, 0
-    for k in range(1, _NUM_TESTS + 1):
-        # nuPlan rule 67: positions accumulate rounding step by step
-        boxes[0, 0] += steps[0, 0]
-        boxes[0, 1] += steps[0, 1]
-        for index in range(1, len(boxes)):
-            boxes[index, 0] += steps[index, 0]
-            boxes[index, 1] += steps[index, 1]
-            dx, dy = boxes[index, 0] - boxes[0, 0], boxes[index, 1] - boxes[0, 1]
-            reach = boxes[0, 7] + boxes[index, 7]
-            # most are too far away, which is told without a call
-            if dx * dx + dy * dy <= reach * reach and collide(boxes[0], boxes[index], scratch):
-                return k, index - 1
-    return 0, 0

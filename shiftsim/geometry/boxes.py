@@ -75,17 +75,6 @@ def bearing_cosine(cos: float, sin: float, dx: float, dy: float) -> float:
 
 
 @kernel
-def front_touches(box: FloatArray, ring: FloatArray) -> bool:
-    """Whether the front edge of a box (4, 2) touches the area of a convex ring (V, 2)."""
-    if locate_in_ring(ring, box[0, 0], box[0, 1]) != EXTERIOR:
-        return True
-    for index in range(len(ring)):
-        if segments_intersect(box[0], box[3], ring[index - 1], ring[index]):
-            return True
-    return False
-
-
-@kernel
 def contact_type(
     pose: FloatArray,
     speed: float,
@@ -106,7 +95,12 @@ def contact_type(
         return STOPPED_TRACK
     if bearing(pose, x, y) > BEHIND:
         return ACTIVE_REAR
-    return ACTIVE_FRONT if front_touches(box, other) else ACTIVE_LATERAL
+    if locate_in_ring(other, box[0, 0], box[0, 1]) != EXTERIOR:
+        return ACTIVE_FRONT
+    for index in range(len(other)):
+        if segments_intersect(box[0], box[3], other[index - 1], other[index]):
+            return ACTIVE_FRONT  # the front edge touches the other box
+    return ACTIVE_LATERAL
 
 
 @kernel

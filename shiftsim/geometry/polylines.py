@@ -1,4 +1,4 @@
-"""Polylines: arc length, headings, nearest vertices, projection; paths with headings.
+"""Polylines: arc length, headings, projection; paths with headings.
 
 The vertices of a path are grouped in short runs with bounding boxes, so that a search along it
 looks at a few segments instead of all of them.
@@ -90,22 +90,6 @@ def vertex_headings(xy: FloatArray) -> FloatArray:
     step = np.diff(xy, axis=0)
     heading = np.arctan2(step[:, 1], step[:, 0])
     return np.append(heading, heading[-1])
-
-
-@kernel
-def nearest_vertex(
-    xy: FloatArray, start: int, stop: int, stride: int, x: float, y: float
-) -> tuple[int, float]:
-    """The vertex of a polyline nearest to a point and its distance [m]; the first one on ties.
-
-    Of the vertices `start` … `stop` - 1 of `xy` (V, 2) every `stride`-th is looked at.
-    """
-    best, found = np.inf, start
-    for index in range(start, stop, stride):
-        distance = np.hypot(xy[index, 0] - x, xy[index, 1] - y)
-        if distance < best:
-            best, found = distance, index
-    return found, best
 
 
 def arc_lengths(xy: FloatArray, ptr: IntArray) -> FloatArray:
