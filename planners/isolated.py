@@ -8,8 +8,8 @@ import os
 import subprocess
 import sys
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import replace
+from multiprocessing import Pipe
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,7 @@ class Isolated:
         self.name, self.degraded = spec, ""
         self._given = (spec, dict(arguments), python)
         self._process: Any = None
+        self._connection: Any = None
         self._map: VectorMap | None = None
         self._about: Any = None
 
@@ -75,10 +76,14 @@ class Isolated:
         self.close()
         self._map = None
         spec, arguments, python = self._given
-        words = [python or sys.executable, stub.__file__, str(os.getpid())]
-        pipe = subprocess.PIPE
+        self._connection, theirs = Pipe()
+        file = theirs.fileno()
+        words = [python or sys.executable, stub.__file__, str(os.getpid()), str(file)]
         try:
-            self._process = subprocess.Popen(words, stdin=pipe, stdout=pipe, process_group=0)
+            with theirs:
+                self._process = subprocess.Popen(
+                    words, stdin=subprocess.DEVNULL, pass_fds=[file], process_group=0
+                )
         except OSError as error:
             raise PlannerError(
                 f"planner {spec!r}: {words[0]!r} cannot be started ({error.strerror})",
@@ -115,9 +120,9 @@ class Isolated:
 
     def _ask(self, verb: str, value: object) -> Any:
         try:
-            stub.write(self._process.stdin, (verb, value))
-            state, answer = stub.read(self._process.stdout, _RETURNED)
-        except (OSError, EOFError, ValueError) as error:
+            stub.write(self._connection, (verb, value))
+            state, answer = stub.read(self._connection, _RETURNED)
+        except (OSError, EOFError, TypeError, ValueError) as error:
             self._process.kill()
             code = self._process.wait()
             end = f"by signal {-code}" if code < 0 else f"with code {code}"
@@ -137,14 +142,12 @@ class Isolated:
         process, self._process = self._process, None
         if process is None:
             return
-        with suppress(OSError):  # of what is still to be written
-            process.stdin.close()
+        self._connection.close()
         try:
             process.wait(_PATIENCE)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
-        process.stdout.close()
 
     def __del__(self) -> None:
         if self._process is not None:
