@@ -126,7 +126,13 @@ def _first_violations(
 
     Each of these counts until its first contact with the ego or its projection.
     """
-    states, box = places.states, np.empty((4, 2))
+    states, centers, others_at, speeds = (
+        places.states,
+        places.centers,
+        others.centers,
+        others.speeds,
+    )
+    box = np.empty((4, 2))
     radius = 0.5 * np.hypot(size.length, size.width) + SLACK
     out = np.full(len(states), NEVER)
     for proposal in range(len(states)):
@@ -135,20 +141,19 @@ def _first_violations(
             for step in range(states.shape[1]):
                 if is_over or step > out[proposal]:
                     break
-                state = states[proposal, step]
-                x, y = places.centers[proposal, step, 0], places.centers[proposal, step, 1]
-                speed = np.hypot(state[VX], state[VY])
+                x, y = centers[proposal, step, 0], centers[proposal, step, 1]
+                speed = np.hypot(states[proposal, step, VX], states[proposal, step, VY])
                 reach = touching + AHEAD_SECONDS * speed
-                reach += (AHEAD_SECONDS + DT) * others.speeds[0, index]
-                dx = others.centers[step // 2, index, 0] - x
-                dy = others.centers[step // 2, index, 1] - y
+                reach += (AHEAD_SECONDS + DT) * speeds[0, index]
+                dx, dy = others_at[step // 2, index, 0] - x, others_at[step // 2, index, 1] - y
                 if speed < TTC_STOPPED or dx * dx + dy * dy > reach * reach:
                     continue
+                state = states[proposal, step]
                 cos, sin = np.cos(state[HEADING]), np.sin(state[HEADING])
                 for ahead in TTC_STEPS:
                     row, travel = (step + ahead) // 2, 0.1 * ahead * speed
-                    dx = others.centers[row, index, 0] - (x + travel * cos)
-                    dy = others.centers[row, index, 1] - (y + travel * sin)
+                    dx = others_at[row, index, 0] - (x + travel * cos)
+                    dy = others_at[row, index, 1] - (y + travel * sin)
                     if is_over or dx * dx + dy * dy > touching * touching:
                         continue
                     project_box(places.corners[proposal, step], state, travel, box)

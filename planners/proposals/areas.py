@@ -88,9 +88,9 @@ def held_points(
     `run_ptr` and `runs` are those of `Areas`.
     """
     low_x, low_y, _, high_y = ring_bounds(points)
-    inside = on_boundary = 0
+    xy, ring_ptr, inside, on_boundary = polygons.xy, polygons.ring_ptr, 0, 0
     for ring in range(polygons.poly_ptr[area], polygons.poly_ptr[area + 1]):
-        first, end = polygons.ring_ptr[ring], polygons.ring_ptr[ring + 1]
+        first, end = ring_ptr[ring], ring_ptr[ring + 1]
         for run in range(run_ptr[ring], run_ptr[ring + 1]):
             if high_y < runs[run, 0] or low_y > runs[run, 1] or low_x > runs[run, 2]:
                 continue  # most often: no ray from a point to +x meets an edge of the run
@@ -99,7 +99,7 @@ def held_points(
             stop = min(start + RUN, end)
             for point in range(len(points)):
                 x, y = points[point, 0], points[point, 1]
-                is_odd, on_edge = ray_crossings(polygons.xy, before, start, stop, x, y)
+                is_odd, on_edge = ray_crossings(xy, before, start, stop, x, y)
                 if on_edge:
                     on_boundary |= 1 << point
                 elif is_odd:

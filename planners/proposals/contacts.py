@@ -128,14 +128,18 @@ def first_faults(
         (P,) factors 0, 0.5 or 1, and time indices of the first collisions, inf if none.
     """
     scores, first = np.ones(len(places.states)), np.full(len(places.states), NEVER)
-    radius = circle_around(places.corners[0, 0])[2]
+    radius, centers, others_at = (
+        circle_around(places.corners[0, 0])[2],
+        places.centers,
+        others.centers,
+    )
     for proposal in range(len(scores)):
         for index in near:
             reach = radius + others.radii[index] + SLACK
             for step in range(len(rows)):
                 row = rows[step]
-                dx = others.centers[row, index, 0] - places.centers[proposal, step, 0]
-                dy = others.centers[row, index, 1] - places.centers[proposal, step, 1]
+                dx = others_at[row, index, 0] - centers[proposal, step, 0]
+                dy = others_at[row, index, 1] - centers[proposal, step, 1]
                 if row < 0 or dx * dx + dy * dy > reach * reach:
                     continue  # most often, and without a slice
                 box, other = places.corners[proposal, step], others.boxes[row, index]

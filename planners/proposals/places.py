@@ -83,7 +83,12 @@ def _locate(
     places: ProposalStates,  # the states are there
 ) -> None:
     """Fill in boxes, flags and speed limits."""
-    polygons, bounds = areas.polygons, areas.polygons.bounds
+    polygons, bounds, run_ptr, runs = (
+        areas.polygons,
+        areas.polygons.bounds,
+        areas.run_ptr,
+        areas.runs,
+    )
     points = np.empty((5, 2))  # corners of the ego, and what decides whether it is on the route
     for row in range(places.states.shape[0]):
         for step in range(places.states.shape[1]):
@@ -132,7 +137,7 @@ def _locate(
                         continue
                     if high_x > bounds[area, 2] or high_y > bounds[area, 3]:
                         continue
-                within = held_points(polygons, areas.run_ptr, areas.runs, area, points)
+                within = held_points(polygons, run_ptr, runs, area, points)
                 if within & _MIDDLE:
                     limit, is_on_route = (
                         max(limit, limits[area]),

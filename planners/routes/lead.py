@@ -96,25 +96,25 @@ def _ring_gap(a: FloatArray, b: FloatArray) -> tuple[float, float]:
     for i in range(len(a)):
         before = len(b) - 1
         for j in range(len(b)):
-            c, d = b[before], b[j]
-            before = j
+            cx, cy, dx, dy = b[before, 0], b[before, 1], b[j, 0], b[j, 1]
             if not (
-                max(c[0], d[0]) < low_x
-                or min(c[0], d[0]) > high_x
-                or max(c[1], d[1]) < low_y
-                or min(c[1], d[1]) > high_y
+                max(cx, dx) < low_x
+                or min(cx, dx) > high_x
+                or max(cy, dy) < low_y
+                or min(cy, dy) > high_y
             ):
-                distance = point_segment_distance(a[i, 0], a[i, 1], c[0], c[1], d[0], d[1])
+                distance = point_segment_distance(a[i, 0], a[i, 1], cx, cy, dx, dy)
                 if distance < best:
-                    best, gap = distance, _gap_to_edge(a[i], c, d)
+                    best, gap = distance, _gap_to_edge(a[i], b[before], b[j])
+            before = j
     for i in range(len(b)):
-        p = b[i]
-        if low_x <= p[0] <= high_x and low_y <= p[1] <= high_y:
+        x, y = b[i, 0], b[i, 1]
+        if low_x <= x <= high_x and low_y <= y <= high_y:
             for j in range(len(a)):
-                c, d = a[j - 1], a[j]
-                distance = point_segment_distance(p[0], p[1], c[0], c[1], d[0], d[1])
+                cx, cy, dx, dy = a[j - 1, 0], a[j - 1, 1], a[j, 0], a[j, 1]
+                distance = point_segment_distance(x, y, cx, cy, dx, dy)
                 if distance < best:
-                    best, gap = distance, _gap_to_edge(p, c, d)
+                    best, gap = distance, _gap_to_edge(b[i], a[j - 1], a[j])
     return best, gap
 
 

@@ -12,7 +12,14 @@ import numpy as np
 import shapely
 
 from shiftsim.geometry.polylines import RUN
-from shiftsim.geometry.rings import ring_bounds, ring_segment_distance, rings_touch
+from shiftsim.geometry.rings import (
+    EXTERIOR,
+    locate_in_ring,
+    point_segment_distance,
+    ring_bounds,
+    rings_touch,
+    segments_meet,
+)
 from shiftsim.kernels import FloatArray, kernel
 
 CLEAR, HIT, UNDECIDED = 0, 1, 2
@@ -54,16 +61,38 @@ def line_distance(
 
     The search ends at the first distance that is not above `enough`. `bounds` are the ring's.
     """
-    xy, runs = corridor.xy, corridor.runs
-    nearest, starts_outside = np.inf, False
+    xy, runs, nearest, starts_outside = corridor.xy, corridor.runs, np.inf, False
     for run in range(corridor.begin // RUN, (corridor.end - 2) // RUN + 1):
         if not is_run_near(runs, run, bounds, limit):
             starts_outside = False
             continue
         first, stop = max(corridor.begin, run * RUN), min(corridor.end - 1, (run + 1) * RUN)
         for index in range(first, stop):
-            distance = ring_segment_distance(ring, xy[index], xy[index + 1], limit, starts_outside)
-            nearest, starts_outside = min(nearest, distance), True
+            # scalars instead of slices, which numba counts references of
+            ax, ay, bx, by = xy[index, 0], xy[index, 1], xy[index + 1, 0], xy[index + 1, 1]
+            if not starts_outside and locate_in_ring(ring, ax, ay) != EXTERIOR:
+                return 0.0
+            starts_outside = True
+            low_x, high_x = min(ax, bx) - limit, max(ax, bx) + limit
+            low_y, high_y = min(ay, by) - limit, max(ay, by) + limit
+            best, before = np.inf, len(ring) - 1
+            for vertex in range(len(ring)):
+                cx, cy, dx, dy = ring[before, 0], ring[before, 1], ring[vertex, 0], ring[vertex, 1]
+                before = vertex
+                if (
+                    max(cx, dx) < low_x
+                    or min(cx, dx) > high_x
+                    or max(cy, dy) < low_y
+                    or min(cy, dy) > high_y
+                ):
+                    continue
+                if segments_meet(ax, ay, bx, by, cx, cy, dx, dy):
+                    return 0.0
+                best = min(best, point_segment_distance(ax, ay, cx, cy, dx, dy))
+                best = min(best, point_segment_distance(bx, by, cx, cy, dx, dy))
+                best = min(best, point_segment_distance(dx, dy, ax, ay, bx, by))
+            if best <= limit:
+                nearest = min(nearest, best)
             if nearest <= enough:
                 return nearest
     return nearest
@@ -98,8 +127,8 @@ def occupancy(corridor: Corridor, ring: FloatArray, square_ends: bool) -> int:
     nearest = line_distance(corridor, ring, bounds, enough, outer)
     if nearest <= enough:
         return HIT
-    first = _end_occupancy(xy[begin + 1], xy[begin], corridor.half_width, ring, bounds)
-    last = _end_occupancy(xy[end - 2], xy[end - 1], corridor.half_width, ring, bounds)
+    first = _end_occupancy(xy, begin + 1, begin, corridor.half_width, ring, bounds)
+    last = _end_occupancy(xy, end - 2, end - 1, corridor.half_width, ring, bounds)
     if first == last == CLEAR:
         if nearest <= inner:
             return HIT
@@ -111,31 +140,32 @@ def occupancy(corridor: Corridor, ring: FloatArray, square_ends: bool) -> int:
 
 @kernel
 def _end_occupancy(
-    a: FloatArray,
-    b: FloatArray,
+    xy: FloatArray,
+    before: int,
+    end: int,
     half_width: float,
     ring: FloatArray,
     bounds: tuple[float, float, float, float],
 ) -> int:
-    """As `occupancy`, for the square end of a corridor alone: half a width straight on from b.
+    """As `occupancy`, for the square end of a corridor alone: half a width straight on.
 
-    Before b (2,) comes a (2,); `bounds` are those of the ring.
+    The line ends with the vertices `before` and `end`; `bounds` are those of the ring.
     """
-    reach = 2.0 * (1.0 + BAND) * half_width  # more than to the corners
+    x, y, reach = xy[end, 0], xy[end, 1], 2.0 * (1.0 + BAND) * half_width  # to beyond the corners
     if not (
-        bounds[0] - reach <= b[0] <= bounds[2] + reach
-        and bounds[1] - reach <= b[1] <= bounds[3] + reach
+        bounds[0] - reach <= x <= bounds[2] + reach and bounds[1] - reach <= y <= bounds[3] + reach
     ):
         return CLEAR
-    length, square = np.hypot(b[0] - a[0], b[1] - a[1]), np.empty((4, 2))
+    dx, dy, square = x - xy[before, 0], y - xy[before, 1], np.empty((4, 2))
+    length = np.hypot(dx, dy)
     for is_outer in range(2):
         reach = (1.0 + BAND) * half_width if is_outer else (1.0 - BAND) * half_width
-        along_x, along_y = reach * (b[0] - a[0]) / length, reach * (b[1] - a[1]) / length
+        along_x, along_y = reach * dx / length, reach * dy / length
         for corner in range(4):
             ahead = 1.0 if corner == 0 or corner == 3 else 0.0
             left = 1.0 if corner < 2 else -1.0
-            square[corner, 0] = b[0] + ahead * along_x - left * along_y
-            square[corner, 1] = b[1] + ahead * along_y + left * along_x
+            square[corner, 0] = x + ahead * along_x - left * along_y
+            square[corner, 1] = y + ahead * along_y + left * along_x
         if rings_touch(square, ring):
             return UNDECIDED if is_outer else HIT
     return CLEAR

@@ -264,8 +264,9 @@ def rings_touch(a: FloatArray, b: FloatArray) -> bool:
             or max(b[before, 1], b[j, 1]) < low_y
             or min(b[before, 1], b[j, 1]) > high_y
         ):
+            px, py, qx, qy = b[before, 0], b[before, 1], b[j, 0], b[j, 1]
             for i in range(len(a)):
-                if segments_intersect(a[i - 1], a[i], b[before], b[j]):
+                if segments_meet(a[i - 1, 0], a[i - 1, 1], a[i, 0], a[i, 1], px, py, qx, qy):
                     return True
         before = j
     return False
@@ -292,17 +293,17 @@ def ring_distance(a: FloatArray, b: FloatArray) -> float:
     best = np.inf
     before = len(b) - 1
     for j in range(len(b)):
-        c, d = b[before], b[j]
+        cx, cy, dx, dy = b[before, 0], b[before, 1], b[j, 0], b[j, 1]
         if not (
-            max(c[0], d[0]) < low_x - reach
-            or min(c[0], d[0]) > high_x + reach
-            or max(c[1], d[1]) < low_y - reach
-            or min(c[1], d[1]) > high_y + reach
+            max(cx, dx) < low_x - reach
+            or min(cx, dx) > high_x + reach
+            or max(cy, dy) < low_y - reach
+            or min(cy, dy) > high_y + reach
         ):
             for i in range(len(a)):
-                p, q = a[i - 1], a[i]
-                best = min(best, point_segment_distance(q[0], q[1], c[0], c[1], d[0], d[1]))
-                best = min(best, point_segment_distance(d[0], d[1], p[0], p[1], q[0], q[1]))
+                px, py, qx, qy = a[i - 1, 0], a[i - 1, 1], a[i, 0], a[i, 1]
+                best = min(best, point_segment_distance(qx, qy, cx, cy, dx, dy))
+                best = min(best, point_segment_distance(dx, dy, px, py, qx, qy))
             reach = min(reach, best + SLACK)
         before = j
     return best
@@ -316,38 +317,6 @@ def distance_bound(a: FloatArray, b: FloatArray) -> float:
         dx, dy = b[j, 0] - a[0, 0], b[j, 1] - a[0, 1]
         square = min(square, dx * dx + dy * dy)
     return np.sqrt(square) + SLACK
-
-
-@kernel
-def ring_segment_distance(
-    ring: FloatArray, a: FloatArray, b: FloatArray, limit: float, starts_outside: bool
-) -> float:
-    """Distance between the area of a simple ring (V, 2) and the segment a-b, points (2,) [m].
-
-    Infinite where it is more than `limit`. `starts_outside` where a is known to be outside.
-    """
-    if not starts_outside and locate_in_ring(ring, a[0], a[1]) != EXTERIOR:
-        return 0.0
-    low_x, high_x = min(a[0], b[0]) - limit, max(a[0], b[0]) + limit
-    low_y, high_y = min(a[1], b[1]) - limit, max(a[1], b[1]) + limit
-    best = np.inf
-    before = len(ring) - 1
-    for index in range(len(ring)):
-        c, d = ring[before], ring[index]
-        before = index
-        if (
-            max(c[0], d[0]) < low_x
-            or min(c[0], d[0]) > high_x
-            or max(c[1], d[1]) < low_y
-            or min(c[1], d[1]) > high_y
-        ):
-            continue
-        if segments_intersect(a, b, c, d):
-            return 0.0
-        best = min(best, point_segment_distance(a[0], a[1], c[0], c[1], d[0], d[1]))
-        best = min(best, point_segment_distance(b[0], b[1], c[0], c[1], d[0], d[1]))
-        best = min(best, point_segment_distance(d[0], d[1], a[0], a[1], b[0], b[1]))
-    return best if best <= limit else np.inf
 
 
 @kernel
