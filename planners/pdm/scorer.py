@@ -135,14 +135,17 @@ def _first_violations(
     box = np.empty((4, 2))
     radius = 0.5 * np.hypot(size.length, size.width) + SLACK
     out = np.full(len(states), NEVER)
+    ego_speeds = np.empty(states.shape[1])
     for proposal in range(len(states)):
+        for step in range(len(ego_speeds)):
+            ego_speeds[step] = np.hypot(states[proposal, step, VX], states[proposal, step, VY])
         for index in near:
             touching, is_over = radius + others.radii[index], False
             for step in range(states.shape[1]):
                 if is_over or step > out[proposal]:
                     break
                 x, y = centers[proposal, step, 0], centers[proposal, step, 1]
-                speed = np.hypot(states[proposal, step, VX], states[proposal, step, VY])
+                speed = ego_speeds[step]
                 reach = touching + AHEAD_SECONDS * speed
                 reach += (AHEAD_SECONDS + DT) * speeds[0, index]
                 dx, dy = others_at[step // 2, index, 0] - x, others_at[step // 2, index, 1] - y

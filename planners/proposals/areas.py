@@ -99,6 +99,8 @@ def held_points(
             stop = min(start + RUN, end)
             for point in range(len(points)):
                 x, y = points[point, 0], points[point, 1]
+                if y < runs[run, 0] or y > runs[run, 1] or x > runs[run, 2]:
+                    continue
                 is_odd, on_edge = ray_crossings(xy, before, start, stop, x, y)
                 if on_edge:
                     on_boundary |= 1 << point

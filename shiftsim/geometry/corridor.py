@@ -70,11 +70,14 @@ def line_distance(
         for index in range(first, stop):
             # scalars instead of slices, which numba counts references of
             ax, ay, bx, by = xy[index, 0], xy[index, 1], xy[index + 1, 0], xy[index + 1, 1]
+            low_x, high_x = min(ax, bx) - limit, max(ax, bx) + limit
+            low_y, high_y = min(ay, by) - limit, max(ay, by) + limit
+            if low_x > bounds[2] or low_y > bounds[3] or high_x < bounds[0] or high_y < bounds[1]:
+                starts_outside = True  # the next segment, at the end of this one
+                continue
             if not starts_outside and locate_in_ring(ring, ax, ay) != EXTERIOR:
                 return 0.0
             starts_outside = True
-            low_x, high_x = min(ax, bx) - limit, max(ax, bx) + limit
-            low_y, high_y = min(ay, by) - limit, max(ay, by) + limit
             best, before = np.inf, len(ring) - 1
             for vertex in range(len(ring)):
                 cx, cy, dx, dy = ring[before, 0], ring[before, 1], ring[vertex, 0], ring[vertex, 1]
