@@ -126,13 +126,8 @@ def _first_violations(
 
     Each of these counts until its first contact with the ego or its projection.
     """
-    states, centers, others_at, speeds = (
-        places.states,
-        places.centers,
-        others.centers,
-        others.speeds,
-    )
-    box = np.empty((4, 2))
+    states, centers, box = places.states, places.centers, np.empty((4, 2))
+    others_at, speeds = others.centers, others.speeds
     radius = 0.5 * np.hypot(size.length, size.width) + SLACK
     out = np.full(len(states), NEVER)
     ego_speeds = np.empty(states.shape[1])
