@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from shiftsim.errors import DataError
-from shiftsim.metrics import MetricResult, judge, measure
+from shiftsim.metrics import MetricResult, evaluate, measure
 from shiftsim.metrics.score import closed_loop_score
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.log import SimulationLog
@@ -158,7 +158,7 @@ def _compare_results(path: Path, challenge: str, find: FindScenario, report: Rep
             else:
                 report.skip(f"{run}: no simulation log, and a planner that shiftsim has not")
                 continue
-            result = judge(measure(rollout, scenario.map))
+            result = evaluate(measure(rollout, scenario.map))
             known |= {*result.scores}
             _compare_result(run, result, metrics, scores, report)
     if known:  # else no run could be compared, and each is named already

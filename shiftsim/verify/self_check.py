@@ -7,7 +7,7 @@ import numpy as np
 
 from shiftsim.errors import DataError
 from shiftsim.files import PACKAGE
-from shiftsim.metrics import judge, measure
+from shiftsim.metrics import evaluate, measure
 from shiftsim.metrics.comfort import comfort_signals, within_bounds
 from shiftsim.metrics.result import PROFILES
 from shiftsim.sim.dynamics import lqr
@@ -58,7 +58,7 @@ def _check_metrics(world: Named, report: Report) -> None:
     measured = measure(*read_world(world))
     for name, profile in PROFILES.items():
         theirs = world["expected"]["scores_default" if name == "nuplan" else f"scores_{name}"]
-        result = judge(measured, profile)
+        result = evaluate(measured, profile)
         for metric, score in {**result.scores, "score": result.score}.items():
             if score is not None:
                 atol = SCORES.get(metric, EXACT)

@@ -9,7 +9,7 @@ import places
 import pytest
 from parity_cases import Cases, change_json, name_unknown, noticed, tracked
 
-from shiftsim.metrics import DEEPPLAN, NUPLAN, Measurements, judge, measure
+from shiftsim.metrics import DEEPPLAN, NUPLAN, Measurements, evaluate, measure
 from shiftsim.metrics.collision import at_fault_counts
 from shiftsim.metrics.comfort import BOUNDED_SIGNALS, within_bounds
 from shiftsim.verify.rollouts import SCORES
@@ -34,7 +34,7 @@ def test_world(path: Path, cases: Cases) -> None:
     expected, measured = world["expected"], measure(log, road)
     flags = {}
     for name, profile in (("deepplan", DEEPPLAN), ("default", NUPLAN)):
-        result, theirs = judge(measured, profile), expected[f"scores_{name}"]
+        result, theirs = evaluate(measured, profile), expected[f"scores_{name}"]
         for metric, score in {**result.scores, "score": result.score}.items():
             if score is not None:
                 atol = SCORES.get(metric, 0.0)

@@ -23,7 +23,7 @@ from parity_cases import (
     open_tables,
 )
 
-from shiftsim.metrics import MetricResult, judge, measure
+from shiftsim.metrics import MetricResult, evaluate, measure
 from shiftsim.planners.registry import PLANNERS, load_planner
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import simulate
@@ -113,7 +113,7 @@ def compare_metrics(expected: Path, logged: Path, scenes: Scenes, cases: Cases) 
         measured = measure(log, road)
         compare_route(run, measured, road, tables)
         for thresholds, profile in PROFILES.items():
-            result = judge(measured, profile)
+            result = evaluate(measured, profile)
             compare_profile((*run, thresholds), result, entry, tables)
             if profile == "nuplan":
                 compare_series(run, result, tables["time_series"])
@@ -205,7 +205,7 @@ def compare_simulations(expected: Path, logged: Path, scenes: Scenes, cases: Cas
             objects.match(key, ours, quantity="reactive")
         measured = measure(log, scenes[scene].map)
         for thresholds, profile in PROFILES.items():
-            result = judge(measured, profile)
+            result = evaluate(measured, profile)
             found = {**result.scores, "score": result.score}
             columns = {name: [score] for name, score in found.items() if score is not None}
             scores.match((*key, thresholds), columns, quantity="simulated score")

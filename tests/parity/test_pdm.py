@@ -41,7 +41,7 @@ from shiftsim.planners.pdm import route as routes
 from shiftsim.planners.pdm import step as steps_module
 from shiftsim.planners.pdm.parameters import DEFAULT
 from shiftsim.planners.pdm.planner import PdmClosed, Seen
-from shiftsim.planners.pdm.scorer import TTC_STEPS, Place, Scores, score, weigh
+from shiftsim.planners.pdm.scorer import TTC_STEPS, Place, Scores, score, weighted_mean
 from shiftsim.planners.pdm.step import Step, choose
 from shiftsim.planners.proposals.areas import areas_of, select_areas
 from shiftsim.planners.proposals.comfort import SIGNALS, comfort
@@ -117,7 +117,7 @@ def compare_path(case: File, where: str) -> None:
     poses, queries = case.take("vertices", -1, 3), case.take("query_s", -1)
     path, at = make_path(poses), np.empty((len(queries), 3))
     for progress, pose in zip(queries.tolist(), at, strict=True):
-        rollout.read_pose(path, progress, np.full(3, np.nan), pose)
+        rollout.read_pose(path, progress, pose)
     projection = [project(path, *xy, 0)[0] for xy in case.take("query_xy", -1, 2).tolist()]
     ours: dict[str, Any] = {"progress": path.progress, "projection": projection, "poses": at}
     ours["offset_m"] = routes.offset_poses(poses, -1.0)
@@ -314,7 +314,7 @@ def settled(where: str, seen: Seen, step: Step, theirs: File) -> Scores:
         ttc, ttc_index = np.where(rows, (other.ttc, index), (ours.ttc, ours.ttc_index))
         ours = ours._replace(ttc=ttc, ttc_index=ttc_index)
     factor = ours.no_collision * ours.drivable * ours.direction
-    return ours._replace(total=factor * weigh(ours.progress, ours.ttc, ours.comfort, DEFAULT))
+    return ours._replace(total=factor * weighted_mean(ours.progress, ours.ttc, ours.comfort, DEFAULT))
 
 
 def in_line(states: np.ndarray, others: Obstacles) -> np.ndarray:

@@ -3,20 +3,13 @@
 import numpy as np
 
 from shiftsim.kernels import FloatArray, kernel
-from shiftsim.planners.proposals.tracker import (
-    DT,
-    Profiles,
-    factor_speed_fit,
-    fit_profiles,
-    look_ahead,
-)
+from shiftsim.planners.proposals.tracker import DT, fit_speed, reference_at
 from shiftsim.sim.dynamics.bicycle import step_bicycle
 from shiftsim.sim.dynamics.lqr import (
     NUPLAN,
-    TRACKED,
     LqrParameters,
-    Reference,
     command,
+    fit_curvature,
     is_stopping,
 )
 from shiftsim.world.state import NUM_STATE, STEERING_RATE, VX, VY, VehicleParameters
@@ -53,19 +46,12 @@ def _roll_out(
 ) -> None:
     """Drive along poses (81, 3) to a standstill; `states` (81, 11) starts with the ego's."""
     count = len(poses) - 1
-    profiles = Profiles(
-        np.empty(count),
-        np.empty(count),
-        np.empty(params.horizon),
-        np.empty((count + 1, 2)),
-        np.empty((3, count)),
-    )
-    factor_speed_fit(dt, params.jerk_penalty, profiles.factors)
-    fit_profiles(poses, dt, params, profiles)
+    speeds, curvatures, ahead = np.empty(count), np.empty(count), np.empty(params.horizon)
+    fit_speed(poses, dt, params.jerk_penalty, speeds)
+    fit_curvature(poses, speeds, dt, params.curvature_rate_penalty, curvatures)
     for step in range(count):
         state = states[step]
-        lateral, turn = look_ahead(state, poses[step], step, profiles)
-        reference = Reference(TRACKED, lateral, turn, 0.0, profiles.ahead)
+        reference = reference_at(state, poses, step, 0.0, curvatures, ahead)
         accel, rate = command(state, reference, params)
         if soft or is_stopping(state[VX], 0.0, params):
             accel = max(accel, SOFT_ACCEL)

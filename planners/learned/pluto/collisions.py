@@ -31,7 +31,7 @@ def collisions(
     rows = np.arange(places.states.shape[1])
     rows[0] = -1
     # nuPlan rule 251: a contact without fault is looked at again
-    scores, first = first_faults(places, others, near, rows)
+    scores, first = first_faults(places, others, near, rows, False)
     # a red light after another fault does not count
     is_red = (first_red < NEVER) & (first_red <= first)
     return np.where(is_red, 0.0, scores), DT * np.minimum(first, first_red)
