@@ -54,7 +54,7 @@ def _verify_args(file: Source) -> None:
 
 
 def _verify_sampler(file: Source) -> None:
-    from shiftsim.planners.learned.diffusion.network import sampler
+    from shiftsim.planners.learned.diffusion import network_sampler as sampler
 
     numbers = np.arange(sampler.STEPS) + 1
     names = {"sampler": sampler, "made": sampler.SCHEDULE, "numbers": numbers}
@@ -78,7 +78,7 @@ def _verify_forward(file: Source) -> None:
     scene = network.normalise(inputs)
     normalised = {name: scene[name] for name in network.normalisers}
     file.below("norm.").match(file.name, normalised, NORMALISED, quantity=f"{NAME} normalised")
-    encoded, route = network.encode(scene), network.dit[0].route_encoder(scene["route_lanes"])
+    encoded, route = network.encode(scene), network.dit.route_encoder(scene["route_lanes"])
     TABLES["encoded"].match(file.below("out."), file.name, NAME, encoding=encoded, route=route)
     for variant in common.match_case(file, NAME):
         says = _sampled(variant, scene, inputs, given["noise"])
@@ -91,17 +91,17 @@ def _sampled(variant: str, scene: Any, inputs: Any, start: Any) -> dict[str, Any
     """What the sampler comes to with one variant of the weights, and its calls of the network."""
     import torch
 
-    from shiftsim.planners.learned.diffusion.network import sampler
-    from shiftsim.planners.learned.diffusion.network.guidance import with_guidance
+    from shiftsim.planners.learned.diffusion import network_sampler as sampler
+    from shiftsim.planners.learned.diffusion.network_guidance import with_guidance
 
     network = common.make_planner(KeyedPlanner, variant).network
     current, absent = network.present(scene)
-    prepared, noise = network.prepare(scene, absent), torch.from_numpy(start)
+    context, noise = network.context(scene, absent), torch.from_numpy(start)
     seen, made = [], []
 
     def call(x: Any, number: int) -> Any:
         seen.append(x[0, 0].clone())
-        made.append(prepared(x, number))
+        made.append(network.dit(x, sampler.SCHEDULE.call_times[number, None], context))
         return made[-1]
 
     def sampled(function: Callable[[Any, int], Any]) -> Any:

@@ -127,7 +127,7 @@ def likeliest(trajectory: Any, probability: Any) -> Any:
 
 
 def _outputs(network: Any, inputs: Any) -> dict[str, Any]:
-    made = {name: out.numpy() for name, out in network(inputs, predict=True)._asdict().items()}
+    made = {name: out.numpy() for name, out in network(inputs)._asdict().items()}
     return {**made, "poses": likeliest(made["trajectory"], made["probability"])}
 
 
