@@ -17,7 +17,7 @@ NUM_AGENT_KINDS = 4
 HISTORY_CHANNELS = 9
 STATE_CHANNELS = 6  # of the ego state that are read
 _KNOWN_STATES = 3  # of these that are never dropped in training: the pose
-MIN_ROWS, MIN_COLUMNS = 16, 2  # below them CPU libraries compute products in another way
+MIN_ROWS, MIN_COLUMNS = 12, 2  # below these CPU libraries compute products in another way
 LINES_AT_ONCE = 64
 # by level of the history encoder
 _WIDTHS, _HEADS, _WINDOWS, _LENGTHS = (32, 64, 128), (2, 4, 8), (3, 3, 5), (20, 10, 5)
@@ -26,12 +26,15 @@ _WIDTHS, _HEADS, _WINDOWS, _LENGTHS = (32, 64, 128), (2, 4, 8), (3, 3, 5), (20, 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """(..., outputs) of x (..., inputs), weight (outputs, inputs) and bias (outputs,)."""
     count, outputs = x.shape[:-1].numel(), len(weight)
-    if x.is_cuda or count == 0 or (count >= MIN_ROWS and outputs >= MIN_COLUMNS):
+    few = not x.is_cuda and 0 < count < MIN_ROWS
+    if outputs >= MIN_COLUMNS and not few:
         return functional.linear(x, weight, bias)
-    rows = functional.pad(x.reshape(count, -1), (0, 0, 0, max(0, MIN_ROWS - count)))
-    missing = max(0, MIN_COLUMNS - outputs)
-    weight = functional.pad(weight, (0, 0, 0, missing))
-    bias = None if bias is None else functional.pad(bias, (0, missing))
+    rows = x.reshape(count, x.shape[-1])
+    if few:
+        rows = functional.pad(rows, (0, 0, 0, MIN_ROWS - count))
+    if outputs < MIN_COLUMNS:
+        weight = weight.expand(MIN_COLUMNS, -1)
+        bias = None if bias is None else bias.expand(MIN_COLUMNS)
     out = functional.linear(rows, weight, bias)[:count, :outputs]
     return out.reshape(*x.shape[:-1], outputs)
 

@@ -129,9 +129,16 @@ class DiffusionNetwork(nn.Module):
         states = torch.cat([ego, neighbours[..., :STATE]], dim=1)
         return states, torch.cat([nobody, absent], dim=1)
 
-    def context(self, scene: Mapping[str, Tensor], absent: Tensor) -> Context:
-        """What the calls of one plan share, from normalised inputs and absent agents (B, A)."""
-        return self.dit.context(self.encode(scene), scene["route_lanes"], absent)
+    def context(
+        self, scene: Mapping[str, Tensor], absent: Tensor, times: Tensor | None = None
+    ) -> Context:
+        """What the calls of one plan share, from normalised inputs and absent agents (B, A).
+
+        `times` (S, B or 1) are those of the calls; without them they are the sampler's.
+        """
+        if times is None:
+            times = SCHEDULE.call_times.to(absent.device)[:, None]
+        return self.dit.context(self.encode(scene), scene["route_lanes"], absent, times)
 
     def forward(self, inputs: Mapping[str, Tensor], noise: Tensor) -> Tensor:
         """Trajectories (B, A, T, 4), ego first: x, y [m], cos, sin in the ego frame.
@@ -140,8 +147,8 @@ class DiffusionNetwork(nn.Module):
         """
         scene = self.normalise(inputs)
         current, absent = self.present(scene)
-        context, times = self.context(scene, absent), SCHEDULE.call_times.to(noise.device)
-        states = sample(lambda x, call: self.dit(x, times[call, None], context), current, noise)
+        context = self.context(scene, absent)
+        states = sample(lambda x, call: self.dit(x, call, context), current, noise)
         return self.denormalise(states[:, :, 1:])
 
     def denormalise(self, states: Tensor) -> Tensor:

@@ -190,9 +190,10 @@ def _lane_positions(points: Tensor) -> Tensor:
 
 
 class Context(NamedTuple):
-    """What does not depend on the noisy trajectories: computed once per plan."""
+    """What does not depend on the noisy trajectories: computed once for the S calls of a plan."""
 
-    route: Tensor  # (B, hidden) encoded route
+    factors: list[Tensor]  # by block (S, B, 1, 6 * hidden) shifts, scales and gates
+    last_factors: Tensor  # (S, B, 1, 2 * hidden) shift and scale of the last layer
     memory: list[tuple[Tensor, Tensor]]  # by block keys and values (B, N, hidden) of the scene
     mask: Tensor  # (B, 1, 1, A) added to the logits of the agents
 
@@ -226,9 +227,9 @@ class TimeEmbedder(nn.Module):
         )
 
     def forward(self, times: Tensor) -> Tensor:
-        """(B,) times in [0, 1] to (B, hidden)."""
+        """(...) times in [0, 1] to (..., hidden)."""
         steps = torch.arange(FREQUENCIES, dtype=torch.float32, device=times.device)
-        phase = times[:, None] * torch.exp(-math.log(LONGEST) * steps / FREQUENCIES)
+        phase = times[..., None] * torch.exp(-math.log(LONGEST) * steps / FREQUENCIES)
         return self.mlp(torch.cat([torch.cos(phase), torch.sin(phase)], dim=-1))
 
 
@@ -245,11 +246,10 @@ class DiTBlock(nn.Module):
         self.adaLN_modulation = nn.Sequential(nn.SiLU(), Linear(hidden, 6 * hidden))
 
     def forward(
-        self, x: Tensor, condition: Tensor, memory: tuple[Tensor, Tensor], mask: Tensor
+        self, x: Tensor, factors: Tensor, memory: tuple[Tensor, Tensor], mask: Tensor
     ) -> Tensor:
-        """(B, A, hidden) to the same, by a condition (B or 1, hidden); the rest as in `Context`."""
-        factors = self.adaLN_modulation(condition)[:, None].chunk(6, dim=-1)
-        shift1, scale1, gate1, shift2, scale2, gate2 = factors
+        """(B, A, hidden) to the same, by what `Context` has for this block and one call."""
+        shift1, scale1, gate1, shift2, scale2, gate2 = factors.chunk(6, dim=-1)
         y = self.norm1(x) * (1.0 + scale1) + shift1
         x = x + gate1 * self.attn(y, y, y, mask)
         x = x + gate2 * self.mlp1(self.norm2(x) * (1.0 + scale2) + shift2)
@@ -274,9 +274,9 @@ class FinalLayer(nn.Module):
         )
         self.adaLN_modulation = nn.Sequential(nn.SiLU(), Linear(hidden, 2 * hidden))
 
-    def forward(self, x: Tensor, condition: Tensor) -> Tensor:
-        """(B, A, hidden) and (B or 1, hidden) to (B, A, outputs)."""
-        shift, scale = self.adaLN_modulation(condition)[:, None].chunk(2, dim=-1)
+    def forward(self, x: Tensor, factors: Tensor) -> Tensor:
+        """(B, A, hidden) to (B, A, outputs), by the factors of one call."""
+        shift, scale = factors.chunk(2, dim=-1)
         return self.proj(self.norm_final(x) * (1.0 + scale) + shift)
 
 
@@ -292,24 +292,30 @@ class DiT(nn.Module):
         self.blocks = nn.ModuleList(DiTBlock(hidden, heads) for _ in range(depth))
         self.final_layer = FinalLayer(hidden, 4 * POSES)
 
-    def context(self, tokens: Tensor, route_lanes: Tensor, absent: Tensor) -> Context:
+    def context(
+        self, tokens: Tensor, route_lanes: Tensor, absent: Tensor, times: Tensor
+    ) -> Context:
         """What calls share, from tokens of the scene (B, N, hidden) and normalised route lanes.
 
-        `absent` (B, A) are agents that are not there; the ego always is.
+        `absent` (B, A) are agents that are not there, the ego always is; `times` (S, B or 1) are
+        those of the calls.
         """
-        attends = [block.get_submodule("cross_attn") for block in self.blocks]
-        memory = [
-            (attend.project_one(tokens, 1), attend.project_one(tokens, 2))
-            for attend in attends
-            if isinstance(attend, Attention)
-        ]
-        return Context(self.route_encoder(route_lanes), memory, key_mask(~absent))
+        condition = (self.route_encoder(route_lanes) + self.t_embedder(times))[:, :, None]
+        factors, memory = [], []
+        for block in self.blocks:
+            assert isinstance(block, DiTBlock)
+            keys, values = (block.cross_attn.project_one(tokens, number) for number in (1, 2))
+            factors.append(block.adaLN_modulation(condition))
+            memory.append((keys, values))
+        last = self.final_layer.adaLN_modulation(condition)
+        return Context(factors, last, memory, key_mask(~absent))
 
-    def forward(self, x: Tensor, times: Tensor, context: Context) -> Tensor:
-        """Clean trajectories of noisy ones (B, A, 4 * poses), ego first, at times (B or 1,)."""
+    def forward(self, x: Tensor, call: int, context: Context) -> Tensor:
+        """Clean trajectories of noisy ones (B, A, 4 * poses), ego first, at the time of a call."""
         is_neighbour = torch.arange(x.shape[1], device=x.device).clamp(max=1)
-        condition = context.route + self.t_embedder(times)
         x = self.preproj(x) + self.agent_embedding(is_neighbour)
-        for block, memory in zip(self.blocks, context.memory, strict=True):
-            x = block(x, condition, memory, context.mask)
-        return self.final_layer(x, condition)
+        for block, factors, memory in zip(
+            self.blocks, context.factors, context.memory, strict=True
+        ):
+            x = block(x, factors[call], memory, context.mask)
+        return self.final_layer(x, context.last_factors[call])
