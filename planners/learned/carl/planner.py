@@ -96,7 +96,7 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         parts = (np.stack(part) for part in zip(*features, strict=True))
         pictures, measured = (on_device(part, self.device) for part in parts)
         with torch.inference_mode():
-            each = [network.act(pictures, measured) for network in self.networks]
+            each = [network(pictures, measured).action for network in self.networks]
             return list(torch.stack(each).mean(dim=0).cpu().numpy())
 
     def decode(self, output: Action, observation: Observation) -> state.Command:

@@ -38,7 +38,8 @@ def _outputs(network: Any, pictures: Any, measured: Any, told: Any) -> dict[str,
     policy = network.policy(features)
     beta: Any = Beta(policy.alpha, policy.beta)
     return {
-        **{"seen": encoder.see(see), "felt": encoder.feel(feel), "features": features},
+        **{"seen": encoder.encode_raster(see), "felt": encoder.state_linear(feel)},
+        "features": features,
         **{"policy": policy, "value": network.value(features, tell)},
         "log_prob": beta.log_prob(beta.mean).sum(dim=1),
         "entropy": beta.entropy().sum(dim=1),
