@@ -35,7 +35,6 @@ from shiftsim.planners.table import PLANNERS
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.planner import Planner
 from shiftsim.sim.traffic import _MODELS
-from shiftsim.train.pictures import blocks_of
 from shiftsim.train.traffic.labels import labels_of
 from shiftsim.train.traffic.realism import compare
 from shiftsim.world.layers import nearest
@@ -121,7 +120,6 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
         "edited": drive_edited,
         "conversion": convert,
         "tracks and check": convert_table,
-        "rasters": lambda: blocks_of([np.zeros((9, 256, 256), np.uint8)], [False]),
         "realism": lambda: measure_realism(scenario),
         "metrics": lambda: compute_metrics(
             simulate(scenario, load("constant-velocity")), scenario.map

@@ -4,12 +4,10 @@ Several scenarios go in lock step, so that the network sees them as one batch. E
 drives or PDM-Closed, through the actions that it is imitated with.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 from shiftsim.env.episode import Episode
 from shiftsim.errors import ShiftsimError
@@ -17,8 +15,7 @@ from shiftsim.planners.learned.carl.planner import Carl, CarlFeatures, command_o
 from shiftsim.runs.scenarios import open_named_store
 from shiftsim.sim.loop import Setting
 from shiftsim.train.expert import Action, Expert
-from shiftsim.train.network import forward, from_official, lay_out, tensor_of
-from shiftsim.train.pictures import blocks_of, packed
+from shiftsim.train.pictures import packed
 
 EVERY = 2  # steps of which one is kept: neighbours are nearly the same
 _SOON = 30  # steps before an infraction
@@ -63,20 +60,6 @@ class Driven(NamedTuple):
 
 class PolicyPlanner(Carl):
     """The network that is trained, as a planner."""
-
-    def __init__(self, checkpoint: str) -> None:
-        super().__init__(checkpoint)
-        network = self.networks[0]
-        network.load_state_dict(from_official(network.state_dict()))
-        with torch.no_grad():
-            self._laid = lay_out(network)
-
-    def infer(self, features: Sequence[CarlFeatures]) -> list[Action]:
-        """Actions (2,) in [-1, 1], as the network is trained to."""
-        with torch.inference_mode():
-            blocks = blocks_of([f.pictures for f in features], [False] * len(features))
-            measured = torch.from_numpy(np.stack([f.measurements for f in features]))
-            return list(forward(self._laid, tensor_of(blocks), measured).action.numpy())
 
     def remember(self, action: Action) -> None:
         """Take an action that somebody else did as its own last one."""

@@ -10,26 +10,25 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from shiftsim.kernels import IntArray
-from shiftsim.train.network import Laid, tensor_of
-from shiftsim.train.pictures import Blocks
+from shiftsim.planners.learned.carl.raster import Raster
 
 LANES, MICRO = 4, 16  # parts that are summed for themselves; states computed at once
 
-# the blocks of some rows of a batch
-See = Callable[[IntArray], Blocks]
-# of weights, rows and their pictures: the sum of losses over the rows, and of numbers to report
-Judge = Callable[[Laid, IntArray, Tensor], tuple[Tensor, Tensor]]
+# the rasters (B, 9, 256, 256) of some rows of a batch
+GetRasters = Callable[[IntArray], Raster]
+# of rows and their rasters: the sum of losses over the rows, and of numbers to report
+Evaluate = Callable[[IntArray, Tensor], tuple[Tensor, Tensor]]
 
 
 class Summed(NamedTuple):
     """What some states came to."""
 
-    gradients: list[Tensor]  # of the weights that are laid out
+    gradients: list[Tensor]  # of the parameters of the network
     loss: float
-    numbers: Tensor  # of `Judge`
+    numbers: Tensor  # of `Evaluate`
 
 
 class Gradients:
@@ -40,23 +39,31 @@ class Gradients:
         torch.set_num_threads(1)  # sums must not depend on the number of cores
         self._pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
 
-    def of(self, ends: Laid, count: int, see: See, judge: Judge) -> Summed:
-        """The sum over a batch of so many rows; `ends` are leaves."""
+    def of(
+        self, network: nn.Module, count: int, get_rasters: GetRasters, evaluate: Evaluate
+    ) -> Summed:
+        """The sum over a batch of so many rows."""
+        ends = list(network.parameters())
         rows = np.arange(count)
         if self.device != "cpu":
-            blocks = np.concatenate(list(self._pool.map(see, _parts(rows))))
-            return self._part(ends, rows, blocks, judge)
+            rasters = np.concatenate(list(self._pool.map(get_rasters, _parts(rows))))
+            return self._part(ends, rows, rasters, evaluate)
         lanes = np.array_split(rows, LANES)
-        return _sum(self._pool.map(lambda lane: self._lane(ends, lane, see, judge), lanes))
+        return _sum(
+            self._pool.map(lambda lane: self._lane(ends, lane, get_rasters, evaluate), lanes)
+        )
 
-    def _lane(self, ends: Laid, rows: IntArray, see: See, judge: Judge) -> Summed:
+    def _lane(
+        self, ends: list[Tensor], rows: IntArray, get_rasters: GetRasters, evaluate: Evaluate
+    ) -> Summed:
         """The same of some rows, few at once, so that they stay in the cache."""
-        return _sum(self._part(ends, part, see(part), judge) for part in _parts(rows))
+        return _sum(self._part(ends, part, get_rasters(part), evaluate) for part in _parts(rows))
 
-    def _part(self, ends: Laid, rows: IntArray, blocks: Blocks, judge: Judge) -> Summed:
-        loss, numbers = judge(ends, rows, tensor_of(blocks, self.device))
-        wanted = list(ends.values())
-        gradients = torch.autograd.grad(loss, wanted, allow_unused=True, materialize_grads=True)
+    def _part(
+        self, ends: list[Tensor], rows: IntArray, rasters: Raster, evaluate: Evaluate
+    ) -> Summed:
+        loss, numbers = evaluate(rows, torch.from_numpy(rasters).to(self.device))
+        gradients = torch.autograd.grad(loss, ends, allow_unused=True, materialize_grads=True)
         return Summed(list(gradients), float(loss.detach()), numbers.cpu())
 
 

@@ -7,7 +7,7 @@ import torch
 
 from shiftsim.errors import CheckpointError
 from shiftsim.files import whole_file
-from shiftsim.train.network import State
+from shiftsim.train.learning import State
 
 
 def read_state(path: Path) -> dict[str, Any]:

@@ -11,18 +11,11 @@ from torch.nn import functional
 
 from shiftsim.kernels import BoolArray, IntArray
 from shiftsim.planners.learned.carl.network import CarlNetwork, Policy
+from shiftsim.planners.learned.carl.raster import Raster
 from shiftsim.train.gradients import Gradients
-from shiftsim.train.network import (
-    MIRRORED_ACTION,
-    Laid,
-    State,
-    forward,
-    lay_out,
-    leaves,
-    mirrored_measurements,
-)
-from shiftsim.train.pictures import Blocks, blocks_of
+from shiftsim.train.pictures import stack_rasters
 from shiftsim.train.states import States, Values
+from shiftsim.world.state import PACIFICA
 
 BATCH = 64  # states of a step
 RATE, FLOOR, WARM_UP = 1e-3, 0.01, 0.02  # learning rate, its end as a share, share of rising
@@ -34,6 +27,15 @@ BEGUN = 0.5  # share of the learning rate, where weights are given to begin with
 CERTAINTY = 0.01  # weight of the likelihood, by which the distribution gets its width
 EDGE = 0.01  # labels are kept so far from the ends of [0, 1], where the density may be 0 or inf
 HIDDEN, MIRRORED = 0.5, 0.25  # shares: of last actions not shown, of states in the mirror
+# a network in training reads measurements divided by these: last action, velocity and acceleration
+# of the centre [m/s, m/s^2], steering angle and rate [rad, rad/s], yaw rate and acceleration
+UNITS = (1.0, 1.0, 5.0, 0.5, 1.0, 0.5, 0.1, 0.3, 0.2, 0.5)
+MIRRORED_ACTION = np.array([1, -1], np.float32)  # signs in the mirror
+_MIRRORED = np.array([1, -1, 1, -1, 1, -1, -1, -1, -1, -1], np.float32)
+_AX, _YAW_ACCEL = 4, 9  # of the measurements
+_FIRST_WEIGHT = "features_extractor.state_linear.0.weight"
+
+State = dict[str, Tensor]
 
 
 class Batch(NamedTuple):
@@ -43,6 +45,34 @@ class Batch(NamedTuple):
     mirrored: BoolArray  # (B,)
     measurements: Values  # (B, 10)
     actions: Values  # (B, 2)
+
+
+def to_official(state: State) -> State:
+    """A state as the planner has it, which knows no units: its first layer takes them in."""
+    weight = state[_FIRST_WEIGHT]
+    return {**state, _FIRST_WEIGHT: weight / torch.tensor(UNITS, device=weight.device)}
+
+
+def from_official(state: State) -> State:
+    """The inverse of `to_official`."""
+    weight = state[_FIRST_WEIGHT]
+    return {**state, _FIRST_WEIGHT: weight * torch.tensor(UNITS, device=weight.device)}
+
+
+def in_units(measurements: Tensor) -> Tensor:
+    """Measurements (B, 10) as a network in training reads them."""
+    return measurements / torch.tensor(UNITS, device=measurements.device)
+
+
+def mirrored_measurements(measurements: Values) -> Values:
+    """(…, 10) measurements of the ego in the mirror.
+
+    The acceleration of the centre holds the yaw acceleration, with its sign.
+    """
+    out = measurements * _MIRRORED
+    turning = PACIFICA.rear_axle_to_center * measurements[..., _YAW_ACCEL]
+    out[..., _AX] -= np.float32(2.0) * turning.astype(np.float32)
+    return out
 
 
 def draw_batch(states: States, key: Iterable[int], size: int = BATCH) -> Batch:
@@ -123,24 +153,23 @@ class Learner:
 
     def learn(self, states: States, batch: Batch) -> StepResult:
         """Do one step."""
-        laid = lay_out(self.network)
         count = len(batch.indices)
 
-        def see(rows: IntArray) -> Blocks:
+        def get_rasters(rows: IntArray) -> Raster:
             rasters = [states.picture(int(index)) for index in batch.indices[rows]]
-            return blocks_of(rasters, batch.mirrored[rows].tolist())
+            return stack_rasters(rasters, batch.mirrored[rows].tolist())
 
-        def judge(ends: Laid, rows: IntArray, pictures: Tensor) -> tuple[Tensor, Tensor]:
-            measured = torch.from_numpy(batch.measurements[rows]).to(pictures.device)
-            label = torch.from_numpy(batch.actions[rows]).to(pictures.device)
-            return loss_of(forward(ends, pictures, measured), label)
+        def evaluate(rows: IntArray, rasters: Tensor) -> tuple[Tensor, Tensor]:
+            measured = torch.from_numpy(batch.measurements[rows]).to(rasters.device)
+            label = torch.from_numpy(batch.actions[rows]).to(rasters.device)
+            return loss_of(self.network(rasters, in_units(measured)), label)
 
-        gradients, loss, errors = self._gradients.of(leaves(laid), count, see, judge)
+        gradients, loss, errors = self._gradients.of(self.network, count, get_rasters, evaluate)
         torch._foreach_div_(gradients, float(count))
         for group in self.optimiser.param_groups:
             group["lr"] = self._rate * schedule(self.step / self.total)
-        self.optimiser.zero_grad()
-        torch.autograd.backward(list(laid.values()), gradients)
+        for parameter, gradient in zip(self.network.parameters(), gradients, strict=True):
+            parameter.grad = gradient
         torch.nn.utils.clip_grad_norm_(self._trained, CLIP)
         self.optimiser.step()
         self.step += 1

@@ -18,24 +18,13 @@ from torch import Tensor
 from shiftsim.files import write_text
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.planners.learned.carl.network import CarlNetwork, Policy
+from shiftsim.planners.learned.carl.raster import Raster
 from shiftsim.train.curves import Say, write_table
 from shiftsim.train.gradients import Gradients
 from shiftsim.train.jobs import NOISES, Towns
 from shiftsim.train.keeping import read_state, write_state
-from shiftsim.train.learning import log_density
-from shiftsim.train.network import (
-    Laid,
-    State,
-    features_of,
-    from_official,
-    lay_out,
-    leaves,
-    policy_of,
-    tensor_of,
-    to_official,
-    value_of,
-)
-from shiftsim.train.pictures import Blocks, blocks_of, packed, unpacked
+from shiftsim.train.learning import State, from_official, in_units, log_density, to_official
+from shiftsim.train.pictures import packed, unpacked
 from shiftsim.train.settings import Settings
 
 ENVS = 8
@@ -201,10 +190,9 @@ class Trainer:
         actions, ended = np.zeros((steps, ENVS, 2)), np.zeros((steps, ENVS), np.bool_)
         density, values, rewards = np.zeros((3, steps, ENVS))
         with torch.no_grad():
-            laid = lay_out(self.network, critic=True)
             for step in range(steps):
                 seen = self._seen
-                policy, value = self._ask(laid, seen)
+                policy, value = self._ask(seen)
                 x = torch.distributions.Beta(policy.alpha, policy.beta).sample()
                 x = x.clamp(_EDGE, 1.0 - _EDGE)
                 density[step] = log_density(policy.alpha, policy.beta, x).sum(1).cpu()
@@ -215,18 +203,18 @@ class Trainer:
                 self._seen, reward, infraction, is_over, _ = self._envs.step(asked)
                 rewards[step], ended[step] = reward / PERCENT, infraction | is_over
                 self._count(reward, ended[step])
-            last = self._ask(laid, self._seen)[1].cpu().numpy().astype(np.float64)
+            last = self._ask(self._seen)[1].cpu().numpy().astype(np.float64)
         gains = advantages_of(rewards, values, ended, last)
         numbers = (measured, critic, actions, density, values, gains + values, gains)
         flat = [found.reshape(-1, *found.shape[2:]).astype(np.float32) for found in numbers]
         return Memory(pictures, *flat)
 
-    def _ask(self, laid: Laid, seen: dict[str, Any]) -> tuple[Policy, Tensor]:
-        blocks = blocks_of(seen["raster"], [False] * ENVS)
+    def _ask(self, seen: dict[str, Any]) -> tuple[Policy, Tensor]:
+        rasters = torch.from_numpy(seen["raster"]).to(self._device)
         measured = torch.from_numpy(seen["measurements"]).to(self._device)
         critic = torch.from_numpy(seen["value_measurements"]).to(self._device)
-        features = features_of(laid, tensor_of(blocks, self._device), measured)
-        return policy_of(laid, features), value_of(laid, features, critic)
+        features = self.network.features_extractor(rasters, in_units(measured))
+        return self.network.policy(features), self.network.value(features, critic)[:, 0]
 
     def _count(self, reward: FloatArray, over: NDArray[np.bool_]) -> None:
         self._sums += reward
@@ -239,23 +227,22 @@ class Trainer:
         gain = chosen["advantages"]
         chosen["advantages"] = (gain - gain.mean()) / (gain.std() + 1e-8)
 
-        def see(rows: IntArray) -> Blocks:
-            rasters = [unpacked(memory.pictures[index]) for index in order[rows]]
-            return blocks_of(rasters, [False] * len(rows))
+        def get_rasters(rows: IntArray) -> Raster:
+            return np.stack([unpacked(memory.pictures[index]) for index in order[rows]])
 
-        def judge(ends: Laid, rows: IntArray, pictures: Tensor) -> tuple[Tensor, Tensor]:
-            part = {name: value[rows].to(pictures.device) for name, value in chosen.items()}
-            features = features_of(ends, pictures, part["measurements"])
-            policy = policy_of(ends, features)
-            seen = features.detach() if critic_only else features
-            values = value_of(ends, seen, part["critic"])
+        def evaluate(rows: IntArray, rasters: Tensor) -> tuple[Tensor, Tensor]:
+            part = {name: value[rows].to(rasters.device) for name, value in chosen.items()}
+            measured = in_units(part["measurements"])
+            features = self.network.features_extractor(rasters, measured)
+            policy = self.network.policy(features)
+            known = features.detach() if critic_only else features
+            values = self.network.value(known, part["critic"])[:, 0]
             return judged(policy, values, part, critic_only=critic_only)
 
-        laid = lay_out(self.network, critic=True)
-        found = self._gradients.of(leaves(laid), len(order), see, judge)
+        found = self._gradients.of(self.network, len(order), get_rasters, evaluate)
         torch._foreach_div_(found.gradients, float(len(order)))
-        self._optimiser.zero_grad()
-        torch.autograd.backward(list(laid.values()), found.gradients)
+        for parameter, gradient in zip(self.network.parameters(), found.gradients, strict=True):
+            parameter.grad = gradient
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), CLIP_NORM)
         self._optimiser.step()
         return found.loss / len(order), float(found.numbers[0])

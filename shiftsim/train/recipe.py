@@ -17,8 +17,14 @@ from shiftsim.runs.verdicts import read_verdicts
 from shiftsim.train.curves import Say, draw_curves, write_table
 from shiftsim.train.jobs import Towns, collect, divide, mean_scores
 from shiftsim.train.keeping import read_state, write_network, write_state
-from shiftsim.train.learning import BATCH, Learner, draw_batch
-from shiftsim.train.network import State, from_official, to_official
+from shiftsim.train.learning import (
+    BATCH,
+    Learner,
+    State,
+    draw_batch,
+    from_official,
+    to_official,
+)
 from shiftsim.train.settings import TAUS, Settings, prepare_folder
 from shiftsim.train.states import States, read_part, write_part
 

@@ -10,7 +10,7 @@ from shiftsim.planners.learned.carl.network import CarlNetwork, Policy
 from shiftsim.planners.learned.carl.planner import MAX_STEERING, command_of, measure
 from shiftsim.sim.loop import Setting, simulate
 from shiftsim.sim.planner import observe_log, scene_info
-from shiftsim.train import network as fast
+from shiftsim.train import learning
 from shiftsim.train.expert import Expert, encode, hold
 from shiftsim.train.learning import (
     BATCH,
@@ -22,7 +22,7 @@ from shiftsim.train.learning import (
     loss_of,
     schedule,
 )
-from shiftsim.train.pictures import blocks_of, packed, unpacked
+from shiftsim.train.pictures import packed, stack_rasters, unpacked
 from shiftsim.train.states import State, States, importance, read_part, write_part
 
 
@@ -80,7 +80,7 @@ def rasters(random, count):
 
 
 def measurements(random, count):
-    return (random.normal(size=(count, 10)) * fast.UNITS).astype(np.float32)
+    return (random.normal(size=(count, 10)) * learning.UNITS).astype(np.float32)
 
 
 def test_a_raster_is_kept_without_loss(rng):
@@ -88,22 +88,9 @@ def test_a_raster_is_kept_without_loss(rng):
     assert np.array_equal(unpacked(packed(raster)), raster)
 
 
-def test_the_fast_network_is_that_of_the_planner(rng):
-    torch.manual_seed(0)
-    network, official = CarlNetwork(), CarlNetwork()
-    official.load_state_dict(fast.to_official(network.state_dict()))
-    pictures, measured = rasters(rng, 8), torch.from_numpy(measurements(rng, 8))
-    with torch.no_grad():
-        slow = official(torch.from_numpy(pictures), measured).action
-        laid = fast.lay_out(network)
-        found = fast.forward(laid, fast.tensor_of(blocks_of(pictures, [False] * 8)), measured)
-    assert found.action.numpy() == pytest.approx(slow.numpy(), abs=0.01)
-    assert slow.std(0).min() > 0.01
-
-
 def test_units_are_taken_in_and_out():
     state = CarlNetwork().state_dict()
-    there = fast.from_official(fast.to_official(state))
+    there = learning.from_official(learning.to_official(state))
     for name, value in state.items():
         assert torch.allclose(there[name], value)
 
@@ -115,11 +102,11 @@ def test_a_mirrored_raster_is_that_of_the_mirrored_world(rng):
         scratch = np.zeros((4, 2), np.int64)
         box = (10.3, sign * 7.21, sign * 0.4, 4.6, 2.1)
         draw_box(raster[view.VEHICLES], frame, box, scratch)
-    mirrored, straight = blocks_of([left], [True]), blocks_of([right], [False])
+    mirrored, straight = stack_rasters([left], [True]), stack_rasters([right], [False])
     # the corners of a box are cut to whole pixels, of which some lie one aside
     assert (mirrored != straight).sum() <= 8
     assert (mirrored != 0).sum() > 40
-    assert np.array_equal(blocks_of([left[:, ::-1].copy()], [False]), mirrored)
+    assert np.array_equal(stack_rasters([left[:, ::-1].copy()], [False]), mirrored)
 
 
 def draw_box(raster, frame, box, ring):
@@ -133,8 +120,8 @@ def test_mirrored_measurements_are_those_of_the_mirrored_ego(rng):
     ego = rng.normal(size=11)
     mirrored = ego * [1, -1, -1, 1, -1, 1, -1, -1, -1, -1, -1]
     action = np.float32([0.3, 0.2])
-    found = fast.mirrored_measurements(measure(ego, action))
-    other = measure(mirrored, action * fast.MIRRORED_ACTION)
+    found = learning.mirrored_measurements(measure(ego, action))
+    other = measure(mirrored, action * learning.MIRRORED_ACTION)
     assert found == pytest.approx(other, abs=1e-5)
 
 
@@ -212,7 +199,7 @@ def test_rare_states_are_drawn_more_often(states):
 def test_a_batch_hides_last_actions_and_mirrors_with_the_sign_of_steering(states):
     batch = draw_batch(states, (1, 2), size=4000)
     plain = states.actions[batch.indices]
-    flipped = np.where(batch.mirrored[:, None], fast.MIRRORED_ACTION, np.float32([1, 1]))
+    flipped = np.where(batch.mirrored[:, None], learning.MIRRORED_ACTION, np.float32([1, 1]))
     assert np.array_equal(batch.actions, plain * flipped)
     assert batch.mirrored.mean() == pytest.approx(MIRRORED, abs=0.05)
     hidden = (batch.measurements[:, :2] == 0.0).all(axis=1)

@@ -222,9 +222,7 @@ class TimeEmbedder(nn.Module):
 
     def __init__(self, hidden: int) -> None:
         super().__init__()
-        self.mlp = nn.Sequential(
-            Linear(2 * FREQUENCIES, hidden), nn.SiLU(), Linear(hidden, hidden)
-        )
+        self.mlp = nn.Sequential(Linear(2 * FREQUENCIES, hidden), nn.SiLU(), Linear(hidden, hidden))
 
     def forward(self, times: Tensor) -> Tensor:
         """(...) times in [0, 1] to (..., hidden)."""

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from shiftsim.planners.learned import features as builder
-from shiftsim.planners.learned.match import network_module
+from shiftsim.planners.learned.checkpoint import network_module
 from shiftsim.planners.learned.plan_states import STEP, plan_of_poses
 from shiftsim.planners.learned.plantf.planner import PlanTF, make_batch
 from shiftsim.planners.learned.pluto.proposals import headings_of

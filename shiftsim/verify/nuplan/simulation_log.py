@@ -20,8 +20,8 @@ import numpy as np
 
 from shiftsim.errors import DataError, MissingExtraError
 from shiftsim.kernels import IntArray
-from shiftsim.planners.learned.reader import BROKEN, PlainReader
 from shiftsim.verify.files import DAMAGED, Source
+from shiftsim.verify.nuplan.plain_pickle import BROKEN, PlainReader
 from shiftsim.verify.report import Report
 from shiftsim.verify.worlds import CENTER_COLUMNS
 from shiftsim.world.state import AgentKind, LightStatus, rear_poses
