@@ -27,8 +27,7 @@ from shiftsim.data.nuplan.scenarios import find_maps
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.planners.learned.checkpoint import network_module
 from shiftsim.planners.learned.deterministic import deterministic_state, keyed_normals, rule_of
-from shiftsim.planners.learned.features import PLAN_POSES
-from shiftsim.planners.learned.plan_states import STEP
+from shiftsim.planners.learned.features import PLAN_POSES, STEP
 from shiftsim.planners.routes import correction
 from shiftsim.sim.loop import Rollout
 from shiftsim.sim.planner import past_rows

@@ -9,9 +9,9 @@ import numpy as np
 
 from shiftsim.planners.learned import features as builder
 from shiftsim.planners.learned.checkpoint import network_module
-from shiftsim.planners.learned.plan_states import STEP, plan_of_poses
+from shiftsim.planners.learned.features import STEP, plan_of_poses
 from shiftsim.planners.learned.plantf.planner import PlanTF, make_batch
-from shiftsim.planners.learned.pluto.proposals import headings_of
+from shiftsim.planners.learned.pluto.planner import headings_of
 from shiftsim.verify.files import Source
 from shiftsim.verify.nets.common import Loop, make_planner
 from shiftsim.verify.tables import Table, read_tables

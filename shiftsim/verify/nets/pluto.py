@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from shiftsim.planners.learned.map_features import CROSSWALK
-from shiftsim.planners.learned.pluto import brake, inputs, planner, scoring
-from shiftsim.planners.learned.pluto.proposals import headings_of
+from shiftsim.planners.learned.pluto import planner, scoring
+from shiftsim.planners.learned.pluto.planner import headings_of
 from shiftsim.verify.files import Source
 from shiftsim.verify.nets import common, plantf
 from shiftsim.verify.tables import read_tables, rows_of
@@ -23,9 +23,9 @@ def _verify_brake(file: Source) -> None:
     for number, case in enumerate(rows_of(file)):
         ego, time = case.take("ego", NUM_STATE), float(case["fault_time"])
         speed = float(np.hypot(ego[VX], ego[VY]))
-        braked, states = brake.must_brake(speed, time), np.full((81, NUM_STATE), np.nan)
+        braked, states = scoring.must_brake(speed, time), np.full((81, NUM_STATE), np.nan)
         if braked:
-            states = brake.brake(case["candidate"], ego, time, PACIFICA)
+            states = scoring.brake(case["candidate"], ego, time, PACIFICA)
         ours = {"speed": speed, "braked": braked, "states": states}
         case.match(f"case {number}", ours, {"speed": LINE, "": common.STATE})
 
@@ -49,8 +49,6 @@ def _outputs(network: Any, batch: Any) -> dict[str, Any]:
 
 def compare(loop: common.Loop) -> None:
     """Compare everything stored of one iteration."""
-    from shiftsim.planners.learned.pluto.network import Inputs
-
     choice, stored = loop.planner.choice, loop.stored.below("post/")
     loop.match("choice", stored)
     parts = (stored[name] for name in ("multi", "weighted", "progress"))
@@ -58,7 +56,7 @@ def compare(loop: common.Loop) -> None:
     loop.match("aggregated", stored, "aggregated", progress=progress, rule=rule)
     if "agent_tokens" in loop.stored:  # one of the iterations stored in full
         _compare_sight(loop)
-        batch = Inputs(*inputs.stack([loop.features], "cpu"))
+        batch = planner.make_batch([loop.features], "cpu")
         plantf.compare_network(loop, _outputs, batch, "outputs")
         # what the scores of the stored proposals are, against the stored predictions
         agents, proposals = choice.agents, np.ascontiguousarray(stored["cand"])

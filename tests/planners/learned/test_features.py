@@ -16,6 +16,7 @@ from shiftsim.planners.learned.features import (
     SAMPLES,
     agent_features,
     map_poses,
+    plan_of_poses,
     straight_on,
 )
 from shiftsim.planners.learned.map_features import (
@@ -29,7 +30,6 @@ from shiftsim.planners.learned.map_features import (
     road_features,
     road_objects,
 )
-from shiftsim.planners.learned.plan_states import plan_of_poses
 from shiftsim.planners.per_map import PerMap
 from shiftsim.sim.planner import History
 from shiftsim.world.build import AreaSpec, build_map
