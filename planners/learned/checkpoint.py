@@ -12,7 +12,7 @@ first of the two that is there.
 import hashlib
 import importlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -89,10 +89,14 @@ def load_weights(spec: str, planner: str, *, device: str = "cpu") -> Weights:
         MissingExtraError: PyTorch is not installed.
     """
     require_torch(f"planner {planner!r}")
+    import torch
+
     place = resolve_device(device)
     prepare_inference(place)
     if spec.startswith("deterministic:"):
-        state, args = _deterministic(spec, planner), None
+        variant = _known_deterministic(spec).removeprefix("deterministic:")
+        weights = network_weights(network_module(planner), variant)
+        state, args = {name: torch.from_numpy(value) for name, value in weights.items()}, None
     else:
         found = open_checkpoint(find_checkpoint(spec, planner))
         args = needed_args(found, planner)
@@ -313,44 +317,33 @@ def shapes_of(state: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
 
 def most_like(shapes: Shapes) -> str:
     """The planner whose network has most of these names and shapes; empty where none has half."""
-    best, name = max((_likeness(shapes, planner), planner) for planner in PUBLISHED)
-    return name if best >= LIKENESS else ""
-
-
-def _likeness(shapes: Shapes, planner: str) -> float:
-    wanted = _standard_shapes(planner)
-    equal = len(shapes.items() & wanted.items())
-    return equal / max(len(shapes), len(wanted))
-
-
-@lru_cache
-def _standard_shapes(planner: str) -> dict[str, tuple[int, ...]]:
-    return shapes_of(empty_state(planner))
+    likeness = {}
+    for planner in PUBLISHED:
+        wanted = shapes_of(empty_state(planner))
+        equal = len(shapes.items() & wanted.items())
+        likeness[planner] = equal / max(len(shapes), len(wanted))
+    name = max(likeness, key=likeness.__getitem__)
+    return name if likeness[name] >= LIKENESS else ""
 
 
 def _differences(shapes: Shapes, wanted: Shapes) -> str:
     """What keeps these tensors from being loaded into a network, in words; empty where nothing."""
-    both = wanted.keys() & shapes.keys()
-    wrong = [
-        f"{name} is {_dims(shapes[name])}, not {_dims(wanted[name])}"
-        for name in wanted
-        if name in both and shapes[name] != wanted[name]
-    ]
+    dims = {name: "x".join(map(str, shape)) or "a scalar" for name, shape in shapes.items()}
     kinds = {
-        "missing": [name for name in wanted if name not in both],
-        "unexpected": [name for name in shapes if name not in both],
-        "of another shape": wrong,
+        "missing": [name for name in wanted if name not in shapes],
+        "unexpected": [name for name in shapes if name not in wanted],
+        "of another shape": [
+            f"{name} is {dims[name]}, not {'x'.join(map(str, shape)) or 'a scalar'}"
+            for name, shape in wanted.items()
+            if shapes.get(name, shape) != shape
+        ],
     }
-    return "; ".join(f"{len(n)} {what}: {_first_of(n)}" for what, n in kinds.items() if n)
-
-
-def _dims(shape: tuple[int, ...]) -> str:
-    return "x".join(map(str, shape)) or "a scalar"
-
-
-def _first_of(names: Sequence[str]) -> str:
-    rest = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return ", ".join(names[:_NAMED]) + rest
+    return "; ".join(
+        f"{len(names)} {what}: {', '.join(names[:_NAMED])}"
+        + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
+        for what, names in kinds.items()
+        if names
+    )
 
 
 def file_hash(path: Path) -> str:
@@ -398,11 +391,3 @@ def _known_deterministic(spec: str) -> str:
         hint = f"there are {' and '.join(DETERMINISTIC)}"
         raise CheckpointError(f"checkpoint {spec!r} unknown", hint)
     return spec
-
-
-def _deterministic(spec: str, planner: str) -> dict[str, Any]:
-    import torch
-
-    variant = _known_deterministic(spec).removeprefix("deterministic:")
-    state = network_weights(network_module(planner), variant)
-    return {name: torch.from_numpy(value) for name, value in state.items()}

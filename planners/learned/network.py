@@ -425,11 +425,12 @@ class PointsEncoder(nn.Module):
         """(M, K, channels) with `valid` (M, K) to (M, 128)."""
         first = self.first_mlp(points[valid])
         # the second part reads a point beside the maximum over its line, the same for all of them
-        enter, norm, activation, leave = self.second_mlp
+        enter = self.second_mlp[0]
+        assert isinstance(enter, Linear)
         own, of_line = enter.weight.split(first.shape[1], dim=1)
         shared = linear(_pooled(first, valid), of_line)
         hidden = linear(first, own, enter.bias) + shared[valid.nonzero()[:, 0]]
-        return _pooled(leave(activation(norm(hidden))), valid)
+        return _pooled(self.second_mlp[1:](hidden), valid)
 
 
 def _pooled(values: Tensor, valid: Tensor) -> Tensor:

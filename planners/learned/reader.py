@@ -1,16 +1,20 @@
 """What a checkpoint file holds, read without running anything that is in it.
 
 Torch files are pickles, and a pickle is a program: torch reads plain containers and tensors of it
-alone, and where a file names another class, as training frameworks leave behind, it is given one
-that does nothing.
+alone, and for every other class that a file names, as training frameworks leave behind, an empty
+dictionary stands.
 """
 
 import json
 import warnings
 import zipfile
+from collections import OrderedDict
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from shiftsim.errors import CheckpointError
 
@@ -35,21 +39,11 @@ class Contents:
     skipped: tuple[str, ...] = ()  # names of the classes whose objects were left out
 
 
-class Inert(dict[Any, Any]):
-    """In the place of an object of a foreign class: takes everything, does nothing."""
+class _StandIn:
+    """In the place of a foreign class: an empty dictionary, whatever an object is made with."""
 
-    def __new__(cls, *_args: object, **_named: object) -> "Inert":
-        """Another one, whatever it is made with."""
-        return dict.__new__(cls)
-
-    def __init__(self, *_args: object, **_named: object) -> None:
-        super().__init__()
-
-    def __setstate__(self, _state: object) -> None:
-        pass
-
-    __hash__ = object.__hash__  # type: ignore[assignment]  # keys of a dict must be hashable
-    __eq__ = object.__eq__
+    def __new__(cls, *_args: object) -> "OrderedDict[Any, Any]":  # type: ignore[misc]
+        return OrderedDict()
 
 
 def read_contents(path: Path) -> Contents:
@@ -107,16 +101,26 @@ def _read_torch(path: Path, is_zip: bool) -> Contents:
     import torch
 
     skipped: list[str] = []
-    if is_zip:
-        with zipfile.ZipFile(path) as archive:
-            if bad := archive.testzip():  # torch itself would load other numbers
-                raise zipfile.BadZipFile(f"wrong checksum of {bad}")
-        skipped = sorted(torch.serialization.get_unsafe_globals_in_checkpoint(path))
-    stand_ins: list[Any] = [(type("Inert", (Inert,), {}), name) for name in skipped]
-    with torch.serialization.safe_globals(stand_ins), warnings.catch_warnings():
+    with torch.serialization.safe_globals(list(_numpy_scalars())), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of other pickle protocols
-        loaded = torch.load(path, map_location="cpu", weights_only=True)
+        if is_zip:
+            with zipfile.ZipFile(path) as archive:
+                if bad := archive.testzip():  # torch itself would load other numbers
+                    raise zipfile.BadZipFile(f"wrong checksum of {bad}")
+            skipped = sorted(torch.serialization.get_unsafe_globals_in_checkpoint(path))
+        stand_ins: list[Any] = [(_StandIn, name) for name in skipped]
+        with torch.serialization.safe_globals(stand_ins):
+            loaded = torch.load(path, map_location="cpu", weights_only=True)
     return Contents("torch zip" if is_zip else "torch, before 1.6", loaded, skipped=tuple(skipped))
+
+
+def _numpy_scalars() -> Iterator[Any]:
+    """What numbers of NumPy are made of, under its old name too."""
+    scalar: Any = np.float64(0.0).__reduce__()[0]
+    yield from ((scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core"))
+    yield np.dtype
+    kinds = (np.bool_, np.int32, np.int64, np.uint8, np.float16, np.float32, np.float64)
+    yield from (type(np.dtype(kind)) for kind in kinds)
 
 
 def read_json_object(path: Path) -> dict[str, Any]:

@@ -43,7 +43,7 @@ class Gradients:
         self, network: nn.Module, count: int, get_rasters: GetRasters, evaluate: Evaluate
     ) -> Summed:
         """The sum over a batch of so many rows."""
-        ends = list(network.parameters())
+        ends: list[Tensor] = [*network.parameters()]
         rows = np.arange(count)
         if self.device != "cpu":
             rasters = np.concatenate(list(self._pool.map(get_rasters, _parts(rows))))

@@ -94,7 +94,8 @@ class PlanTfNetwork(nn.Module):
         x = self.norm(x)
         agents = scenes.unpack(x)[:, 1 : inputs.valid.shape[1]]
         prediction = self.agent_predictor(agents).view(*agents.shape[:2], STEPS, 2)
-        return Outputs(*self.trajectory_decoder(scenes.firsts(x)), prediction)
+        trajectory, probability = self.trajectory_decoder(scenes.firsts(x))
+        return Outputs(trajectory, probability, prediction)
 
 
 def build_network(args: Mapping[str, Any] | None = None) -> PlanTfNetwork:

@@ -173,13 +173,12 @@ class DecoderBlock(nn.Module):
     ) -> Tensor:
         """(L, modes, 128); zero before the attention to the scene for lines without points."""
         normed = self.norm1(x)
-        q, k, v = self.r2r_attn.project(normed, normed, normed)
-        each = zip(lines.split(q), lines.split(k), lines.split(v), strict=True)
-        mixed = [
+        parts = self.r2r_attn.project(normed, normed, normed)
+        mixed = []
+        for q, k, v, mask in zip(*map(lines.split, parts), masks, strict=True):
             # every mode of a line attends to the same mode of the scene's others
-            self.r2r_attn.attend(*(part.transpose(0, 1) for part in parts), mask).transpose(0, 1)
-            for parts, mask in zip(each, masks, strict=True)
-        ]
+            q, k, v = q.transpose(0, 1), k.transpose(0, 1), v.transpose(0, 1)
+            mixed.append(self.r2r_attn.attend(q, k, v, mask).transpose(0, 1))
         x = x + self.r2r_attn.out_proj(torch.cat(mixed))
         normed = self.norm2(x)
         x = x + self.m2m_attn(normed + place, normed + place, normed)
@@ -279,7 +278,8 @@ class PlutoNetwork(nn.Module):
         egos = scenes.firsts(x)
         prediction = self.agent_predictor(scenes.unpack(x)[:, 1 : inputs.valid.shape[1]])
         free = self.ref_free_decoder(egos).view(len(egos), STEPS, 4)
-        return Outputs(*self.planning_decoder(inputs, x, scenes, egos), prediction, free, egos)
+        trajectory, probability = self.planning_decoder(inputs, x, scenes, egos)
+        return Outputs(trajectory, probability, prediction, free, egos)
 
 
 def build_network(args: Mapping[str, Any] | None = None) -> PlutoNetwork:

@@ -247,7 +247,7 @@ def make_batch(scenes: Sequence[SceneInputs], device: str) -> Any:
 
     parts = ("category", "kind", "object_category", "line_valid")
     counts = [[len(getattr(scene, name)) for scene in scenes] for name in parts]
-    return Inputs(*stack_scenes(scenes, device), counts)
+    return Inputs(*[*stack_scenes(scenes, device), counts])
 
 
 def headings_of(trajectory: np.ndarray) -> np.ndarray:

@@ -210,5 +210,9 @@ def line_features(lines: Sequence[FloatArray], rear: FloatArray) -> LineFeatures
     cos, sin = np.cos(rear[2]), np.sin(rear[2])
     turn = np.array([[cos, -sin], [sin, cos]])
     # nuPlan rule 248: padding is moved as well
-    moved = (points[..., :2] - rear[:2]) @ turn, points[..., 2:4] @ turn, points[..., 4] - rear[2]
-    return LineFeatures(*(part.astype(np.float32) for part in moved), valid)
+    position, vector = (points[..., :2] - rear[:2]) @ turn, points[..., 2:4] @ turn
+    orientation = points[..., 4] - rear[2]
+    single = np.float32
+    return LineFeatures(
+        position.astype(single), vector.astype(single), orientation.astype(single), valid
+    )
