@@ -188,21 +188,21 @@ def road_features(
     square = square_around(float(center[0]), float(center[1]), radius)
     edges = meeting(road.edges.polygons, square)
     near = np.concatenate([edges, len(road.edges) + meeting(road.crosswalks.polygons, square)])
-    kept, points, vectors, orientations, valid = _to_ego_frame(
+    chosen, points, vectors, orientations, valid = _to_ego_frame(
         known.lines, known.angles, near, ego[0], ego[1], ego[2], radius
     )
-    limit = known.limit[kept]
+    limit = known.limit[chosen]
     has_limit = ~np.isnan(limit)
-    light = np.full(len(kept), int(LightStatus.UNKNOWN))
-    num_edges = int(np.searchsorted(kept, len(road.edges)))
-    light[:num_edges] = lights[kept[:num_edges]]
-    block = known.block[kept]
-    routed = (block != NONE) & on_route[block] if len(on_route) else np.zeros(len(kept), np.bool_)
+    light = np.full(len(chosen), int(LightStatus.UNKNOWN))
+    num_edges = int(np.searchsorted(chosen, len(road.edges)))
+    light[:num_edges] = lights[chosen[:num_edges]]
+    block = known.block[chosen]
+    routed = (block != NONE) & on_route[block] if len(on_route) else np.zeros(len(chosen), np.bool_)
     centers = np.concatenate(
         [points[:, 0, _MIDDLE], orientations[:, 0, _MIDDLE : _MIDDLE + 1]], axis=1
     )
     return RoadFeatures(
-        *(kept, points, vectors, orientations, centers, valid, known.kind[kept], routed, light),
+        *(chosen, points, vectors, orientations, centers, valid, known.kind[chosen], routed, light),
         *(has_limit, np.where(has_limit, limit, 0.0).astype(np.float32)),
     )
 
@@ -219,7 +219,7 @@ def _to_ego_frame(
 ) -> tuple[IntArray, np.ndarray, np.ndarray, np.ndarray, BoolArray]:
     """Objects with a valid point, moved and turned; invalid points are, too."""
     cos, sin = np.cos(heading), np.sin(heading)
-    kept = np.empty(len(near), np.int64)
+    chosen = np.empty(len(near), np.int64)
     valid = np.empty((len(near), POINTS), np.bool_)
     count = 0
     for row in near:
@@ -230,13 +230,13 @@ def _to_ego_frame(
             valid[count, point] = abs(ahead) < radius and abs(left) < radius
             seen = seen or valid[count, point]
         if seen:
-            kept[count] = row
+            chosen[count] = row
             count += 1
     points = np.empty((count, 3, POINTS, 2), np.float32)
     vectors = np.empty((count, 3, POINTS, 2), np.float32)
     orientations = np.empty((count, 3, POINTS), np.float32)
     for index in range(count):
-        row = kept[index]
+        row = chosen[index]
         for side in range(3):
             line = lines[row, side]
             for point in range(POINTS):
@@ -247,4 +247,4 @@ def _to_ego_frame(
                 vectors[index, side, point, 0] = cos * dx + sin * dy
                 vectors[index, side, point, 1] = cos * dy - sin * dx
                 orientations[index, side, point] = angles[row, side, point] - heading
-    return kept[:count], points, vectors, orientations, valid[:count]
+    return chosen[:count], points, vectors, orientations, valid[:count]

@@ -79,8 +79,8 @@ class InferenceServer:
                 return self._planners[name].infer(features), ""
         except Exception as error:  # becomes that of the scenario
             ours = isinstance(error, ShiftsimError)
-            told = error if ours else PlannerError(f"{type(error).__name__}: {error}")
-            return told, traceback.format_exc()
+            reported = error if ours else PlannerError(f"{type(error).__name__}: {error}")
+            return reported, traceback.format_exc()
 
 
 class InferenceClient:

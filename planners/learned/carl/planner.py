@@ -58,11 +58,11 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         self.device = resolve_device(device)
 
     def begin(self) -> None:
-        """Make the maps that are laid out."""
-        self._maps = PerMap(_lay_out)
+        """Make the cache of prepared maps."""
+        self._maps = PerMap(_prepare_roads)
 
     def reset(self, scene: SceneInfo) -> None:
-        """Lay out the map and forget the last action; the route is corrected at the first step."""
+        """Prepare the map and forget the last action; the route is corrected at the first step."""
         self._scene = scene
         self._roads, self._scratch = self._maps(scene.map)
         self._on_route: BoolArray | None = None
@@ -172,7 +172,7 @@ def command_of(action: Action, ego: FloatArray) -> state.Command:
     return state.Command(min(max(acceleration, -MAX_BRAKING), MAX_ACCELERATION), steering_rate)
 
 
-def _lay_out(road: VectorMap) -> tuple[Roads, view.Scratch]:
+def _prepare_roads(road: VectorMap) -> tuple[Roads, view.Scratch]:
     roads = make_roads(road)
     return roads, view.make_scratch(roads)
 

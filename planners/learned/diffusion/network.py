@@ -201,8 +201,8 @@ def drive_overrides(state: dict[str, np.ndarray]) -> None:
     rows = keyed_normals(f"{_FINAL}.weight#drive", (STATE, weight.shape[1]))
     rows /= np.sqrt(weight.shape[1])
     ramp = np.arange(steps)[:, None] / (steps - 1) * np.array(_DRIVE_AMPLITUDES)
-    made = (ramp[:, :, None] * rows).reshape(weight.shape)
-    state[f"{_FINAL}.weight"] = made.astype(weight.dtype)
+    weights = (ramp[:, :, None] * rows).reshape(weight.shape)
+    state[f"{_FINAL}.weight"] = weights.astype(weight.dtype)
     offsets = np.zeros((steps, STATE))
     offsets[:, 0] = (_DRIVE_STEP * np.arange(steps) - _DRIVE_OFFSET) / _DRIVE_SCALE
     offsets[:, 2] = 1.0

@@ -195,9 +195,9 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         size = np.array([scene.vehicle.length, scene.vehicle.width])
         footprint = boxes_to_corners(observation.ego.center, size)
         lights = world.red_lights(scene.map, route, observation)
-        others = world.make_world(sight.static, agents, lights, footprint)
+        hazards = world.make_world(sight.static, agents, lights, footprint)
         place = Place(sight.drivable, scene.map.edges.polygons, nearest_line(sight.lines, ego))
-        scores = score(poses, learned, ego, others, place, scene.vehicle)
+        scores = score(poses, learned, ego, hazards, place, scene.vehicle)
         best = int(np.argmax(scores.total))  # the first one on ties
         speed = float(np.hypot(ego[VX], ego[VY]))
         braked = must_brake(speed, float(scores.fault_times[best]))

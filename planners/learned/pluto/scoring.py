@@ -99,13 +99,13 @@ def score(
 ) -> Scores:
     """Drive proposals (P, 81, 3) and score them; `learned` (P,) are their scores by the network."""
     driven = drive_proposals(poses, ego, vehicle).states
-    drivable, others = place.drivable, world.others
+    drivable, obstacles = place.drivable, world.obstacles
     size, areas = ego_box(vehicle), drivable.areas
     at = find_places(driven, size, areas, drivable.selected, drivable.limits, by_center=False)
-    near = near_others(at, others, driven.shape[1], DT * TTC_STEPS[-1])
+    near = near_others(at, obstacles, driven.shape[1], DT * TTC_STEPS[-1])
     red = run_lights(at.corners, place.lanes, world.lights)
-    clear, fault_times = collisions(at, others, near, red)
-    ttc = times_to_collision(at, others, near)
+    clear, fault_times = collisions(at, obstacles, near, red)
+    ttc = times_to_collision(at, obstacles, near)
     factors = np.stack([clear, on_road(at.flags[..., OFF_ROAD]), direction(driven, at.flags)])
     progress = travel(driven, place.baseline)
     comfortable = comfort(driven, ComfortBounds()).score
@@ -191,16 +191,16 @@ def nearest_line(lines: list[FloatArray], rear: FloatArray) -> FloatArray:
 
 
 def collisions(
-    places: ProposalStates, others: Obstacles, near: IntArray, first_red: FloatArray
+    places: ProposalStates, obstacles: Obstacles, near: IntArray, first_red: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """At-fault collisions with those of `others` that are `near`, red lights (P,) included.
+    """At-fault collisions with those of `obstacles` that are `near`, red lights (P,) included.
 
     (P,) factors 0, 0.5 or 1, and times of the first collisions, inf if none [s].
     """
     rows = np.arange(places.states.shape[1])
     rows[0] = -1
     # nuPlan rule 251: a contact without fault is looked at again
-    scores, first = first_faults(places, others, near, rows)
+    scores, first = first_faults(places, obstacles, near, rows)
     # a red light after another fault does not count
     is_red = (first_red < NEVER) & (first_red <= first)
     return np.where(is_red, 0.0, scores), DT * np.minimum(first, first_red)
@@ -222,7 +222,7 @@ def run_lights(corners: FloatArray, lanes: Polygons, lights: IntArray) -> FloatA
 
 
 @kernel
-def times_to_collision(places: ProposalStates, others: Obstacles, near: IntArray) -> FloatArray:
+def times_to_collision(places: ProposalStates, obstacles: Obstacles, near: IntArray) -> FloatArray:
     """(P,) 0 or 1: whether the ego, moved ahead along its heading, stays clear.
 
     Arguments as for `collisions`.
@@ -245,12 +245,12 @@ def times_to_collision(places: ProposalStates, others: Obstacles, near: IntArray
                 then = places.states[proposal, number]
                 off_lane = places.off_lane[proposal, number]
                 for index in near:
-                    if hits(others, step, index, box, circle):
+                    if hits(obstacles, step, index, box, circle):
                         speed, center = (
-                            others.speeds[number, index],
-                            others.centroids[number, index],
+                            obstacles.speeds[number, index],
+                            obstacles.centroids[number, index],
                         )
-                        other = others.boxes[number, index]
+                        other = obstacles.boxes[number, index]
                         if is_at_fault(then, box, off_lane, speed, center, other):
                             scores[proposal] = 0.0
             if scores[proposal] == 0.0:
