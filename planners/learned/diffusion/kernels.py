@@ -48,16 +48,12 @@ def resample_lanes(lines: Polylines, left: Polylines, right: Polylines) -> Float
     return rows
 
 
-@kernel
 def line_bounds(lines: Polylines) -> FloatArray:
     """(M, 4) min x, min y, max x, max y of each line; of an empty one nothing is within [m]."""
-    out = np.empty((len(lines.ptr) - 1, 4))
-    for line in range(len(out)):
-        out[line, :2], out[line, 2:] = np.inf, -np.inf
-        for vertex in range(lines.ptr[line], lines.ptr[line + 1]):
-            for axis in range(2):
-                out[line, axis] = min(out[line, axis], lines.xy[vertex, axis])
-                out[line, 2 + axis] = max(out[line, 2 + axis], lines.xy[vertex, axis])
+    out = np.tile([np.inf, np.inf, -np.inf, -np.inf], (len(lines.ptr) - 1, 1))
+    line_of = np.repeat(np.arange(len(out)), np.diff(lines.ptr))
+    np.minimum.at(out[:, :2], line_of, lines.xy)
+    np.maximum.at(out[:, 2:], line_of, lines.xy)
     return out
 
 
@@ -201,29 +197,3 @@ def fill_agents(
             row[4], row[5] = cos * x + sin * y, cos * y - sin * x
             row[6], row[7] = sizes[known, track, 1], sizes[known, track, 0]
             row[8 + kinds[track]] = 1.0
-
-
-@kernel
-def fill_objects(
-    tracks: IntArray,
-    poses: FloatArray,
-    sizes: FloatArray,
-    kinds: IntArray,
-    anchor: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Write static objects in the ego frame into `out`, float32 (OBJECTS, OBJECT_COLUMNS).
-
-    The other arguments are as above, of the last sample.
-    """
-    cos, sin = np.cos(anchor[2]), np.sin(anchor[2])
-    for index, track in enumerate(tracks):
-        row = out[index]
-        x, y = poses[track, 0] - anchor[0], poses[track, 1] - anchor[1]
-        turn = poses[track, 2] - anchor[2]
-        row[0], row[1] = cos * x + sin * y, cos * y - sin * x
-        row[2], row[3] = np.cos(turn), np.sin(turn)
-        row[4], row[5] = sizes[track, 1], sizes[track, 0]
-        kind = kinds[track]
-        column = 6 if kind == SIGN else (7 if kind == BARRIER else (8 if kind == CONE else 9))
-        row[column] = 1.0
