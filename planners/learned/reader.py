@@ -111,6 +111,8 @@ def _read_torch(path: Path, is_zip: bool) -> Contents:
         stand_ins: list[Any] = [(_StandIn, name) for name in skipped]
         with torch.serialization.safe_globals(stand_ins):
             loaded = torch.load(path, map_location="cpu", weights_only=True)
+    if isinstance(loaded, dict):
+        loaded = {str(name): value for name, value in loaded.items()}
     return Contents("torch zip" if is_zip else "torch, before 1.6", loaded, skipped=tuple(skipped))
 
 
