@@ -427,7 +427,7 @@ class PointsEncoder(nn.Module):
         # the second part reads a point beside the maximum over its line, the same for all of them
         enter = self.second_mlp[0]
         assert isinstance(enter, Linear)
-        own, of_line = enter.weight.split(first.shape[1], dim=1)
+        own, of_line = torch.split(enter.weight, first.shape[1], dim=1)
         shared = linear(_pooled(first, valid), of_line)
         hidden = linear(first, own, enter.bias) + shared[valid.nonzero()[:, 0]]
         return _pooled(self.second_mlp[1:](hidden), valid)
