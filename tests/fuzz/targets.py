@@ -368,9 +368,9 @@ def _read_checkpoint(folder: Path) -> Any:
         checked_state,
         find_checkpoint,
         needed_args,
+        network_module,
         open_checkpoint,
     )
-    from shiftsim.planners.learned.match import network_module
 
     found = open_checkpoint(find_checkpoint(str(folder)))
     if len(found.state) < 10:  # of no planner

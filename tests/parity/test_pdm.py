@@ -314,7 +314,9 @@ def settled(where: str, seen: Seen, step: Step, theirs: File) -> Scores:
         ttc, ttc_index = np.where(rows, (other.ttc, index), (ours.ttc, ours.ttc_index))
         ours = ours._replace(ttc=ttc, ttc_index=ttc_index)
     factor = ours.no_collision * ours.drivable * ours.direction
-    return ours._replace(total=factor * weighted_mean(ours.progress, ours.ttc, ours.comfort, DEFAULT))
+    return ours._replace(
+        total=factor * weighted_mean(ours.progress, ours.ttc, ours.comfort, DEFAULT)
+    )
 
 
 def in_line(states: np.ndarray, others: Obstacles) -> np.ndarray:

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from shiftsim.planners.learned.diffusion.network import DiffusionNetwork
-from shiftsim.planners.learned.diffusion.network.sampler import SCHEDULE, STATE
+from shiftsim.planners.learned.diffusion.network_sampler import SCHEDULE, STATE
 from shiftsim.world.state import PACIFICA
 
 SCALE = 0.5  # of the gradient

@@ -12,14 +12,10 @@ from torch import Tensor, nn
 
 from shiftsim.errors import CheckpointError
 from shiftsim.planners.learned.deterministic import keyed_normals
-from shiftsim.planners.learned.diffusion.network.decoder import DiT, Prepared
-from shiftsim.planners.learned.diffusion.network.encoder import SceneEncoder
-from shiftsim.planners.learned.diffusion.network.sampler import SCHEDULE, STATE, sample
-from shiftsim.planners.learned.network.graphs import Replayed
-from shiftsim.planners.learned.network.rows import store_by_columns
+from shiftsim.planners.learned.diffusion.network_layers import Context, DiT, SceneEncoder
+from shiftsim.planners.learned.diffusion.network_sampler import SCHEDULE, STATE, sample
 from shiftsim.world.ranges import CHECKPOINT, require
 
-ROWS = 4  # of agents; a matrix product of 12 rows is faster than one of 11
 PREFIXES = ("module.",)  # of the official file; left by distributed training
 _XY = ([10.0, 0.0], [20.0, 20.0])  # mean and std [m]
 
@@ -95,13 +91,17 @@ class DiffusionNetwork(nn.Module):
         dit = DiT(hidden, heads, int(args["decoder_depth"]))
         self.encoder = nn.ModuleDict({"encoder": encoder})
         self.decoder = nn.ModuleDict({"decoder": nn.ModuleDict({"dit": dit})})
-        self.dit = [dit]  # in a list, so that its parameters have one name only
         self.normalisers = nn.ModuleDict(
             {name: Normaliser(row) for name, row in args["observation_normalizer"].items()}
         )
         self.state_normaliser = Normaliser(args["state_normalizer"])
-        self._decode = Replayed(self._decoded)
-        store_by_columns(self)
+
+    @property
+    def dit(self) -> DiT:
+        """The diffusion transformer."""
+        dit = self.get_submodule("decoder.decoder.dit")
+        assert isinstance(dit, DiT)
+        return dit
 
     def normalise(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The inputs as the network reads them; those without a normaliser as they are."""
@@ -129,13 +129,16 @@ class DiffusionNetwork(nn.Module):
         states = torch.cat([ego, neighbours[..., :STATE]], dim=1)
         return states, torch.cat([nobody, absent], dim=1)
 
-    def prepare(self, scene: Mapping[str, Tensor], absent: Tensor) -> Prepared:
-        """What the calls of one plan share, from normalised inputs and absent agents (B, A)."""
-        dit = self.dit[0]
-        times = SCHEDULE.call_times.to(absent.device)
-        return dit.prepare(
-            self.encode(scene), dit.route_encoder(scene["route_lanes"]), absent, times
-        )
+    def context(
+        self, scene: Mapping[str, Tensor], absent: Tensor, times: Tensor | None = None
+    ) -> Context:
+        """What the calls of one plan share, from normalised inputs and absent agents (B, A).
+
+        `times` (S, B or 1) are those of the calls; without them they are the sampler's.
+        """
+        if times is None:
+            times = SCHEDULE.call_times.to(absent.device)[:, None]
+        return self.dit.context(self.encode(scene), scene["route_lanes"], absent, times)
 
     def forward(self, inputs: Mapping[str, Tensor], noise: Tensor) -> Tensor:
         """Trajectories (B, A, T, 4), ego first: x, y [m], cos, sin in the ego frame.
@@ -144,34 +147,13 @@ class DiffusionNetwork(nn.Module):
         """
         scene = self.normalise(inputs)
         current, absent = self.present(scene)
-        if not noise.is_cuda:
-            current, absent, noise = (_padded(part) for part in (current, absent, noise))
-        route = self.dit[0].route_encoder(scene["route_lanes"])
-        times = SCHEDULE.call_times.to(noise.device)
-        states = self._decode(self.encode(scene), route, absent, times, current, noise)
-        return self.denormalise(states[:, : self.num_agents, 1:])
-
-    def _decoded(
-        self,
-        context: Tensor,
-        route: Tensor,
-        absent: Tensor,
-        times: Tensor,
-        current: Tensor,
-        noise: Tensor,
-    ) -> Tensor:
-        """Normalised states; 1,600 of the network's 1,900 operations, of fixed shapes."""
-        return sample(self.dit[0].prepare(context, route, absent, times), current, noise)
+        context = self.context(scene, absent)
+        states = sample(lambda x, call: self.dit(x, call, context), current, noise)
+        return self.denormalise(states[:, :, 1:])
 
     def denormalise(self, states: Tensor) -> Tensor:
         """(..., 4) x, y [m], cos, sin of normalised ones."""
         return states * self.state_normaliser.std + self.state_normaliser.mean
-
-
-def _padded(x: Tensor) -> Tensor:
-    """(B, A, ...) with rows added up to a multiple of `ROWS`: zeros, or True in a mask."""
-    missing = (len(x), -x.shape[1] % ROWS, *x.shape[2:])
-    return torch.cat([x, torch.full(missing, x.dtype == torch.bool).to(x)], dim=1)
 
 
 def build_network(args: Mapping[str, Any] | None = None) -> DiffusionNetwork:
@@ -219,8 +201,8 @@ def drive_overrides(state: dict[str, np.ndarray]) -> None:
     rows = keyed_normals(f"{_FINAL}.weight#drive", (STATE, weight.shape[1]))
     rows /= np.sqrt(weight.shape[1])
     ramp = np.arange(steps)[:, None] / (steps - 1) * np.array(_DRIVE_AMPLITUDES)
-    made = (ramp[:, :, None] * rows).reshape(weight.shape)
-    state[f"{_FINAL}.weight"] = made.astype(weight.dtype)
+    weights = (ramp[:, :, None] * rows).reshape(weight.shape)
+    state[f"{_FINAL}.weight"] = weights.astype(weight.dtype)
     offsets = np.zeros((steps, STATE))
     offsets[:, 0] = (_DRIVE_STEP * np.arange(steps) - _DRIVE_OFFSET) / _DRIVE_SCALE
     offsets[:, 2] = 1.0
