@@ -12,9 +12,9 @@ from types import ModuleType
 from typing import Any
 
 MODULES = {
-    "shiftsim.data.deepplan_route": "shiftsim.data.readers.deepplan.route",
-    "shiftsim.data.deepplan_states": "shiftsim.data.readers.deepplan.states",
-    "shiftsim.data.deepplan_windows": "shiftsim.data.readers.deepplan.windows",
+    "shiftsim.data.deepplan_route": "shiftsim.data.readers.routes",
+    "shiftsim.data.deepplan_states": "shiftsim.data.readers.states",
+    "shiftsim.data.deepplan_windows": "shiftsim.data.readers.windows",
     "shiftsim.data.opendrive_map": "shiftsim.data.maps.opendrive.map",
     "shiftsim.log": "shiftsim.sim.log",
     "shiftsim.map": "shiftsim.world.map",

@@ -285,7 +285,7 @@ _COMMANDS = {
     "split": "stores:make_split",
     "edits": "edits:app",
     "planners": "planners:app",
-    "convert": "open_data:app",
+    "convert": "convert:app",
     "export": "stores:export",
     "checkpoint": "planners:checkpoint",
     "train": "training:app",

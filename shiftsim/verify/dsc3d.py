@@ -14,22 +14,16 @@ import pyproj
 from shiftsim.data.maps.opendrive.lanes import LaneKey
 from shiftsim.data.maps.opendrive.map import Origin, build_road_map
 from shiftsim.data.maps.opendrive.reading import read_opendrive
-from shiftsim.data.readers.deepplan.recording import Converted, convert_recording
-from shiftsim.data.readers.deepplan.states import rows_between, sample_runs
-from shiftsim.data.readers.deepplan.windows import (
-    EGO,
-    ROW_S,
-    ConversionConfig,
-    find_runs,
-    judge_windows,
-)
-from shiftsim.data.readers.dsc3d.recording import (
+from shiftsim.data.readers.dsc3d import (
     Annotations,
     Site,
     find_map,
     open_site,
     read_recording,
 )
+from shiftsim.data.readers.samples import ROW_S, find_runs, rows_between, sample_runs
+from shiftsim.data.readers.scenarios import Converted, make_scenarios
+from shiftsim.data.readers.windows import EGO, ConversionConfig, evaluate_windows, window_spans
 from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.kernels import FloatArray
 from shiftsim.metrics.route import driven_route
@@ -183,7 +177,10 @@ def _compare_scripted(expected: Source, where: str, folder: Path, maps: Path | N
     places += [parent / "maps" / expected["map"] for parent in folder.resolve().parents[:4]]
     if found := next(filter(Path.is_file, places), None):
         lanes = Lanes(found, site)
-        made = convert_recording(recording, lanes.road, lanes.offset, _CONFIG)
+        spans = window_spans(recording.duration, _CONFIG)
+        made = make_scenarios(
+            recording, lanes.road, config=_CONFIG, offset=lanes.offset, spans=spans
+        )
         _compare_made(folder, made, lanes, ways, report)
     else:
         report.skip(f"lane sequences and poses: map {expected['map']} not found (--maps)")
@@ -192,7 +189,11 @@ def _compare_scripted(expected: Source, where: str, folder: Path, maps: Path | N
 def _compare_windows(expected: Source, recording: Annotations, name: str) -> Ways:
     """Compare windows and verdicts; what the file says of lanes, by window and ego."""
     report, ids, ways = expected.report, recording.track_ids.tolist(), Ways()
-    windows = judge_windows(recording, find_runs(recording, _CONFIG.max_hole_s), _CONFIG)
+    runs, spans = (
+        find_runs(recording, _CONFIG.max_hole_s),
+        window_spans(recording.duration, _CONFIG),
+    )
+    windows = evaluate_windows(recording, runs, _CONFIG, spans)
     wanted = expected.each("windows")
     report.compare("windows", name, len(windows), len(wanted))
     for window, theirs in zip(windows, wanted, strict=False):

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from shiftsim.cli import main
-from shiftsim.data.readers.deepplan.convert import convert_dsc3d
+from shiftsim.data.readers.dsc3d import convert_dsc3d
 from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import DataError

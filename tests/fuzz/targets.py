@@ -259,9 +259,8 @@ def _sites(folder: Path) -> None:
 
 
 def _read_site(folder: Path) -> Any:
-    from shiftsim.data.readers.deepplan.convert import convert_dsc3d
-    from shiftsim.data.readers.deepplan.windows import ConversionConfig
-    from shiftsim.data.readers.dsc3d.recording import open_site, read_recording
+    from shiftsim.data.readers.dsc3d import convert_dsc3d, open_site, read_recording
+    from shiftsim.data.readers.windows import ConversionConfig
 
     site = open_site(folder)
     recordings = [read_recording(site, name) for name in site.recordings]
@@ -284,10 +283,9 @@ def _py123d(folder: Path) -> None:
 
 
 def _read_scenes(name: str, folder: Path) -> Any:
-    from shiftsim.data.readers.open_data.av2 import Av2Reader
-    from shiftsim.data.readers.open_data.commonroad import CommonRoadReader
-    from shiftsim.data.readers.open_data.py123d import Py123dReader
-    from shiftsim.data.readers.open_data.scenes import convert_scene
+    from shiftsim.data.readers.av2 import Av2Reader
+    from shiftsim.data.readers.commonroad import CommonRoadReader
+    from shiftsim.data.readers.py123d import Py123dReader
 
     reader = {"av2": Av2Reader, "commonroad": CommonRoadReader, "py123d": Py123dReader}[name]()
     made = [convert_scene(reader.read(path)) for path in reader.find(folder)]

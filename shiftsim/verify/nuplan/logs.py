@@ -16,7 +16,7 @@ from shiftsim.data.nuplan.boxes import read_boxes
 from shiftsim.data.nuplan.log import Log, open_log, read_ego
 from shiftsim.data.nuplan.mapping import Mapping
 from shiftsim.data.nuplan.scenarios import find_maps, list_scenarios, load_map, read_scenario
-from shiftsim.data.readers.deepplan.route import follow_blocks
+from shiftsim.data.readers.routes import follow_blocks
 from shiftsim.errors import DataError
 from shiftsim.kernels import IntArray
 from shiftsim.verify.files import COMPARED, Groups, Scenes, Source, open_tables, read_file

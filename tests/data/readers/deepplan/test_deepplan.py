@@ -7,16 +7,15 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shiftsim.data.readers.deepplan.convert import convert_dsc3d
-from shiftsim.data.readers.deepplan.states import ego_states, resample, slope
-from shiftsim.data.readers.deepplan.windows import (
+from shiftsim.data.readers.dsc3d import convert_dsc3d, open_site, read_recording
+from shiftsim.data.readers.states import ego_states, resample, slope
+from shiftsim.data.readers.windows import (
     ConversionConfig,
+    evaluate_windows,
     find_runs,
-    judge_windows,
     shared_area,
     window_starts,
 )
-from shiftsim.data.readers.dsc3d.recording import open_site, read_recording
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError, ConversionError
 from shiftsim.geometry.boxes import boxes_to_corners
@@ -35,7 +34,7 @@ def _verdicts(tmp_path, tracks, duration=18.08, config=CONFIG):
     runs = find_runs(recording, config.max_hole_s)
     return [
         dict(zip(recording.track_ids[w.tracks].tolist(), w.verdicts, strict=True))
-        for w in judge_windows(recording, runs, config)
+        for w in evaluate_windows(recording, runs, config)
     ]
 
 

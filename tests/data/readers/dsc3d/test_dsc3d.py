@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from shiftsim.data.readers.dsc3d import find_map, open_site, read_recording
 from shiftsim.data.readers.dsc3d.motion import believed_velocities, held_headings, rotation_angles
-from shiftsim.data.readers.dsc3d.recording import find_map, open_site, read_recording
 from shiftsim.errors import ConversionError
 
 

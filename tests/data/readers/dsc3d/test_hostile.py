@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shiftsim.data.readers.deepplan.convert import convert_dsc3d
-from shiftsim.data.readers.deepplan.windows import ConversionConfig
-from shiftsim.data.readers.dsc3d.recording import open_site, read_recording
+from shiftsim.data.readers.dsc3d import convert_dsc3d, open_site, read_recording
+from shiftsim.data.readers.windows import ConversionConfig
 from shiftsim.data.store.check import check_store
 from shiftsim.errors import ConfigError, ConversionError
 

@@ -16,9 +16,9 @@ from open_data_files import (
     write_py123d,
 )
 
-from shiftsim.data.readers.open_data.av2 import Av2Reader
-from shiftsim.data.readers.open_data.commonroad import CommonRoadReader
-from shiftsim.data.readers.open_data.py123d import Py123dReader
+from shiftsim.data.readers.av2 import Av2Reader
+from shiftsim.data.readers.commonroad import CommonRoadReader
+from shiftsim.data.readers.py123d import Py123dReader
 from shiftsim.errors import DataError
 
 

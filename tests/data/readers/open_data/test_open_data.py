@@ -22,9 +22,8 @@ from open_data_files import (
 )
 
 from shiftsim.data.maps.opendrive.check import check_map
-from shiftsim.data.readers.open_data.av2 import Av2Reader
-from shiftsim.data.readers.open_data.py123d import Py123dReader
-from shiftsim.data.readers.open_data.scenes import convert_scene, convert_scenes
+from shiftsim.data.readers.av2 import Av2Reader
+from shiftsim.data.readers.py123d import Py123dReader
 from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConversionError

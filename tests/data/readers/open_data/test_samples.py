@@ -8,9 +8,8 @@ import pytest
 
 import shiftsim
 from shiftsim.data.maps.opendrive.check import check_map
-from shiftsim.data.readers.open_data.av2 import Av2Reader
-from shiftsim.data.readers.open_data.commonroad import CommonRoadReader
-from shiftsim.data.readers.open_data.scenes import convert_scene, convert_scenes
+from shiftsim.data.readers.av2 import Av2Reader
+from shiftsim.data.readers.commonroad import CommonRoadReader
 from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.world.state import AgentKind, center_poses

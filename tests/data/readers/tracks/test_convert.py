@@ -14,12 +14,12 @@ from shiftsim.data.maps.build import build_lane_map
 from shiftsim.data.maps.opendrive.map import build_road_map
 from shiftsim.data.maps.opendrive.reading import read_opendrive
 from shiftsim.data.maps.segments import LanePiece, MapSource
-from shiftsim.data.readers.deepplan.convert import convert_dsc3d
-from shiftsim.data.readers.tracks.build import make_samples
-from shiftsim.data.readers.tracks.convert import convert_tracks, look_at
-from shiftsim.data.readers.tracks.motion import fitted_velocities
-from shiftsim.data.readers.tracks.reading import read_tracks
-from shiftsim.data.readers.tracks.scenarios import make_scenarios
+from shiftsim.data.readers.build import make_samples
+from shiftsim.data.readers.dsc3d import convert_dsc3d
+from shiftsim.data.readers.motion import fitted_velocities
+from shiftsim.data.readers.scenarios import make_scenarios
+from shiftsim.data.readers.tracks.inspection import convert_tracks, inspect_tracks
+from shiftsim.data.readers.tracks.table import read_tracks
 from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import ConfigError, ConversionError
@@ -65,7 +65,7 @@ def _samples(columns, **changed):
 
 def test_a_table_gives_the_scenarios_of_the_same_recording_in_dsc3d(towns, town, tmp_path):
     table = write_tracks(tmp_path / "t.csv", town[0])
-    report, _ = convert_tracks(look_at(table, town[1], city=TOWN), tmp_path / "own")
+    report, _ = convert_tracks(inspect_tracks(table, town[1], city=TOWN), tmp_path / "own")
     convert_dsc3d(towns / TOWN, tmp_path / "theirs", site=TOWN)
     own, theirs = open_store(tmp_path / "own"), open_store(tmp_path / "theirs")
     assert report.summary.accepted == len(own) == len(theirs) > 0
@@ -207,7 +207,7 @@ def test_files_of_levelxdata_need_nothing_said(town, tmp_path):
     kinds = {"trackId": tracks, "class": c["kind"][first]}
     pc.write_csv(pa.table(kinds), tmp_path / "07_tracksMeta.csv")
     pc.write_csv(pa.table({"frameRate": [12.5]}), tmp_path / "07_recordingMeta.csv")
-    looked = look_at(tmp_path / "07_tracks.csv", town[1])
+    looked = inspect_tracks(tmp_path / "07_tracks.csv", town[1])
     assert looked.doubts.found == []
     assert looked.table.hz == 12.5
     names = np.array(looked.table.categories)[looked.table.category]
@@ -215,13 +215,13 @@ def test_files_of_levelxdata_need_nothing_said(town, tmp_path):
 
 
 def test_a_recording_that_is_converted_again_takes_the_place_of_the_old_one(town, tmp_path):
-    looked = look_at(write_tracks(tmp_path / "t.csv", town[0]), town[1])
+    looked = inspect_tracks(write_tracks(tmp_path / "t.csv", town[0]), town[1])
     _, before = convert_tracks(looked, tmp_path / "s")
     _, made = convert_tracks(looked, tmp_path / "s", egos=[before.windows[-1].ego])
     assert len(made.windows) < len(before.windows)
     assert open_store(tmp_path / "s").tokens == tuple(sorted(w.token for w in made.windows))
     assert check_store(tmp_path / "s") == []
-    other = look_at(tmp_path / "t.csv", export_town(tmp_path, "junction")[1], city="map")
+    other = inspect_tracks(tmp_path / "t.csv", export_town(tmp_path, "junction")[1], city="map")
     other.doubts.found.clear()
     with pytest.raises(ConversionError, match="another map named 'map'"):
         convert_tracks(other, tmp_path / "s")

@@ -8,8 +8,8 @@ from track_files import export_town, write_tracks
 
 from shiftsim.data.maps.opendrive.map import build_road_map
 from shiftsim.data.maps.opendrive.reading import read_opendrive
-from shiftsim.data.readers.tracks.doubts import find_doubts
-from shiftsim.data.readers.tracks.reading import read_tracks
+from shiftsim.data.readers.tracks.diagnostics import diagnose
+from shiftsim.data.readers.tracks.table import read_tracks
 from shiftsim.errors import ConfigError, ConversionError
 
 FOOT = 0.3048
@@ -231,7 +231,7 @@ def town(tmp_path_factory):
 
 
 def _doubts(path, road, **how):
-    return find_doubts(read_tracks(path, **how), road, 0.95)
+    return diagnose(read_tracks(path, **how), road, 0.95)
 
 
 def test_a_right_table_raises_no_doubt(town, tmp_path):

@@ -14,12 +14,12 @@ import pyarrow as pa
 from shiftsim.data.maps.build import PieceMap, build_lane_map
 from shiftsim.data.maps.lights import LightStates, states_of_lists
 from shiftsim.data.maps.segments import MapSource, StopArea
-from shiftsim.data.readers.open_data import codes
-from shiftsim.data.readers.open_data.lane_names import LaneNames
-from shiftsim.data.readers.open_data.scenes import Scene
-from shiftsim.data.readers.open_data.source import Source, find_below, items, vectors
-from shiftsim.data.readers.tracks.build import make_samples
-from shiftsim.data.readers.tracks.samples import TrackSamples
+from shiftsim.data.readers import codes
+from shiftsim.data.readers.build import make_samples
+from shiftsim.data.readers.codes import LaneNames
+from shiftsim.data.readers.files import SceneFolder, SourceFile, items, vectors
+from shiftsim.data.readers.reader import SourceRecording
+from shiftsim.data.readers.samples import TrackSamples
 from shiftsim.errors import import_extra
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.state import AgentKind
@@ -52,37 +52,46 @@ _FEATURES = {  # of the elements of a map, by layer
 _DRIVABLE = ("lane group", "intersection", "car park", "drivable area")
 
 
-class Py123dReader:
+class Py123dReader(SceneFolder):
     """Logs of py123d; a scene is named by the folder of its log."""
 
-    def find(self, folder: Path) -> list[Path]:
-        """Folders of the logs, sorted."""
-        hint = "give the folder that py123d wrote, with logs/ and maps/"
-        return [path.parent for path in find_below(folder, "ego_state_se3.arrow", hint)]
+    name = "py123d"
+    pattern = "ego_state_se3.arrow"
+    hint = "give the folder that py123d wrote, with logs/ and maps/"
 
-    def files(self, path: Path) -> list[Path]:
+    def recordings(self) -> list[str]:
+        """Folders of the logs, sorted."""
+        return [str(Path(file).parent) for file in super().recordings()]
+
+    def files(self, recording: str) -> list[Path]:
         """Tracks, lights, and the map of the log or of its city."""
+        path = Path(recording)
         files = [*(path / f"{name}.arrow" for name in _FILES), _read_sync(path)[1]]
         return [file for file in files if file.is_file()]
 
-    def read(self, path: Path) -> Scene:
+    def read(self, recording: str) -> SourceRecording:
         """One log."""
-        notes, map_path = _read_sync(path)
-        dataset, split = notes["dataset"], notes["split"]
+        path = Path(recording)
+        about, map_path = _read_sync(path)
+        dataset, split = about["dataset"], about["split"]
         if dataset.startswith("wod") and split.endswith("test"):
-            raise Source(path).fault(f"split {split!r} hides the future", "convert train or val")
-        with Source(path).naming():
+            raise SourceFile(path).fault(
+                f"split {split!r} hides the future", "convert train or val"
+            )
+        with SourceFile(path).naming():
             samples = _read_tracks(path)
         lights = _read_lights(path)
-        city = path.name if map_path.parent == path else notes.get("location")
+        city = path.name if map_path.parent == path else about.get("location")
         road = _read_map(map_path, f"{dataset}-{city}", lights.names if lights else ())
-        source = f"{dataset} {split}, through py123d {notes.get('version')}"
+        source = f"{dataset} {split}, through py123d {about.get('version')}"
         licences = (text for name, text in codes.LICENCES.items() if dataset.startswith(name))
         metadata = {"source": source, "licence": next(licences, "that of the source")}
-        return Scene(samples=samples, map=road, egos=(EGO,), lights=lights, metadata=metadata)
+        return SourceRecording(
+            samples, road, lights=lights, metadata=metadata, **self.recorded_ego(EGO)
+        )
 
 
-class _File(Source):
+class _File(SourceFile):
     """An Arrow file, and what msgpack packed in its metadata and cells."""
 
     remedy = "convert the log again with py123d 0.7.0"  # the version that is tested
@@ -120,22 +129,22 @@ def _array(found: dict[Any, Any]) -> Any:
 
 def _read_sync(log: Path) -> tuple[dict[str, Any], Path]:
     """What a log says of itself; its map: beside it, or in the `maps` of the whole folder."""
-    about = {"dataset": str, "location": (str,)}
-    form = {**about, "split": str, "version": (str,), "map_metadata": (about,)}
-    *_, notes = _File(log / "sync.arrow").steps({}, form)
-    city = notes.get("map_metadata") or notes
+    place = {"dataset": str, "location": (str,)}
+    form = {**place, "split": str, "version": (str,), "map_metadata": (place,)}
+    *_, about = _File(log / "sync.arrow").steps({}, form)
+    city = about.get("map_metadata") or about
     shared = f"maps/{city['dataset']}/{city['dataset']}_{city.get('location')}.arrow"
     places = (log / "map.arrow", *(folder / shared for folder in log.parents))
-    return notes, next(filter(Path.is_file, places), places[0])
+    return about, next(filter(Path.is_file, places), places[0])
 
 
 def _read_tracks(log: Path) -> TrackSamples:
     """The boxes of all steps, and the box of the recording car."""
     ego_us, ego = _read_ego(log)
     file = _File(log / "box_detections_se3.arrow")
-    stamps, table, notes = file.steps(_BOXES, {"box_detection_label_class": str})
+    stamps, table, about = file.steps(_BOXES, {"box_detection_label_class": str})
     rows, (boxes, tokens, velocities, labels) = file.lists(table)
-    name = notes["box_detection_label_class"].rpartition(".")[2]
+    name = about["box_detection_label_class"].rpartition(".")[2]
     kinds = codes.LABELS[file.known(name, codes.LABELS, "label class")]
     category = [kinds[file.known(i, kinds, f"{name}: label")] for i in labels.to_pylist()]
     every = np.concatenate([file.boxes(vectors(boxes, 9)), ego])
@@ -158,8 +167,8 @@ def _read_ego(log: Path) -> tuple[IntArray, FloatArray]:
     """
     file = _File(log / "ego_state_se3.arrow")
     form = {"center_to_imu_se3": [float], "length": float, "width": float}
-    stamps, table, notes = file.steps(_EGO, form)
-    center, *size = (notes[name] for name in form)
+    stamps, table, about = file.steps(_EGO, form)
+    center, *size = (about[name] for name in form)
     if len(center) != 7:
         raise file.fault(f"'center_to_imu_se3' has {len(center)} numbers, need 7")
     ((ahead, left, turn, *size),) = file.boxes(np.array([[*center, *size]], np.float64))
@@ -183,18 +192,18 @@ def _read_lights(log: Path) -> LightStates | None:
 def _read_map(path: Path, name: str, lit: tuple[str, ...]) -> PieceMap:
     """A map; `lit` are the lanes that have a light."""
     file = _File(path)
-    said: dict[str, list[Any]] = {layer: [] for layer in _FEATURES}
+    elements: dict[str, list[Any]] = {layer: [] for layer in _FEATURES}
     areas: dict[str, list[Any]] = {layer: [] for layer in codes.LAYERS.values() if layer != "lane"}
     for code, number, packed, wkb in zip(*file.columns(_MAP).to_pydict().values(), strict=True):
         layer = codes.LAYERS.get(code, "")
         place = f"{layer} {number}"
-        if layer in said:
-            said[layer].append((number, file.unpack(packed, _load, _FEATURES[layer], place)))
+        if layer in elements:
+            elements[layer].append((number, file.unpack(packed, _load, _FEATURES[layer], place)))
         if layer in areas:
             areas[layer].append(file.area(wkb, f"wkb of {place}"))
-    inside = {n for n, group in said["lane group"] if group.get("intersection_id") is not None}
+    inside = {n for n, group in elements["lane group"] if group.get("intersection_id") is not None}
     pieces = []
-    for number, lane in said["lane"]:
+    for number, lane in elements["lane"]:
         if lane.get("lane_type") != codes.BIKE_LANE:
             light = str(number) if str(number) in lit else None
             inner = lane.get("lane_group_id") in inside
@@ -206,7 +215,7 @@ def _read_map(path: Path, name: str, lit: tuple[str, ...]) -> PieceMap:
         drivable_areas=[area for layer in drivable for area in areas[layer]],
         stop_areas=[
             StopArea(area, codes.STOPS.get(zone.get("stop_zone_type"), codes.OTHER_STOP))
-            for area, (_, zone) in zip(areas["stop zone"], said["stop zone"], strict=True)
+            for area, (_, zone) in zip(areas["stop zone"], elements["stop zone"], strict=True)
         ],
         crosswalks=areas["crosswalk"],
         walkways=areas["walkway"],

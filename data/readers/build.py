@@ -6,18 +6,30 @@ be is an error; what can be repaired is repaired and counted.
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from shiftsim.data.readers.deepplan.states import ROW_US, rows_between, sample_runs
-from shiftsim.data.readers.deepplan.windows import ROW_S, find_runs
-from shiftsim.data.readers.dsc3d.motion import held_headings, track_medians
-from shiftsim.data.readers.dsc3d.recording import CATEGORIES
-from shiftsim.data.readers.tracks.motion import believed, fitted_velocities, headings_of_motion
-from shiftsim.data.readers.tracks.samples import TrackSamples
+from shiftsim.data.readers.codes import CATEGORIES, KIND_NAMES, SIZES
+from shiftsim.data.readers.motion import (
+    believed_velocities,
+    contradiction,
+    fitted_velocities,
+    headings_of_motion,
+    held_headings,
+    track_medians,
+)
+from shiftsim.data.readers.samples import (
+    ROW_S,
+    ROW_US,
+    TrackSamples,
+    find_runs,
+    rows_between,
+    sample_runs,
+)
 from shiftsim.errors import ConversionError
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.state import AgentKind
@@ -25,17 +37,6 @@ from shiftsim.world.state import AgentKind
 MAX_HOLE_S = 0.5  # s, longest hole of a track that is filled
 MAX_PAUSE_S = 3600.0  # s without a row of any object within one recording
 MAX_SPAN_S = 1e5  # s from the first row to the last one
-_KINDS = {kind.name.lower(): kind for kind in AgentKind}
-# length and width of objects of unknown size [m]
-SIZES = {
-    AgentKind.VEHICLE: (4.6, 1.9),
-    AgentKind.BICYCLE: (1.8, 0.6),
-    AgentKind.PEDESTRIAN: (0.7, 0.7),
-    AgentKind.TRAFFIC_CONE: (0.4, 0.4),
-    AgentKind.BARRIER: (2.0, 0.5),
-    AgentKind.CZONE_SIGN: (0.5, 0.5),
-    AgentKind.GENERIC_OBJECT: (1.0, 1.0),
-}
 
 
 def make_samples(
@@ -44,13 +45,13 @@ def make_samples(
     time_us: IntArray,
     ids: NDArray[Any],
     category: IntArray,
-    categories: Sequence[str] = tuple(_KINDS),
+    categories: Sequence[str] = tuple(KIND_NAMES),
     xy: FloatArray,
     headings: FloatArray | None = None,
     velocities: FloatArray | None = None,
     sizes: FloatArray | None = None,
     derived: FloatArray | None = None,
-    kind_of: Mapping[str, AgentKind] = CATEGORIES | _KINDS,
+    kind_of: Mapping[str, AgentKind] = CATEGORIES | KIND_NAMES,
 ) -> TrackSamples:
     """A recording from its columns. A rows, one per object and time, in any order.
 
@@ -84,7 +85,7 @@ def make_samples(
         raise ConversionError(
             f"{name}: {len(time_us)} rows at one time", "give rows at two times or more"
         )
-    track_ids, track = numbered(ids)
+    track_ids, track = index_ids(ids)
     order = order_of_rows(track, time_us)
     if order is not None:
         time_us, track, category, xy = time_us[order], track[order], category[order], xy[order]
@@ -93,15 +94,25 @@ def make_samples(
         )
         derived = None
     _refuse_twice(name, track_ids, track, time_us)
-    stamps, frame = numbered(time_us)
+    stamps, frame = index_ids(time_us)
     _refuse_pauses(name, stamps)
     time = (time_us - stamps[0]) / 1e6
     step = np.diff(time)[track[1:] == track[:-1]]
     period = float(np.median(step)) if len(step) else ROW_S
-    named, kinds = _kinds(name, category, categories, kind_of, track, warnings)
+    most = most_frequent(category, len(categories), track, warnings)
+    names = tuple(categories[code] for code in most)
+    if unknown := sorted(set(names) - set(kind_of)):
+        raise ConversionError(
+            f"{name}: category {unknown[0]!r} is unknown",
+            f"map it to one of {', '.join(sorted(kind_of))}",
+        )
+    kinds = np.array([kind_of[category] for category in names], np.int64)
     if derived is None:
         derived = fitted_velocities(xy, time, track, period)
-    speeds = believed(velocities, derived, time, track, warnings)
+    contradicts = None
+    if velocities is not None:
+        contradicts = contradiction(velocities, derived, time, track)[0]
+    speeds = believed_velocities(velocities, derived, contradicts, track, warnings)
     raw = headings_of_motion(speeds, track, warnings) if headings is None else headings
     samples = TrackSamples(
         name=name,
@@ -115,7 +126,7 @@ def make_samples(
         headings=held_headings(raw, speeds, time, track, warnings),
         velocities=speeds,
         track_ids=track_ids,
-        categories=named,
+        categories=names,
         kinds=kinds,
         sizes=_sizes(sizes, kinds, track, warnings),
         warnings=dict(+warnings),
@@ -142,56 +153,56 @@ def on_common_clock(samples: TrackSamples) -> TrackSamples:
     """The same recording with a row every 0.05 s, where objects have times of their own."""
     runs = find_runs(samples, MAX_HOLE_S)
     first, last = rows_between(samples.time[runs.first], samples.time[runs.last])
-    # what is there at an end of the recording is there at its first or last row, too
+    # what is seen at an end of the recording is seen at its first or last row, too
     first[samples.time[runs.first] < samples.period] = 0
     at_end = samples.time[runs.last] > samples.duration - samples.period
     last[at_end] = int(samples.duration / ROW_S + 1e-9)
     counts = np.maximum(last - first + 1, 0)
     run = np.repeat(np.arange(len(counts)), counts)
     frame = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts - first, counts)
-    found = sample_runs(samples, runs, run, frame * ROW_S)
-    kept, track = np.unique(runs.track[run], return_inverse=True)
-    lost = len(samples.track_ids) - len(kept)
+    boxes = sample_runs(samples, runs, run, frame * ROW_S)
+    present, track = np.unique(runs.track[run], return_inverse=True)
     warnings = Counter(samples.warnings)
+    lost = len(samples.track_ids) - len(present)
     warnings["tracks too short for a row every 0.05 s (left out)"] += lost
-    return TrackSamples(
-        name=samples.name,
-        start_us=samples.start_us,
+    return replace(
+        samples,
         period=ROW_S,
         clock=np.arange(int(frame.max()) + 1) * ROW_US / 1e6,
         frame=frame,
         track=track,
-        centers=np.column_stack([found.poses[:, :2], found.heights]),
-        raw_headings=found.poses[:, 2],
-        headings=found.poses[:, 2],
-        velocities=found.velocities,
-        track_ids=samples.track_ids[kept],
-        categories=tuple(samples.categories[i] for i in kept.tolist()),
-        kinds=samples.kinds[kept],
-        sizes=samples.sizes[kept],
+        centers=np.column_stack([boxes.poses[:, :2], boxes.heights]),
+        raw_headings=boxes.poses[:, 2],
+        headings=boxes.poses[:, 2],
+        velocities=boxes.velocities,
+        track_ids=samples.track_ids[present],
+        categories=tuple(samples.categories[i] for i in present.tolist()),
+        kinds=samples.kinds[present],
+        sizes=samples.sizes[present],
         warnings=dict(+warnings),
     )
 
 
-def numbered(ids: Any) -> tuple[NDArray[Any], IntArray]:
-    """Distinct ids, ascending, and (A,) the number of each row's among them.
+def index_ids(ids: Any) -> tuple[NDArray[Any], IntArray]:
+    """Distinct ids, ascending, and (A,) the index of each row's among them.
 
     `ids` (A,) are integers or texts, as an array of numpy or pyarrow.
     """
-    encoded = ids if isinstance(ids, pa.ChunkedArray | pa.Array) else pa.array(ids)
+    array = ids if isinstance(ids, pa.ChunkedArray | pa.Array) else pa.array(ids)
+    encoded = pa.chunked_array(array.chunks if isinstance(array, pa.ChunkedArray) else [array])
     if not pa.types.is_dictionary(encoded.type):
         encoded = encoded.dictionary_encode()  # far faster than sorting texts
-    encoded = pa.chunked_array(encoded).unify_dictionaries().combine_chunks()
+    names, number = dictionary_codes(encoded)
+    distinct, rank = np.unique(names.to_numpy(zero_copy_only=False), return_inverse=True)
+    return distinct.astype(str) if distinct.dtype == object else distinct, rank[number]
+
+
+def dictionary_codes(column: pa.ChunkedArray) -> tuple[pa.Array, IntArray]:
+    """The values of a dictionary column, and (A,) the index of each row's; nulls get the last."""
+    encoded = column.unify_dictionaries().combine_chunks()
     encoded = encoded.chunk(0) if isinstance(encoded, pa.ChunkedArray) else encoded
-    names = encoded.dictionary.to_numpy(zero_copy_only=False)
-    number = encoded.indices.to_numpy()
-    order = np.argsort(names, kind="stable")
-    rank = np.empty(len(order), np.int64)
-    rank[order] = np.arange(len(order))
-    if number.dtype != rank.dtype or (rank != np.arange(len(order))).any():
-        number = rank[number]
-    found = names[order]
-    return found.astype(str) if found.dtype == object else found, number
+    codes = encoded.indices.fill_null(len(encoded.dictionary))
+    return encoded.dictionary, codes.to_numpy().astype(np.int64, copy=False)
 
 
 def order_of_rows(track: IntArray, time_us: IntArray) -> IntArray | None:
@@ -199,8 +210,6 @@ def order_of_rows(track: IntArray, time_us: IntArray) -> IntArray | None:
     later = time_us[1:] >= time_us[:-1]
     if ((track[1:] > track[:-1]) | ((track[1:] == track[:-1]) & later)).all():
         return None
-    if later.all():  # frame by frame: far quicker
-        return np.argsort(track.astype(np.min_scalar_type(int(track.max()))), kind="stable")
     return np.lexsort((time_us, track))
 
 
@@ -215,26 +224,16 @@ def _refuse_twice(name: str, ids: NDArray[Any], track: IntArray, time_us: IntArr
         )
 
 
-def _kinds(
-    name: str,
-    category: IntArray,
-    categories: Sequence[str],
-    kind_of: Mapping[str, AgentKind],
-    track: IntArray,
-    warnings: Counter[str],
-) -> tuple[tuple[str, ...], IntArray]:
-    """Most frequent category of every track, and its kind."""
-    votes = np.zeros((int(track[-1]) + 1, len(categories)), np.int64)
+def most_frequent(
+    category: IntArray, num_categories: int, track: IntArray, warnings: Counter[str]
+) -> list[int]:
+    """N most frequent category of every track; category and track: (A,)."""
+    votes = np.zeros((int(track[-1]) + 1, num_categories), np.int64)
     np.add.at(votes, (track, category), 1)
     changing = int(((votes > 0).sum(axis=1) > 1).sum())
     warnings["tracks of changing category (most frequent taken)"] += changing
-    names = tuple(categories[code] for code in votes.argmax(axis=1).tolist())
-    for one in sorted(set(names) - set(kind_of)):
-        raise ConversionError(
-            f"{name}: category {one!r} is unknown",
-            f"map it to one of {', '.join(sorted(kind_of))}",
-        )
-    return names, np.array([kind_of[one] for one in names], np.int64)
+    most: list[int] = votes.argmax(axis=1).tolist()
+    return most
 
 
 def _sizes(
@@ -248,10 +247,10 @@ def _sizes(
     known = (sizes > 0.0).all(axis=1)
     if not known.all():  # the rows that have one tell it
         sizes, track = sizes[known], track[known]
-    found = np.zeros_like(usual)
+    medians = np.zeros_like(usual)
     if len(track):
-        medians = [track_medians(sizes[:, axis], track) for axis in (0, 1)]
-        found[: len(medians[0])] = np.column_stack(medians)
-    lacking = ~np.all(found > 0.0, axis=1)
+        for axis in (0, 1):
+            medians[: int(track[-1]) + 1, axis] = track_medians(sizes[:, axis], track)
+    lacking = ~np.all(medians > 0.0, axis=1)
     warnings["tracks without size (that of their kind)"] += int(lacking.sum())
-    return np.where(np.expand_dims(lacking, 1), usual, found)
+    return np.where(np.expand_dims(lacking, 1), usual, medians)

@@ -1,4 +1,4 @@
-"""Velocities and headings of tracks that lack them, and velocities that contradict positions.
+"""How recorded objects move: angles, velocities that can be believed or are derived, headings.
 
 Rows are sorted by track, then time, as in `TrackSamples`.
 """
@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from shiftsim.data.readers.dsc3d.motion import median
+from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 
 _HALF_WINDOW = 0.25  # s on each side of a fit
@@ -16,6 +16,33 @@ _EPS = 1e-6  # s
 _SLOW = 0.3  # m/s, below which a direction of motion tells nothing
 _END = 1.0  # s at both ends of a track, where trackers settle
 MAX_SHARE, _LEAST_ERROR = 0.1, 0.3  # of the speed; m/s that noise of positions may cause
+_MAX_STANDING_TURN = 0.5  # rad/s
+
+
+def track_ends(track: IntArray) -> IntArray:
+    """(N + 1,) first row of every track (A,), and the number of rows."""
+    return np.searchsorted(track, np.arange(int(track[-1]) + 2))
+
+
+def track_medians(values: FloatArray, track: IntArray) -> FloatArray:
+    """(N,) median of the rows of each track; values and track: (A,), sorted by track."""
+    return np.array(
+        [median(values[low:high]) for low, high in pairwise(track_ends(track).tolist())]
+    )
+
+
+def median(values: FloatArray) -> float:
+    """Median of values (n,); NaN of none, and NaN counts as larger than all numbers."""
+    if not len(values):
+        return float("nan")
+    low, high = (len(values) - 1) // 2, len(values) // 2
+    ranked = np.partition(values, (low, high))
+    return 0.5 * float(ranked[low] + ranked[high])
+
+
+def unit_vectors(headings: FloatArray) -> FloatArray:
+    """(A, 2) vectors of length 1 in the directions (A,) [rad]."""
+    return np.column_stack([np.cos(headings), np.sin(headings)])
 
 
 def fitted_velocities(
@@ -25,9 +52,8 @@ def fitted_velocities(
 
     Where frames are farther apart, through the neighbours. A row without one has velocity 0.
     """
-    ends = np.searchsorted(track, np.arange(int(track[-1]) + 2))
     half = max(_HALF_WINDOW, 1.5 * period) + _EPS
-    return _fit(np.ascontiguousarray(xy), time, ends, half)
+    return _fit(np.ascontiguousarray(xy), time, track_ends(track), half)
 
 
 def contradiction(
@@ -38,9 +64,9 @@ def contradiction(
     They do where the median over the track differs by more than 10 % of the median speed and 0.3
     m/s; the first and the last second are left out of tracks that are longer.
     """
-    ends = np.searchsorted(track, np.arange(int(track[-1]) + 2)).tolist()
+    ends = track_ends(track).tolist()
     wrong, share = np.zeros(len(ends) - 1, np.bool_), np.zeros(len(ends) - 1)
-    for one, (low, high) in enumerate(pairwise(ends)):
+    for number, (low, high) in enumerate(pairwise(ends)):
         times = time[low:high]
         if len(times) and times[-1] - times[0] > 3.0 * _END:
             high = low + int(np.searchsorted(times, times[-1] - _END, side="right"))
@@ -49,36 +75,34 @@ def contradiction(
             continue
         error = median(np.hypot(*(stored[low:high] - derived[low:high]).T))
         speed = median(np.hypot(*derived[low:high].T))
-        wrong[one] = not error <= max(_LEAST_ERROR, MAX_SHARE * speed)
-        share[one] = error / max(speed, _SLOW)
+        wrong[number] = not error <= max(_LEAST_ERROR, MAX_SHARE * speed)
+        share[number] = error / max(speed, _SLOW)
     return wrong, share
 
 
-def believed(
+def believed_velocities(
     stored: FloatArray | None,
     derived: FloatArray,
-    time: FloatArray,
+    contradicts: BoolArray | None,
     track: IntArray,
     warnings: Counter[str],
 ) -> FloatArray:
-    """Stored velocities (A, 2) of the tracks where they fit the positions, else the derived."""
+    """Stored velocities (A, 2) of tracks that have them and do not contradict, else the derived.
+
+    `contradicts` (N,) marks the tracks whose stored velocities contradict their positions.
+    """
     num_tracks = int(track[-1]) + 1
-    if stored is None:
+    if stored is None or contradicts is None:
         warnings["tracks without stored velocity (derived)"] += num_tracks
         return derived
     lacking = np.zeros(num_tracks, np.bool_)
     lacking[track[~np.isfinite(stored).all(axis=1)]] = True
     warnings["tracks without stored velocity (derived)"] += int(lacking.sum())
-    wrong = contradiction(stored, derived, time, track)[0] & ~lacking
+    wrong = contradicts & ~lacking
     warnings["tracks whose stored velocity does not fit (derived)"] += int(wrong.sum())
     if not (lacking | wrong).any():
         return stored
     return np.where((lacking | wrong)[track][:, None], derived, stored)
-
-
-def unit_vectors(headings: FloatArray) -> FloatArray:
-    """(A, 2) vectors of length 1 in the directions (A,) [rad]."""
-    return np.column_stack([np.cos(headings), np.sin(headings)])
 
 
 def headings_of_motion(
@@ -87,7 +111,7 @@ def headings_of_motion(
     """(A,) directions of velocities (A, 2); a standing object keeps the last, or gets the next."""
     known = np.hypot(velocities[:, 0], velocities[:, 1]) > _SLOW
     index = np.arange(len(track))
-    ends = np.searchsorted(track, np.arange(int(track[-1]) + 2))
+    ends = track_ends(track)
     before = np.maximum.accumulate(np.where(known, index, -1))
     after = np.minimum.accumulate(np.where(known, index, len(track))[::-1])[::-1]
     source = np.where(before >= ends[track], before, np.minimum(after, len(track) - 1))
@@ -96,6 +120,45 @@ def headings_of_motion(
     warnings["tracks without heading that never move (heading 0)"] += still
     angle = np.arctan2(velocities[source, 1], velocities[source, 0])
     return np.where(moves, angle, 0.0)
+
+
+def held_headings(
+    yaw: FloatArray,
+    velocities: FloatArray,
+    time: FloatArray,
+    track: IntArray,
+    warnings: Counter[str],
+) -> FloatArray:
+    """Headings; where a standing object's spins, the one before (nuPlan rule 460)."""
+    source = np.arange(len(yaw))
+    held = _hold(yaw, velocities, time, track, source)
+    warnings["rows with a heading that spins at standstill (held)"] += held
+    return yaw[source]
+
+
+@kernel
+def _hold(
+    yaw: FloatArray, velocities: FloatArray, time: FloatArray, track: IntArray, source: IntArray
+) -> int:
+    """Replace the rows `source` (A,) of headings where they spin; how many these are."""
+    held, before = 0, -1  # row before the first that spins
+    was_standing = False
+    for row in range(len(yaw)):
+        is_standing = np.hypot(velocities[row, 0], velocities[row, 1]) < _SLOW
+        if row == 0 or track[row] != track[row - 1]:
+            before, was_standing = -1, is_standing
+            continue
+        if not (is_standing and was_standing):
+            before = -1
+        if is_standing and before < 0:
+            turn = abs(wrap_angle(yaw[row] - yaw[row - 1]))
+            if turn > _MAX_STANDING_TURN * (time[row] - time[row - 1]):
+                before = row - 1
+        if before >= 0:
+            source[row] = before
+            held += 1
+        was_standing = is_standing
+    return held
 
 
 @kernel
@@ -129,7 +192,7 @@ def _fit(xy: FloatArray, time: FloatArray, ends: IntArray, half: float) -> Float
                     out[row, axis] = (y[1, axis] * s[0] - y[0, axis] * s[1]) / span / half
                 continue
             # second of three normal equations, by Cramer's rule
-            whole = (
+            determinant = (
                 s[0] * (s[2] * s[4] - s[3] * s[3])
                 - s[1] * (s[1] * s[4] - s[3] * s[2])
                 + s[2] * (s[1] * s[3] - s[2] * s[2])
@@ -141,5 +204,5 @@ def _fit(xy: FloatArray, time: FloatArray, ends: IntArray, half: float) -> Float
                     - a * (s[1] * s[4] - s[3] * s[2])
                     + s[2] * (s[1] * c - b * s[2])
                 )
-                out[row, axis] = part / whole / half
+                out[row, axis] = part / determinant / half
     return out

@@ -6,43 +6,59 @@ Position and heading are taken as truth, heading through the rotation matrix.
 """
 
 import json
+import os
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
+import pyproj
 
-from shiftsim.data.readers.dsc3d.files import (
-    DIMENSION,
-    POSITION,
-    REPAIR,
-    ROTATION,
-    VELOCITY,
-    numbers,
-    read_table,
+from shiftsim.data.maps.build import PieceMap
+from shiftsim.data.maps.opendrive.map import build_road_map
+from shiftsim.data.maps.opendrive.reading import read_opendrive
+from shiftsim.data.maps.opendrive.records import OpenDrive
+from shiftsim.data.readers.build import dictionary_codes, most_frequent
+from shiftsim.data.readers.codes import CATEGORIES, normalise_category
+from shiftsim.data.readers.convert import (
+    ConversionReport,
+    Executor,
+    Progress,
+    convert,
+    serial_map,
 )
-from shiftsim.data.readers.dsc3d.motion import (
+from shiftsim.data.readers.motion import (
     believed_velocities,
     held_headings,
-    rotation_angles,
+    track_ends,
     track_medians,
 )
-from shiftsim.data.readers.tracks.samples import TrackSamples
-from shiftsim.errors import ConversionError
-from shiftsim.kernels import FloatArray, IntArray
+from shiftsim.data.readers.placement import place_on_map
+from shiftsim.data.readers.reader import SourceRecording, site_map
+from shiftsim.data.readers.samples import TrackSamples
+from shiftsim.data.readers.windows import ConversionConfig, window_spans
+from shiftsim.data.store.tables import digest
+from shiftsim.errors import ConversionError, DataError
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.world.ranges import DSC3D, require
 from shiftsim.world.state import AgentKind
 
-_CATEGORIES = {
-    AgentKind.VEHICLE: "car vehicle van pickup truck bus trailer tram train construction_vehicle"
-    " agricultural_vehicle emergency_vehicle",
-    AgentKind.BICYCLE: "motorcycle bicycle cyclist scooter e_scooter escooter moped",
-    AgentKind.PEDESTRIAN: "pedestrian person stroller wheelchair",
-    AgentKind.GENERIC_OBJECT: "animal bicycle_rack movable_object static_object generic_object",
-}  # nuPlan rule 462: it has no class for motorcycles
-CATEGORIES = {name: kind for kind, names in _CATEGORIES.items() for name in names.split()}
+POSITION = ("translation_x", "translation_y", "translation_z")
+ROTATION = ("rotation_x", "rotation_y", "rotation_z")
+DIMENSION = ("dimension_x", "dimension_y", "dimension_z")
+VELOCITY = ("velocity_x", "velocity_y")
+REPAIR = "get the recording again from its source, or repair the file"
+SCENARIO_TYPE = "deepplan"
+_MAX_VELOCITY_ERROR = 0.5  # m/s, median of a track; beyond it the stored velocity is not believed
+_MAX_SPEED = 200.0  # m/s along an axis
+_EPS = 1e-9  # s
+_MAX_FRAME_SHIFT = 0.5  # m between the map's own georeference and that of the annotations
+_MOVING = 1.0  # m/s
+_MAX_POINTS = 20_000  # of a recording that tell where the map lies
 
 _NEEDED = ("frame_id", "track_id", "category", *POSITION, *ROTATION, *DIMENSION, *VELOCITY)
 
@@ -86,6 +102,125 @@ class Annotations(TrackSamples):
 
     bottom: FloatArray  # (A, 3) centre of the bottom face [m]
     angles: FloatArray  # (A, 3) yaw, pitch, roll [rad]
+
+
+class Dsc3dReader:
+    """A DSC3D download with its map; its recordings are named by their folders.
+
+    Args:
+        src: Folder with `data_meta.json`, `annotations/` and `map/`.
+        site: Name of the site in the store; the name of the folder by default.
+        map_path: OpenDRIVE file, where it is not in the download.
+        config: Thresholds.
+
+    Raises:
+        ConversionError: The folder or its map cannot be read, or contradict each other.
+    """
+
+    def __init__(
+        self,
+        src: Path,
+        *,
+        site: str | None = None,
+        map_path: Path | None = None,
+        config: ConversionConfig | None = None,
+    ) -> None:
+        self.config = config or ConversionConfig()
+        self.download = open_site(src)
+        self.name = site or src.resolve().name
+        self.source = self.download.folder
+        path = find_map(self.download, map_path)
+        self.site = self._map(path)
+        self.settings: Mapping[str, Any] = {
+            "site": [self.name, *self.download.offset.tolist()],
+            "rate": [self.download.frame_rate, self.download.frame_distance],
+            "config": asdict(self.config),
+            "map": digest(path),
+        }
+
+    def _map(self, path: Path) -> PieceMap:
+        drive = read_opendrive(path)
+        _check_georeference(drive, self.download)
+        x, y, *_ = drive.offset or (0.0, 0.0)
+        place = self.download.offset
+        offset = float(place[0]) - x, float(place[1]) - y  # the header's is applied
+        road, report = build_road_map(
+            drive,
+            name=self.name,
+            offset=offset,
+            epsg=self.download.epsg,
+            country=self.config.country,
+        )
+        if road.num_lanes == 0:
+            raise ConversionError(f"{drive.source} has no drivable lane", "give a map with roads")
+        return site_map(road, report.warnings)
+
+    def recordings(self) -> Sequence[str]:
+        """Names as listed in `data_meta.json`."""
+        return self.download.recordings
+
+    def files(self, recording: str) -> Sequence[Path]:
+        """Annotations and frames."""
+        folder = self.source / "annotations" / recording
+        return [folder / f"{part}.parquet" for part in ("annotations", "frames")]
+
+    def read(self, recording: str) -> SourceRecording:
+        """One recording, and how its moving vehicles lie on the map."""
+        try:
+            samples = read_recording(self.download, recording, self.config.category_map)
+        except DataError as error:
+            message = error.message.replace(f"{self.source}{os.sep}", "")
+            raise ConversionError(message, error.hint) from error
+        return SourceRecording(
+            samples,
+            self.site,
+            config=self.config,
+            scenario_type=SCENARIO_TYPE,
+            spans=window_spans(samples.duration, self.config),
+            offset=self.download.offset[:2],
+            details={"placement": self._placement(samples)},
+        )
+
+    def _placement(self, samples: TrackSamples) -> dict[str, Any]:
+        """How many moving vehicles are looked at, how many of them are on drivable area."""
+        is_vehicle = (samples.kinds == AgentKind.VEHICLE)[samples.track]
+        moves = np.hypot(samples.velocities[:, 0], samples.velocities[:, 1]) > _MOVING
+        points = samples.centers[is_vehicle & moves, :2]
+        points = points[:: max(1, len(points) // _MAX_POINTS)] + self.download.offset[:2]
+        found = place_on_map(self.site.road, points, self.config.min_drivable_share)
+        return asdict(found) | {"shift": found.shift.tolist()}
+
+    def summarise(self, entries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        """Share of moving vehicles on drivable area; an error where map and tracks do not fit."""
+        places = [entry["placement"] for entry in entries]
+        looked_at = sum(place["num_points"] for place in places)
+        share = sum(place["num_drivable"] for place in places) / looked_at if looked_at else 1.0
+        least = self.config.min_drivable_share
+        if share < least:
+            worst = max(places, key=lambda place: place["num_points"] - place["num_drivable"])
+            x, y = worst["shift"]
+            raise ConversionError(
+                f"{self.source}: only {share:.0%} of the moving vehicles are on drivable area of"
+                f" the map, need {least:.0%}",
+                f"the annotations fit best ({worst['best_share']:.0%}) when shifted by"
+                f" ({x:+.1f}, {y:+.1f}) m: check that map and reference_utm.offset belong together",
+            )
+        return {"drivable_share": share, "config": asdict(self.config)}
+
+
+def convert_dsc3d(
+    src: Path,
+    store: Path,
+    *,
+    site: str | None = None,
+    map_path: Path | None = None,
+    options: ConversionConfig | None = None,
+    progress: Progress | None = None,
+    executor: Executor = serial_map,
+) -> ConversionReport:
+    """Convert a DSC3D download to scenarios in a store: `convert` of a `Dsc3dReader`."""
+    reader = Dsc3dReader(src, site=site, map_path=map_path, config=options)
+    return convert(reader, store, progress=progress, executor=executor)
 
 
 def open_site(src: Path) -> Site:
@@ -171,10 +306,10 @@ def read_recording(
     warnings: Counter[str] = Counter()
     frame_ids, start_us = _read_frames(folder / "frames.parquet", site, warnings)
     path = folder / "annotations.parquet"
-    table = read_table(path, _NEEDED, _MAX_ROWS)
-    columns = {key: numbers(table, key, path) for key in (*POSITION, *ROTATION, *DIMENSION)}
-    ids = numbers(table, "track_id", path).astype(np.int64)
-    row_frames = numbers(table, "frame_id", path).astype(np.int64)
+    table = _read_table(path, _NEEDED, _MAX_ROWS)
+    columns = {key: _numbers(table, key, path) for key in (*POSITION, *ROTATION, *DIMENSION)}
+    ids = _numbers(table, "track_id", path).astype(np.int64)
+    row_frames = _numbers(table, "frame_id", path).astype(np.int64)
     order = np.lexsort((row_frames, ids))
     track_ids, track = np.unique(ids[order], return_inverse=True)
     if len(track_ids) > _MAX_TRACKS:
@@ -205,8 +340,10 @@ def read_recording(
     time = clock[frame]
     stored = None
     if set(VELOCITY) <= set(table.column_names):
-        stored = np.stack([numbers(table, key, path)[order] for key in VELOCITY], axis=1)
-    velocities = believed_velocities(stored, centers[:, :2], time, track, warnings)
+        stored = np.stack([_numbers(table, key, path)[order] for key in VELOCITY], axis=1)
+    derived = _central_differences(centers[:, :2], time, track)
+    contradicts = None if stored is None else _contradicts(stored, derived, track)
+    velocities = believed_velocities(stored, derived, contradicts, track, warnings)
     return Annotations(
         name=name,
         start_us=start_us,
@@ -226,11 +363,6 @@ def read_recording(
         sizes=sizes,
         warnings=dict(+warnings),
     )
-
-
-def normalise_category(name: str) -> str:
-    """A category in lower case with underscores."""
-    return name.strip().lower().replace(" ", "_").replace("-", "_")
 
 
 def _key(data: Any, dotted: str, path: Path) -> Any:
@@ -263,8 +395,8 @@ def _check_site(site: Site, path: Path) -> None:
 
 
 def _read_frames(path: Path, site: Site, warnings: Counter[str]) -> tuple[IntArray, int]:
-    table = read_table(path, ("frame_id", "time"), _MAX_FRAMES)
-    ids = numbers(table, "frame_id", path).astype(np.int64)
+    table = _read_table(path, ("frame_id", "time"), _MAX_FRAMES)
+    ids = _numbers(table, "frame_id", path).astype(np.int64)
     if len(ids) < 2:
         raise ConversionError(f"{path}: {len(ids)} frames, need at least 2", REPAIR)
     if (np.diff(ids) <= 0).any():
@@ -324,26 +456,20 @@ def _track_categories(
 ) -> tuple[str, ...]:
     if "category" not in table.column_names:
         raise ConversionError(f"{path}: column 'category' is missing", REPAIR)
+    column = table["category"]
+    if column.null_count:
+        raise ConversionError(f"{path}: column 'category' holds {column.null_count} nulls", REPAIR)
     try:
-        encoded = table["category"].unify_dictionaries().combine_chunks()
-        if not pa.types.is_dictionary(encoded.type):
-            encoded = encoded.cast(pa.string()).dictionary_encode()
-        encoded = encoded.cast(pa.dictionary(pa.int32(), pa.string()))
+        if not pa.types.is_dictionary(column.type):
+            column = column.cast(pa.string()).dictionary_encode()
+        found, codes = dictionary_codes(column.cast(pa.dictionary(pa.int32(), pa.string())))
     except (pa.ArrowException, ValueError) as error:
         raise ConversionError(f"{path}: column 'category' does not hold names", REPAIR) from error
-    if encoded.null_count:
-        raise ConversionError(f"{path}: column 'category' holds {encoded.null_count} nulls", REPAIR)
-    if isinstance(encoded, pa.ChunkedArray):
-        encoded = encoded.combine_chunks()
-    if len(encoded.dictionary) > _MAX_NAMES:
+    if len(found) > _MAX_NAMES:
         raise ConversionError(f"{path}: more than {_MAX_NAMES} categories", REPAIR)
-    names = [normalise_category(str(name)) for name in encoded.dictionary.to_pylist()]
-    codes = encoded.indices.to_numpy()[order].astype(np.int64)
-    votes = np.zeros((int(track[-1]) + 1, len(names)), np.int64)
-    np.add.at(votes, (track, codes), 1)
-    changing = int(((votes > 0).sum(axis=1) > 1).sum())
-    warnings["tracks of changing category (most frequent taken)"] += changing
-    return tuple(names[code] for code in votes.argmax(axis=1).tolist())
+    names = [normalise_category(str(name)) for name in found.to_pylist()]
+    most = most_frequent(codes[order], len(names), track, warnings)
+    return tuple(names[code] for code in most)
 
 
 def _agent_kinds(
@@ -358,3 +484,103 @@ def _agent_kinds(
                 f"map it: --category {name}=… with one of {', '.join(sorted(CATEGORIES))}",
             )
     return mapped, np.array([CATEGORIES[name] for name in mapped], np.int64)
+
+
+def rotation_angles(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(A, 3) yaw, pitch, roll [rad] and (A, 3) unit vectors along the height of objects.
+
+    `rotation` is (A, 3) axis times angle, object to local frame [rad].
+    """
+    angle = np.linalg.norm(rotation, axis=1)
+    x, y, z = rotation.T
+    sine = np.sinc(angle / np.pi)  # sin(a) / a
+    rest = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2  # (1 - cos(a)) / a^2
+    cos = np.cos(angle)
+    yaw = np.arctan2(z * sine + x * y * rest, cos + x * x * rest)
+    pitch = -np.arcsin(np.clip(x * z * rest - y * sine, -1.0, 1.0))
+    up = np.stack([y * sine + x * z * rest, y * z * rest - x * sine, cos + z * z * rest], axis=1)
+    roll = np.arctan2(x * sine + y * z * rest, up[:, 2])
+    return np.stack([yaw, pitch, roll], axis=1), up
+
+
+def _central_differences(xy: FloatArray, time: FloatArray, track: IntArray) -> FloatArray:
+    """(A, 2) difference of the neighbouring rows of the same track, one-sided at its ends."""
+    index = np.arange(len(track))
+    before = np.where(np.r_[False, track[1:] == track[:-1]], index - 1, index)
+    after = np.where(np.r_[track[1:] == track[:-1], False], index + 1, index)
+    span = np.maximum(time[after] - time[before], _EPS)
+    return (xy[after] - xy[before]) / span[:, None]
+
+
+def _contradicts(stored: FloatArray, derived: FloatArray, track: IntArray) -> BoolArray:
+    """(N,) whether the stored velocities of a track contradict its positions (nuPlan rule 459)."""
+    error = np.hypot(*(derived - stored).T)
+    wrong = track_medians(error, track) >= _MAX_VELOCITY_ERROR
+    wrong &= np.diff(track_ends(track)) > 1  # a single row has nothing to compare with
+    wrong[track[np.abs(stored).max(axis=1) > _MAX_SPEED]] = True
+    return wrong
+
+
+def _read_table(path: Path, wanted: tuple[str, ...], max_rows: int) -> pa.Table:
+    """The columns wanted, as far as the file has them.
+
+    Raises:
+        ConversionError: The file is missing, not Parquet, or has more rows than `max_rows`.
+    """
+    if not os.path.isfile(path):  # a name may be too long to ask for
+        raise ConversionError(f"{path} is missing", "copy the whole recording folder")
+    try:
+        file = pq.ParquetFile(path)
+        if file.metadata.num_rows > max_rows:
+            raise ConversionError(
+                f"{path}: {file.metadata.num_rows} rows, at most {max_rows} can be read",
+                "split the recording",
+            )
+        names = [name for name in wanted if name in file.schema_arrow.names]
+        names_only = [name for name in ("category",) if name in names]
+        file = pq.ParquetFile(path, read_dictionary=names_only)  # long names are not repeated
+        return file.read(names, use_threads=False)
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise ConversionError(f"{path}: not a readable Parquet file ({error})", REPAIR) from error
+
+
+def _numbers(table: pa.Table, key: str, path: Path) -> FloatArray:
+    """One numeric column as float64, finite and without nulls.
+
+    Raises:
+        ConversionError: It is missing, or a value cannot be.
+    """
+    if key not in table.column_names:
+        raise ConversionError(f"{path}: column {key!r} is missing", REPAIR)
+    column = table[key]
+    if column.null_count:
+        raise ConversionError(f"{path}: column {key!r} holds {column.null_count} nulls", REPAIR)
+    try:
+        values = column.cast(pa.float64()).to_numpy().astype(np.float64, copy=False)
+    except (pa.ArrowException, ValueError, TypeError) as error:
+        what = f"{path}: column {key!r} is {column.type}, need numbers"
+        raise ConversionError(what, REPAIR) from error
+    require(DSC3D, key, values, f"{path}: column", error=ConversionError)
+    return values
+
+
+def _check_georeference(drive: OpenDrive, site: Site) -> None:
+    """Refuse a map whose own georeference contradicts that of the annotations."""
+    offset = drive.offset or (0.0, 0.0, 0.0, 0.0)
+    if drive.geo_reference is None:
+        own = offset[:2]
+        if own == (0.0, 0.0):
+            return
+    else:
+        try:
+            crs = pyproj.CRS.from_user_input(drive.geo_reference)
+            to_utm = pyproj.Transformer.from_crs(crs, site.epsg, always_xy=True)
+            own = to_utm.transform(offset[0], offset[1])
+        except pyproj.exceptions.ProjError:
+            return  # not a projection: the map counts as local
+    if not np.hypot(own[0] - site.offset[0], own[1] - site.offset[1]) <= _MAX_FRAME_SHIFT:
+        raise ConversionError(
+            f"{drive.source} places its origin at UTM ({own[0]:.2f}, {own[1]:.2f}),"
+            f" reference_utm.offset at ({site.offset[0]:.2f}, {site.offset[1]:.2f})",
+            "correct the one that is wrong; they must agree to 0.5 m",
+        )

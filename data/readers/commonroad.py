@@ -15,12 +15,12 @@ import shapely
 from shiftsim.data.maps.build import build_lane_map
 from shiftsim.data.maps.lights import Cycle, LightStates, states_of_cycles
 from shiftsim.data.maps.segments import LanePiece, MapSource, StopArea, stop_area
-from shiftsim.data.readers.open_data import codes
-from shiftsim.data.readers.open_data.scenes import Scene
-from shiftsim.data.readers.open_data.source import Source, find_below
-from shiftsim.data.readers.tracks.build import make_samples
-from shiftsim.data.readers.tracks.motion import unit_vectors
-from shiftsim.data.readers.tracks.samples import TrackSamples
+from shiftsim.data.readers import codes
+from shiftsim.data.readers.build import make_samples
+from shiftsim.data.readers.files import SceneFolder, SourceFile
+from shiftsim.data.readers.motion import unit_vectors
+from shiftsim.data.readers.reader import SourceRecording
+from shiftsim.data.readers.samples import TrackSamples
 from shiftsim.data.xml_elements import xml_elements
 from shiftsim.kernels import FloatArray
 from shiftsim.world.state import AgentKind, LightStatus
@@ -36,27 +36,27 @@ _STATE = {  # field of `OPEN_DATA` by path
 }
 
 
-class CommonRoadReader:
-    """CommonRoad; a scene is named by its file."""
+class CommonRoadReader(SceneFolder):
+    """CommonRoad; a scene is named by its file, and every vehicle that drives is an ego."""
 
-    def find(self, folder: Path) -> list[Path]:
-        """XML files, sorted."""
-        return find_below(folder, "*.xml", "give a folder of CommonRoad scenarios in XML")
+    name = "commonroad"
+    pattern = "*.xml"
+    hint = "give a folder of CommonRoad scenarios in XML"
 
-    def files(self, path: Path) -> list[Path]:
+    def files(self, recording: str) -> list[Path]:
         """The file itself."""
-        return [path]
+        return [Path(recording)]
 
-    def read(self, path: Path) -> Scene:
+    def read(self, recording: str) -> SourceRecording:
         """One scene."""
-        file = _File(path)
-        name = file.root.get("benchmarkID") or path.stem
+        file = _File(Path(recording))
+        name = file.root.get("benchmarkID") or file.path.stem
         with file.naming():
             lanes = build_lane_map(file.map(f"commonroad-{name}"))
             samples = file.tracks()
-        return Scene(
-            samples=samples,
-            map=lanes,
+        return SourceRecording(
+            samples,
+            lanes,
             lights=file.lights(samples.duration),
             warnings=file.warnings,
             metadata={
@@ -67,7 +67,7 @@ class CommonRoadReader:
         )
 
 
-class _File(Source):
+class _File(SourceFile):
     """What one file says."""
 
     def __init__(self, path: Path) -> None:

@@ -15,12 +15,11 @@ import pyarrow.compute as pc
 
 from shiftsim.data.maps.build import build_lane_map
 from shiftsim.data.maps.segments import MapSource
-from shiftsim.data.readers.open_data.codes import TYPES
-from shiftsim.data.readers.open_data.lane_names import LaneNames
-from shiftsim.data.readers.open_data.scenes import Scene
-from shiftsim.data.readers.open_data.source import Source, find_below
-from shiftsim.data.readers.tracks.build import make_samples
-from shiftsim.data.readers.tracks.samples import TrackSamples
+from shiftsim.data.readers.build import make_samples
+from shiftsim.data.readers.codes import TYPES, LaneNames
+from shiftsim.data.readers.files import SceneFolder, SourceFile
+from shiftsim.data.readers.reader import SourceRecording
+from shiftsim.data.readers.samples import TrackSamples
 
 EGO = "AV"
 _MOTION = ("position_x", "position_y", "heading", "velocity_x", "velocity_y")
@@ -57,37 +56,40 @@ _METADATA = {
 }
 
 
-class Av2Reader:
+class Av2Reader(SceneFolder):
     """Argoverse 2 motion forecasting; a scene is named by its Parquet file."""
 
-    def find(self, folder: Path) -> list[Path]:
-        """Parquet files of the scenes, sorted."""
-        hint = "give a folder of the motion-forecasting data set, such as val/"
-        return find_below(folder, "scenario_*.parquet", hint)
+    name = "av2"
+    pattern = "scenario_*.parquet"
+    hint = "give a folder of the motion-forecasting data set, such as val/"
 
-    def files(self, path: Path) -> list[Path]:
+    def files(self, recording: str) -> list[Path]:
         """The tracks and the map."""
-        name = path.stem.removeprefix("scenario_")
-        return [path, path.with_name(f"log_map_archive_{name}.json")]
+        path = Path(recording)
+        return [path, path.with_name(f"log_map_archive_{_scenario_id(path)}.json")]
 
-    def read(self, path: Path) -> Scene:
+    def read(self, recording: str) -> SourceRecording:
         """One scene."""
-        tracks, road = map(Source, self.files(path))
-        name = path.stem.removeprefix("scenario_")
+        tracks, road = map(SourceFile, self.files(recording))
+        name = _scenario_id(tracks.path)
         with tracks.naming():
             samples = _read_tracks(tracks)
         with road.naming():
             lanes = build_lane_map(_read_map(road, f"av2-{name}"))
-        return Scene(
-            samples=samples,
-            map=lanes,
-            egos=(EGO,),
+        return SourceRecording(
+            samples,
+            lanes,
             left_out_s=_SQUEEZED_S,
             metadata={**_METADATA, "scenario_id": name},
+            **self.recorded_ego(EGO),
         )
 
 
-def _read_tracks(source: Source) -> TrackSamples:
+def _scenario_id(path: Path) -> str:
+    return path.stem.removeprefix("scenario_")
+
+
+def _read_tracks(source: SourceFile) -> TrackSamples:
     table = source.columns(_COLUMNS)
     if pc.all(table["observed"]).as_py():
         raise source.fault(
@@ -118,7 +120,7 @@ def _read_tracks(source: Source) -> TrackSamples:
     )
 
 
-def _read_map(source: Source, name: str) -> MapSource:
+def _read_map(source: SourceFile, name: str) -> MapSource:
     """The map of a scene: what its `log_map_archive_*.json` says."""
     found = source.unpack(source.content(_MAX_BYTES), json.loads, _MAP, "the JSON")
     return MapSource(

@@ -12,10 +12,10 @@ import pyarrow.csv as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from shiftsim.data.readers.dsc3d.recording import normalise_category
-from shiftsim.data.readers.tracks.build import numbered, order_of_rows
+from shiftsim.data.readers.build import dictionary_codes, index_ids, order_of_rows
+from shiftsim.data.readers.codes import normalise_category
+from shiftsim.data.readers.motion import unit_vectors
 from shiftsim.data.readers.tracks.columns import Columns, recognise
-from shiftsim.data.readers.tracks.motion import unit_vectors
 from shiftsim.errors import ConfigError, ConversionError
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.ranges import OPEN_DATA, require
@@ -45,18 +45,18 @@ class TrackTable:
 
 
 def read_tracks(
-    path: Path, *, said: Mapping[str, Any] | None = None, hz: float | None = None
+    path: Path, *, overrides: Mapping[str, Any] | None = None, hz: float | None = None
 ) -> TrackTable:
     """The rows of a CSV or Parquet file.
 
     Args:
         path: The file; `*Meta.csv` files of levelXdata beside it are read too.
-        said: Names, units and kinds that the user gives (`columns.recognise`).
+        overrides: Names, units and kinds that the user gives (`columns.recognise`).
         hz: Frames per second, for time given in frames.
 
     Raises:
         ConversionError: The file cannot be read, a column is missing or holds something else.
-        ConfigError: What was said does not fit the file.
+        ConfigError: An override does not fit the file.
     """
     if not path.is_file():
         what = "is no file" if path.exists() else "does not exist"
@@ -64,16 +64,16 @@ def read_tracks(
     is_csv = path.suffix.lower() not in (".parquet", ".pq")
     options = _csv_options(path) if is_csv else None
     names = _names(path, options)
-    said, meta = dict(said or {}), None
+    overrides, meta = dict(overrides or {}), None
     stem = path.stem.removesuffix("_tracks")
     if stem != path.stem:  # levelXdata: kinds and rate are in files beside the tracks
-        said, meta = _beside(path.with_name(f"{stem}_"), said, names)
-    columns = recognise(names, said, str(path))
+        overrides, meta = _beside(path.with_name(f"{stem}_"), overrides, names)
+    columns = recognise(names, overrides, str(path))
     table = _read(path, columns, options)
     if not len(table):
         raise ConversionError(f"{path} has no rows", "export the tracks again")
     time_us, rate = _times(table, columns, hz, path)
-    track_ids, track = numbered(_ids(table, columns.found["id"].name, path))
+    track_ids, track = index_ids(_ids(table, columns.found["id"].name, path))
     category, categories = _categories(table, columns, track_ids, track, meta)
     order = order_of_rows(track, time_us)
     if order is not None:
@@ -283,11 +283,8 @@ def _categories(
         values = table[column.name]
         if not pa.types.is_dictionary(values.type):
             values = values.cast(pa.string()).dictionary_encode()
-        encoded = values.unify_dictionaries().combine_chunks()
-        encoded = encoded.chunk(0) if isinstance(encoded, pa.ChunkedArray) else encoded
-        names = [str(name) for name in encoded.dictionary.to_pylist()]
-        codes = encoded.indices.fill_null(len(names)).to_numpy().astype(np.int64)
-        names.append("")
+        found, codes = dictionary_codes(values)
+        names = [*map(str, found.to_pylist()), ""]
     plain = [normalise_category(name) for name in names]
     plain = [columns.kinds.get(name, name) for name in plain]
     distinct = sorted(set(plain))
@@ -296,22 +293,22 @@ def _categories(
 
 
 def _beside(
-    prefix: Path, said: dict[str, Any], names: list[str]
+    prefix: Path, overrides: dict[str, Any], names: list[str]
 ) -> tuple[dict[str, Any], dict[int, str] | None]:
-    """Rate and kinds from the files of levelXdata beside the tracks; the user's word goes first."""
+    """Rate and kinds from levelXdata's files beside the tracks; what the user gives goes first."""
     meta, file = None, prefix
     rates, kinds = (prefix.with_name(f"{prefix.name}{n}Meta.csv") for n in ("recording", "tracks"))
     try:
-        if os.path.isfile(file := rates) and "hz" not in said:
+        if os.path.isfile(file := rates) and "hz" not in overrides:
             found = pc.read_csv(rates).to_pydict()
-            said["hz"] = float(found["frameRate"][0])
+            overrides["hz"] = float(found["frameRate"][0])
         if os.path.isfile(file := kinds) and not {"class", "kind"} & {
             name.lower() for name in names
         }:
             found = pc.read_csv(kinds).to_pydict()
             number = "trackId" if "trackId" in found else "id"
             meta = dict(zip(found[number], map(str, found["class"]), strict=True))
-            said["columns"] = {"kind": "=meta"} | said.get("columns", {})
+            overrides["columns"] = {"kind": "=meta"} | overrides.get("columns", {})
     except (OSError, pa.ArrowException, KeyError, ValueError, IndexError, TypeError) as error:
         raise ConversionError(f"{file}: not readable ({error!r})", _REPAIR) from error
-    return said, meta
+    return overrides, meta

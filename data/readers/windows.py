@@ -11,13 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.data.readers.tracks.samples import TrackSamples
+from shiftsim.data.readers.samples import ROW_S, Runs, TrackSamples, rows_of
 from shiftsim.errors import ConfigError, one_of
 from shiftsim.geometry.boxes import box_corners
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.world.ranges import SETTINGS
 
-ROW_S = 0.05  # s between rows of a converted recording
 EGO, CATEGORY, PRESENCE, SPEED, OVERLAP = "ego", "category", "presence", "speed", "overlap"
 LANE, ROUTE, GAP = "lane", "route", "route with a gap"
 _EPS = 1e-9  # s
@@ -45,7 +44,7 @@ class ConversionConfig:
     window_s: float = 18.0  # length of a window [s]
     overlap_s: float = 6.0  # overlap of consecutive windows [s]
     history_s: float = 3.0  # part of a window before iteration 0 [s]
-    # history made up before the first frame of a recording, by constant velocity, for recordings
+    # history of constant velocity before the first frame of a recording, for recordings
     # too short to spare any [s]
     padding_s: float = 0.0
     ego_categories: tuple[str, ...] = ("car", "van", "pickup")  # categories that may serve as ego
@@ -97,7 +96,7 @@ def make_config(values: Mapping[str, Any]) -> ConversionConfig:
 
 def _check_type(name: str, value: Any) -> None:
     """Types are checked strictly: TOML and Python callers get the same message."""
-    is_whole = isinstance(value, int) and not isinstance(value, bool)
+    is_integer = isinstance(value, int) and not isinstance(value, bool)
     special: dict[str, tuple[bool, str]] = {
         "ego_categories": (isinstance(value, tuple) and _are_texts(*value), "a list of names"),
         "category_map": (
@@ -105,10 +104,10 @@ def _check_type(name: str, value: Any) -> None:
             "a table of names",
         ),
         "country": (_are_texts(value), "a name"),
-        "route_extension_blocks": (is_whole and value >= 0, "an integer from 0 on"),
-        "max_per_window": (value is None or (is_whole and value > 0), "an integer from 1 on"),
+        "route_extension_blocks": (is_integer and value >= 0, "an integer from 0 on"),
+        "max_per_window": (value is None or (is_integer and value > 0), "an integer from 1 on"),
     }
-    is_number = (is_whole or isinstance(value, float)) and 0 <= value < np.inf
+    is_number = (is_integer or isinstance(value, float)) and 0 <= value < np.inf
     is_good, wanted = special.get(name, (is_number, "a number from 0 on"))
     if not is_good:
         raise ConfigError(f"{name} is {value!r}; it must be {wanted}")
@@ -118,16 +117,6 @@ def _check_type(name: str, value: Any) -> None:
 
 def _are_texts(*values: object) -> bool:
     return all(isinstance(value, str) for value in values)
-
-
-@dataclass(frozen=True)
-class Runs:
-    """Stretches of rows in which a track is present without a hole that is too long. U runs."""
-
-    first: IntArray  # (U,) first row
-    last: IntArray  # (U,) last row
-    track: IntArray  # (U,) track
-    number: IntArray  # (U,) how many runs of the same track came before
 
 
 @dataclass(frozen=True)
@@ -141,49 +130,23 @@ class WindowVerdicts:
     partners: IntArray  # (n,) track whose box it overlapped, -1 where the verdict is another one
 
 
-def rows_of(seconds: float) -> int:
-    """How many 20 Hz rows a time span has."""
-    return round(seconds / ROW_S)
-
-
-def find_runs(recording: TrackSamples, max_hole_s: float) -> Runs:
-    """Split the tracks where they are absent for longer than `max_hole_s` (nuPlan rule 458)."""
-    time = recording.time
-    gap = np.r_[np.inf, np.diff(time)]
-    new_track = np.r_[True, np.diff(recording.track) != 0]
-    starts = new_track | (gap > max_hole_s + recording.period + 1e-6)
-    first = np.flatnonzero(starts)
-    last = np.r_[first[1:] - 1, len(time) - 1]
-    track = recording.track[first]
-    first_run = np.searchsorted(track, track)
-    return Runs(first, last, track, np.arange(len(first)) - first_run)
-
-
-def window_starts(duration: float, config: ConversionConfig) -> FloatArray:
-    """Start of every window that fits into a recording [s]."""
-    stride = config.window_s - config.overlap_s
-    count = int(np.floor((duration - config.window_s) / stride + _EPS)) + 1
-    return np.arange(max(count, 0), dtype=np.float64) * stride
-
-
 def window_spans(duration: float, config: ConversionConfig) -> list[Span]:
     """Every window that fits into a recording [s]."""
-    starts = window_starts(duration, config).tolist()
-    return [Span(start, config.window_s, config.history_s) for start in starts]
+    stride = config.window_s - config.overlap_s
+    count = int(np.floor((duration - config.window_s) / stride + _EPS)) + 1
+    return [
+        Span(float(number) * stride, config.window_s, config.history_s)
+        for number in range(max(count, 0))
+    ]
 
 
-def judge_windows(
+def evaluate_windows(
     recording: TrackSamples,
     runs: Runs,
     config: ConversionConfig,
-    spans: Sequence[Span] | None = None,
+    spans: Sequence[Span],
 ) -> list[WindowVerdicts]:
-    """The verdict on every track in every window, rules of category to overlap.
-
-    The windows are those that fit into the recording, unless `spans` are given.
-    """
-    if spans is None:
-        spans = window_spans(recording.duration, config)
+    """The verdict on every track in every window, rules of category to overlap."""
     only = np.array([span.only for span in spans if span.only >= 0], np.int64)
     allowed = np.array([name in config.ego_categories for name in recording.categories], np.bool_)
     speed = _median_of_three(  # nuPlan rule 452
@@ -192,7 +155,7 @@ def judge_windows(
     asked = allowed & any(span.only < 0 for span in spans)
     asked[only] = True
     partner = overlap_partners(recording, asked, config.max_overlap)
-    return [_judge(span, recording, runs, config, allowed, speed, partner) for span in spans]
+    return [_evaluate(span, recording, runs, config, allowed, speed, partner) for span in spans]
 
 
 def overlap_partners(
@@ -215,7 +178,7 @@ def overlap_partners(
     )
 
 
-def _judge(
+def _evaluate(
     span: Span,
     recording: TrackSamples,
     runs: Runs,
@@ -255,14 +218,13 @@ def _judge(
     return WindowVerdicts(span, tracks, run[tracks], tuple(found.tolist()), partners)
 
 
-@kernel
 def _median_of_three(values: FloatArray, track: IntArray) -> FloatArray:
     """Median of each row and its neighbours of the same track; the ends keep their value."""
     out = values.copy()
-    for row in range(1, len(values) - 1):
-        if track[row - 1] == track[row] == track[row + 1]:
-            low, high = min(values[row - 1], values[row]), max(values[row - 1], values[row])
-            out[row] = max(low, min(high, values[row + 1]))
+    inner = np.flatnonzero(track[2:] == track[:-2]) + 1
+    before, here, after = values[inner - 1], values[inner], values[inner + 1]
+    low, high = np.minimum(before, here), np.maximum(before, here)
+    out[inner] = np.maximum(low, np.minimum(high, after))
     return out
 
 
@@ -316,19 +278,22 @@ def shared_area(a: FloatArray, b: FloatArray) -> float:
     for edge in range(len(b)):
         x, y = b[edge]
         nx, ny = y - b[(edge + 1) % len(b), 1], b[(edge + 1) % len(b), 0] - x  # to the left
-        kept = 0
+        num_left = 0
         for index in range(count):
             px, py = ring[index]
             qx, qy = ring[(index + 1) % count]
             p, q = (px - x) * nx + (py - y) * ny, (qx - x) * nx + (qy - y) * ny
             if p >= 0.0:
-                clipped[kept, 0], clipped[kept, 1] = px, py
-                kept += 1
+                clipped[num_left, 0], clipped[num_left, 1] = px, py
+                num_left += 1
             if p * q < 0.0:
                 share = p / (p - q)
-                clipped[kept, 0], clipped[kept, 1] = px + share * (qx - px), py + share * (qy - py)
-                kept += 1
-        ring, clipped, count = clipped, ring, kept
+                clipped[num_left, 0], clipped[num_left, 1] = (
+                    px + share * (qx - px),
+                    py + share * (qy - py),
+                )
+                num_left += 1
+        ring, clipped, count = clipped, ring, num_left
         if count < 3:
             return 0.0
     area = 0.0

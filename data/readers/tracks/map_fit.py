@@ -4,14 +4,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shiftsim.data.readers.deepplan.route import place_on_map
-from shiftsim.geometry.polylines import project_on_polyline
-from shiftsim.kernels import FloatArray, kernel
-from shiftsim.world.layers import Polygons, Polylines, contains, in_any
+from shiftsim.data.readers.placement import (
+    are_drivable,
+    containing_polygons,
+    direction_at,
+    place_on_map,
+)
+from shiftsim.kernels import FloatArray
 from shiftsim.world.map import VectorMap
 
 _MIN_ALONG = 0.7  # share of the vehicles on a lane that drive along one
 _MAX_POINTS = 2000
+_MAX_EDGES = 16  # lanes looked at per point
 _ENOUGH = 0.85  # of both shares, for another unit, axis or origin to be believed
 _GAIN = 0.03  # in the product of the shares, by which a later guess must be better
 _SPEEDS = (1.5, 45.0)  # m/s, of the median moving vehicle in the right unit
@@ -143,50 +147,16 @@ def _shares(
 
     Speed limits [m/s] are 0 where there is none.
     """
-    out = np.zeros((len(points), 4))
-    _look(
-        road.edges.polygons,
-        road.drivable_areas.polygons,
-        road.baselines,
-        np.nan_to_num(road.speed_limits),
-        np.ascontiguousarray(points),
-        np.ascontiguousarray(ways),
-        out,
-    )
-    drivable, on_lane, along, _ = out.sum(axis=0).tolist()
+    points = np.ascontiguousarray(points)
+    edges = containing_polygons(road.edges.polygons, points, _MAX_EDGES)
+    limits, is_along = np.zeros(len(points)), np.zeros(len(points), np.bool_)
+    for index, place in np.argwhere(edges >= 0).tolist():
+        edge = int(edges[index, place])
+        dx, dy = direction_at(road.baselines, edge, *points[index].tolist())
+        if dx * ways[index, 0] + dy * ways[index, 1] > 0.0:
+            is_along[index] = True
+            limits[index] = max(limits[index], np.nan_to_num(road.speed_limits[edge]))
+    on_lane, along = float((edges[:, 0] >= 0).sum()), float(is_along.sum())
     count = max(1, len(points))
-    return drivable / count, along / on_lane if on_lane > 0.1 * count else 1.0, out[:, 3]
-
-
-@kernel
-def _look(
-    edges: Polygons,
-    areas: Polygons,
-    baselines: Polylines,
-    limits: FloatArray,
-    points: FloatArray,
-    ways: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Write whether each point is on drivable area, on a lane, moves along it; the speed limit."""
-    for index in range(len(points)):
-        x, y = points[index, 0], points[index, 1]
-        if in_any(areas, x, y):
-            out[index, 0] = 1.0
-        for edge in range(len(edges.bounds)):
-            low_x, low_y, high_x, high_y = edges.bounds[edge]
-            if x < low_x or x > high_x or y < low_y or y > high_y:
-                continue
-            if not contains(edges, edge, x, y):
-                continue
-            out[index, 0] = 1.0
-            out[index, 1] = 1.0
-            first, last = baselines.ptr[edge], baselines.ptr[edge + 1]
-            along = project_on_polyline(baselines.xy, baselines.arc, first, last, x, y)
-            segment = int(np.searchsorted(baselines.arc[first:last], along, side="right")) - 1
-            at = first + min(max(segment, 0), last - first - 2)
-            dx = baselines.xy[at + 1, 0] - baselines.xy[at, 0]
-            dy = baselines.xy[at + 1, 1] - baselines.xy[at, 1]
-            if dx * ways[index, 0] + dy * ways[index, 1] > 0.0:
-                out[index, 2] = 1.0
-                out[index, 3] = max(out[index, 3], limits[edge])
+    drivable = float(are_drivable(road, points).sum())
+    return drivable / count, along / on_lane if on_lane > 0.1 * count else 1.0, limits

@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.data.readers.dsc3d.motion import track_medians
-from shiftsim.data.readers.tracks.motion import fitted_velocities
-from shiftsim.data.readers.tracks.reading import TrackTable
+from shiftsim.data.readers.motion import fitted_velocities, track_ends, track_medians
+from shiftsim.data.readers.tracks.table import TrackTable
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
 
 FAST = 2.0  # m/s, above which a direction of motion is sure
@@ -17,9 +17,8 @@ LEAST_CONTRADICTING, MAX_CONTRADICTING = 0.1, 0.5
 _MAX_ROWS = 40_000  # that are looked at
 
 
-@dataclass(frozen=True)
-class Doubt:
-    """One thing that cannot be right."""
+class Finding(NamedTuple):
+    """Something that is wrong, or unusual, with a table."""
 
     what: str  # value and limit
     remedy: str
@@ -29,23 +28,23 @@ class Doubt:
 class Diagnostics:
     """What was found out about a table."""
 
-    found: list[Doubt] = field(default_factory=list)  # errors
-    notes: list[Doubt] = field(default_factory=list)  # what may be right
+    errors: list[Finding] = field(default_factory=list)  # what cannot be right
+    warnings: list[Finding] = field(default_factory=list)  # what is unusual
     figures: dict[str, float] = field(default_factory=dict)  # numbers behind it
-    # (A, 2) velocities by the positions [m/s], where these could be told
+    # (A, 2) velocities by the positions [m/s], where these could be derived
     derived: FloatArray | None = None
 
-    def say(self, what: str, remedy: str) -> None:
-        """Say one more error."""
-        self.found.append(Doubt(what, remedy))
+    def error(self, what: str, remedy: str) -> None:
+        """Add something that cannot be right."""
+        self.errors.append(Finding(what, remedy))
 
-    def note(self, what: str, remedy: str) -> None:
-        """Say what may be right."""
-        self.notes.append(Doubt(what, remedy))
+    def warn(self, what: str, remedy: str) -> None:
+        """Add something that is unusual."""
+        self.warnings.append(Finding(what, remedy))
 
 
 @dataclass(frozen=True)
-class Motion:
+class TrackStatistics:
     """A table and how its objects move. A rows, N objects."""
 
     table: TrackTable
@@ -56,7 +55,7 @@ class Motion:
     @cached_property
     def ends(self) -> IntArray:
         """(N + 1,) first row of every object, and the number of rows."""
-        return np.searchsorted(self.table.track, np.arange(len(self.table.track_ids) + 1))
+        return track_ends(self.table.track)
 
     @cached_property
     def derived(self) -> FloatArray:

@@ -1,11 +1,11 @@
 """A file of an open data set: what is read of it is checked, and faults name it and a remedy.
 
 Every reader says what it needs: of columns the Arrow type (`items`: lists without nulls), of JSON
-and msgpack the form (`Source.expect`). What passes is used without further checks but those of
+and msgpack the form (`SourceFile.expect`). What passes is used without further checks but those of
 ranges.
 """
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,14 +16,17 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import shapely
 
+from shiftsim.data.maps.build import PieceMap
 from shiftsim.data.maps.segments import clean_line
 from shiftsim.data.polygons import largest_part
+from shiftsim.data.readers.windows import ConversionConfig
 from shiftsim.errors import ConversionError, DataError, readable
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.ranges import OPEN_DATA, require
 
 _MAX_BYTES = 2_000_000_000
 _MAX_ROWS = 8_000_000
+_RECORDED = ConversionConfig(min_peak_speed=0.0, max_overlap=1e6)  # also a car that stands
 # what JSON and msgpack call a type of Python, and the types of values that will do
 _KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
     bool: ("true or false", (bool,)),
@@ -36,7 +39,7 @@ _KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
 }
 
 
-class Source:
+class SourceFile:
     """A file, and what to do where it is not as expected."""
 
     # hint of all faults that have none of their own
@@ -237,12 +240,38 @@ def _nulls(found: pa.Array, kind: pa.DataType, *, allowed: bool = False) -> int:
     return count
 
 
-def find_below(folder: Path, pattern: str, remedy: str) -> list[Path]:
-    """Files of a folder, or below it, sorted; a file itself is the only one."""
-    found = [folder] if folder.is_file() else sorted(folder.rglob(pattern))
-    if not found:
-        raise ConversionError(f"{folder}: no {pattern} below it", remedy)
-    return found
+class SceneFolder:
+    """What the readers of folders of scenes share; each scene has a map of its own.
+
+    Args:
+        source: Where the files are; a file itself is the only scene.
+        vehicles: Whether every vehicle that drives is an ego, not the recording car alone.
+    """
+
+    name = ""  # of the data set
+    pattern = ""  # of the files that scenes are named by
+    hint = ""  # where there is none
+    site: PieceMap | None = None
+
+    def __init__(self, source: Path, *, vehicles: bool = False) -> None:
+        self.source, self.vehicles = source, vehicles
+        self.settings: Mapping[str, Any] = {"vehicles": vehicles}
+
+    def recordings(self) -> list[str]:
+        """Paths that name the scenes, sorted."""
+        is_file = self.source.is_file()
+        paths = [self.source] if is_file else sorted(self.source.rglob(self.pattern))
+        if not paths:
+            raise ConversionError(f"{self.source}: no {self.pattern} below it", self.hint)
+        return [str(path) for path in paths]
+
+    def recorded_ego(self, name: str) -> dict[str, Any]:
+        """Which objects of a scene become egos: `name`, whatever it does, or all vehicles."""
+        return {} if self.vehicles else {"egos": (name,), "config": _RECORDED}
+
+    def summarise(self, entries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        """Nothing: scenes have nothing in common."""
+        return {}
 
 
 def _read(path: Path, names: Collection[str]) -> pa.Table:

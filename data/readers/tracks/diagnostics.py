@@ -6,13 +6,19 @@ on the map. Every explanation that is known is tried; the one that makes the num
 
 import numpy as np
 
+from shiftsim.data.readers.build import MAX_PAUSE_S, MAX_SPAN_S, index_ids
+from shiftsim.data.readers.codes import KINDS
+from shiftsim.data.readers.motion import contradiction
 from shiftsim.data.readers.tracks.axes import check_headings, check_reference, check_velocities
-from shiftsim.data.readers.tracks.build import MAX_PAUSE_S, MAX_SPAN_S, numbered
-from shiftsim.data.readers.tracks.columns import KINDS, UNITS, Columns
-from shiftsim.data.readers.tracks.evidence import FAST, LEAST_CONTRADICTING, Diagnostics, Motion
-from shiftsim.data.readers.tracks.fit import Fit, fit_map
-from shiftsim.data.readers.tracks.motion import contradiction
-from shiftsim.data.readers.tracks.reading import TrackTable
+from shiftsim.data.readers.tracks.columns import UNITS, Columns
+from shiftsim.data.readers.tracks.map_fit import Fit, fit_map
+from shiftsim.data.readers.tracks.statistics import (
+    FAST,
+    LEAST_CONTRADICTING,
+    Diagnostics,
+    TrackStatistics,
+)
+from shiftsim.data.readers.tracks.table import TrackTable
 from shiftsim.kernels import BoolArray, FloatArray
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AgentKind
@@ -34,7 +40,7 @@ _ACCELERATION_S, _MAX_ACCELERATION = 0.5, 6.0  # s; m/s², of half of the moving
 _MAX_OVERSPEED = 1.6  # of the speed limit, of nine tenths of the rows
 
 
-def find_doubts(table: TrackTable, road: VectorMap, min_share: float) -> Diagnostics:
+def diagnose(table: TrackTable, road: VectorMap, min_share: float) -> Diagnostics:
     """Everything that cannot be right; `min_share` of the moving vehicles must be on the map."""
     out = Diagnostics()
     used = np.unique(table.category).tolist()
@@ -42,7 +48,7 @@ def find_doubts(table: TrackTable, road: VectorMap, min_share: float) -> Diagnos
         name for i, name in enumerate(table.categories) if i in used and name not in KINDS
     ]:
         names = ", ".join(repr(name[:40]) for name in unknown[:8])
-        out.say(
+        out.error(
             f"kinds {names} are unknown",
             f"say what they are in a TOML file for --columns: [kinds] {unknown[0][:40]!r} = 'car';"
             f" known are {', '.join(sorted(KINDS))}",
@@ -51,7 +57,7 @@ def find_doubts(table: TrackTable, road: VectorMap, min_share: float) -> Diagnos
     vehicles = [KINDS.get(name) == AgentKind.VEHICLE for name in table.categories]
     is_vehicle = np.array(vehicles, np.bool_)[table.category]
     if not is_vehicle.any():
-        out.say(
+        out.error(
             f"none of the {len(table.track_ids)} objects is a vehicle, so none can be the ego:"
             f" kinds {', '.join(map(repr, table.categories))}",
             "check the column of kinds, or map them: [kinds]",
@@ -62,39 +68,39 @@ def find_doubts(table: TrackTable, road: VectorMap, min_share: float) -> Diagnos
     if not _check_times(table, step, out):
         return out
     time = (table.time_us - table.time_us.min()) / 1e6
-    motion = Motion(table, is_vehicle, time, float(np.median(step)))
-    if not (_check_jumps(motion, same, out) and _check_speeds(motion, out)):
+    stats = TrackStatistics(table, is_vehicle, time, float(np.median(step)))
+    if not (_check_jumps(stats, same, out) and _check_speeds(stats, out)):
         return out
-    moving = motion.rows(_MOVING)
+    moving = stats.rows(_MOVING)
     _check_gaps(table, out)
-    _check_starts(motion, out)
+    _check_starts(stats, out)
     # another unit of length would show elsewhere, too
-    is_metric = _has_usual_sizes(motion) and _velocities_fit(motion)
-    fit = fit_map(road, table.xy[moving], motion.derived[moving], min_share, only_metres=is_metric)
+    is_metric = _has_usual_sizes(stats) and _velocities_fit(stats)
+    fit = fit_map(road, table.xy[moving], stats.derived[moving], min_share, only_metres=is_metric)
     out.figures.update({"drivable_share": fit.share, "along_share": fit.along})
     _check_fit(fit, table.columns, min_share, out)
     if fit.is_good and fit.overspeed > _MAX_OVERSPEED:
         out.figures["overspeed"] = fit.overspeed
-        out.note(
+        out.warn(
             f"a tenth of the moving vehicles is {fit.overspeed:.2g} times as fast as the speed"
             f" limit of their lane or faster, usual is less than {_MAX_OVERSPEED:g}",
             "check --hz or the unit of time, unless the limits of the map are wrong",
         )
-    _check_accelerations(motion, out)
-    _check_walkers(motion, out)
-    _check_sizes(motion, out)
-    check_headings(motion, fit, out)
-    check_velocities(motion, fit, out)
-    if not out.found:
-        check_reference(motion, out)
-        out.derived = motion.derived
+    _check_accelerations(stats, out)
+    _check_walkers(stats, out)
+    _check_sizes(stats, out)
+    check_headings(stats, fit, out)
+    check_velocities(stats, fit, out)
+    if not out.errors:
+        check_reference(stats, out)
+        out.derived = stats.derived
     return out
 
 
 def _check_times(table: TrackTable, step: FloatArray, out: Diagnostics) -> bool:
     """Whether motion can be told at all."""
     if not len(step):
-        out.say(
+        out.error(
             f"each of the {len(table.track_ids)} objects has one row only",
             "check the column of ids: an object needs the same id in all its rows",
         )
@@ -103,7 +109,7 @@ def _check_times(table: TrackTable, step: FloatArray, out: Diagnostics) -> bool:
     if len(twice):
         name = table.track_ids[table.track[twice[0]]].item()
         when = (table.time_us[twice[0]] - table.time_us.min()) / 1e6
-        out.say(
+        out.error(
             f"object {name!r} has two rows at {when:g} s ({len(twice)} such rows): rows are"
             " repeated, or one id names two objects",
             "leave repeated rows out, give objects ids of their own, and check the unit of time",
@@ -114,7 +120,7 @@ def _check_times(table: TrackTable, step: FloatArray, out: Diagnostics) -> bool:
     span = float(np.ptp(table.time_us)) / 1e6
     if 0.99 / fast <= period <= 1.01 / slow:
         if span > MAX_SPAN_S:
-            out.say(
+            out.error(
                 f"the rows span {span:g} s, more than {MAX_SPAN_S:g} s",
                 "leave out rows with a wrong time, check its unit, or convert parts by themselves",
             )
@@ -130,7 +136,7 @@ def _check_times(table: TrackTable, step: FloatArray, out: Diagnostics) -> bool:
             remedy += f"; if it counts frames: [columns] frame = {column.name!r}, and --hz"
     else:
         remedy = "check --hz, the number of frames per second"
-    out.say(
+    out.error(
         f"rows of an object are {period:g} s apart ({1.0 / period:g} Hz), need"
         f" {slow:g} … {fast:g} Hz",
         remedy,
@@ -139,47 +145,47 @@ def _check_times(table: TrackTable, step: FloatArray, out: Diagnostics) -> bool:
 
 
 def _check_gaps(table: TrackTable, out: Diagnostics) -> None:
-    stamps, _ = numbered(table.time_us)
+    stamps, _ = index_ids(table.time_us)
     gaps = np.flatnonzero(np.diff(stamps) > _MAX_GAP * 1e6)
     if len(gaps):
         first = gaps[np.diff(stamps)[gaps].argmax()]
         begin, end = (stamps[first : first + 2] - stamps[0]) / 1e6
         if end - begin > MAX_PAUSE_S:
-            out.say(
+            out.error(
                 f"no object has a row between {begin:g} s and {end:g} s, at most {MAX_PAUSE_S:g} s",
                 "if the clock begins anew at midnight, add a day to the times after it; if two"
                 " recordings were joined, convert each by itself",
             )
             return
-        out.note(
+        out.warn(
             f"no object has a row between {begin:g} s and {end:g} s ({len(gaps)} such gaps of more"
             f" than {_MAX_GAP:g} s)",
             "no scenario reaches over it; if two recordings were joined, convert each by itself",
         )
 
 
-def _check_starts(motion: Motion, out: Diagnostics) -> None:
+def _check_starts(stats: TrackStatistics, out: Diagnostics) -> None:
     """Objects that all begin at once and end one after another."""
-    first, last = motion.time[motion.ends[:-1]], motion.time[motion.ends[1:] - 1]
+    first, last = stats.time[stats.ends[:-1]], stats.time[stats.ends[1:] - 1]
     vanish = (last < last.max() - 1.0).mean()
     if len(first) >= _LEAST_OBJECTS and first.max() == 0.0 and vanish > 0.5:
-        out.note(
+        out.warn(
             f"all {len(first)} objects appear at the first time, none later, and {vanish:.0%} of"
             " them are gone before the last second",
             "if time counts from the first sight of each object, give one clock for all",
         )
 
 
-def _check_jumps(motion: Motion, same: BoolArray, out: Diagnostics) -> bool:
+def _check_jumps(stats: TrackStatistics, same: BoolArray, out: Diagnostics) -> bool:
     """Single rows that are far from their neighbours; whether speeds tell anything beside them."""
-    table = motion.table
+    table = stats.table
     way = np.hypot(*np.diff(table.xy, axis=0).T)
-    far = same & (way > _JUMP) & (way > _JUMP_SPEED * np.diff(motion.time))
+    far = same & (way > _JUMP) & (way > _JUMP_SPEED * np.diff(stats.time))
     count = int(far.sum())
     out.figures["jumps"] = float(count)
     if not count:
         return True
-    speed = way[same] / np.diff(motion.time)[same]
+    speed = way[same] / np.diff(stats.time)[same]
     if np.median(speed[speed > _MOVING]) > _MAX_SPEED:
         return True  # all do: a matter of units
     row = int(np.flatnonzero(far)[0])
@@ -194,20 +200,20 @@ def _check_jumps(motion: Motion, same: BoolArray, out: Diagnostics) -> bool:
                 f"many of them lead to {column} = {common:g} m, which looks like a place that is"
                 " not known: leave these rows out"
             )
-    out.say(
+    out.error(
         f"object {name!r} jumps {way[row]:.1f} m within"
-        f" {motion.time[row + 1] - motion.time[row]:g} s at {motion.time[row]:g} s ({count}"
+        f" {stats.time[row + 1] - stats.time[row]:g} s at {stats.time[row]:g} s ({count}"
         f" such jumps; more than {_JUMP_SPEED:g} m/s is no motion)",
         remedy,
     )
     return count < 0.01 * same.sum()
 
 
-def _check_speeds(motion: Motion, out: Diagnostics) -> bool:
-    speed = motion.speed[motion.is_vehicle]
+def _check_speeds(stats: TrackStatistics, out: Diagnostics) -> bool:
+    speed = stats.speed[stats.is_vehicle]
     high, fastest = float(np.percentile(speed, 95)), float(speed.max())
     out.figures.update({"fastest_vehicle_mps": fastest})
-    table = motion.table
+    table = stats.table
     column = table.columns.found["x"]
     if high > _MAX_SPEED:
         units = UNITS["position"]
@@ -215,7 +221,7 @@ def _check_speeds(motion: Motion, out: Diagnostics) -> bool:
         guess = (
             f": they look like {fitting[0]}: [units] position = {fitting[0]!r}" if fitting else ""
         )
-        out.say(
+        out.error(
             f"vehicles move at {high:.4g} m/s (95 % of the rows are slower), at most {_MAX_SPEED:g}"
             " m/s is possible",
             f"check the units of positions and time{guess}",
@@ -231,7 +237,7 @@ def _check_speeds(motion: Motion, out: Diagnostics) -> bool:
                 "positions look like degrees of longitude and latitude: project them to the metric"
                 " frame of the map (pyproj)"
             )
-        out.say(
+        out.error(
             f"no vehicle is faster than {fastest:.3g} m/s, and all positions are within"
             f" {spread:.3g} m; an ego must reach {_LEAST_SPEED:g} m/s",
             remedy,
@@ -240,42 +246,42 @@ def _check_speeds(motion: Motion, out: Diagnostics) -> bool:
     return True
 
 
-def _check_accelerations(motion: Motion, out: Diagnostics) -> None:
+def _check_accelerations(stats: TrackStatistics, out: Diagnostics) -> None:
     """Along and across, over half a second: three times too fast they are nine times as large."""
-    track, time = motion.table.track, motion.time
-    rows = motion.rows(FAST)
-    after = np.minimum(rows + max(1, round(_ACCELERATION_S / motion.period)), len(time) - 1)
+    track, time = stats.table.track, stats.time
+    rows = stats.rows(FAST)
+    after = np.minimum(rows + max(1, round(_ACCELERATION_S / stats.period)), len(time) - 1)
     used = (track[after] == track[rows]) & (time[after] > time[rows])
-    used &= time[after] < time[rows] + 2.0 * max(_ACCELERATION_S, motion.period)
+    used &= time[after] < time[rows] + 2.0 * max(_ACCELERATION_S, stats.period)
     rows, after = rows[used], after[used]
     if not len(rows):
         return
-    change = motion.derived[after] - motion.derived[rows]
+    change = stats.derived[after] - stats.derived[rows]
     usual = float(np.median(np.hypot(*change.T) / (time[after] - time[rows])))
     out.figures["acceleration_mps2"] = usual
     if usual > _MAX_ACCELERATION:
-        out.say(
+        out.error(
             f"moving vehicles accelerate, brake and turn with {usual:.2g} m/s² in the middle of"
             f" {len(rows)} rows, at most {_MAX_ACCELERATION:g} m/s²",
             "check --hz or the unit of time; positions that jitter need smoothing",
         )
 
 
-def _check_walkers(motion: Motion, out: Diagnostics) -> None:
+def _check_walkers(stats: TrackStatistics, out: Diagnostics) -> None:
     """How fast pedestrians walk while they do, the same whatever a clock counts."""
-    walks = [KINDS.get(name) == AgentKind.PEDESTRIAN for name in motion.table.categories]
-    is_walker = np.array(walks, np.bool_)[motion.table.category[motion.ends[:-1]]]
+    walks = [KINDS.get(name) == AgentKind.PEDESTRIAN for name in stats.table.categories]
+    is_walker = np.array(walks, np.bool_)[stats.table.category[stats.ends[:-1]]]
     speeds = []
-    for first, stop in zip(motion.ends[:-1][is_walker], motion.ends[1:][is_walker], strict=True):
-        way = motion.table.xy[stop - 1] - motion.table.xy[first]
+    for first, stop in zip(stats.ends[:-1][is_walker], stats.ends[1:][is_walker], strict=True):
+        way = stats.table.xy[stop - 1] - stats.table.xy[first]
         if np.hypot(*way) > _LEAST_WALK:
-            speed = motion.speed[first:stop]
+            speed = stats.speed[first:stop]
             speeds.append(np.median(speed[speed > 0.5 * np.percentile(speed, 90)]))
     if len(speeds) < _LEAST_WALKERS:
         return
     walking = out.figures["walking_mps"] = float(np.median(speeds))
     if not _WALKING[0] <= walking <= _WALKING[1]:
-        out.note(
+        out.warn(
             f"the median pedestrian walks with {walking:.2g} m/s, usual is {_WALKING[0]:g} …"
             f" {_WALKING[1]:g} m/s",
             "check --hz or the unit of time, and the column of kinds",
@@ -296,7 +302,7 @@ def _check_fit(fit: Fit, columns: Columns, min_share: float, out: Diagnostics) -
             f" {fit.min_along:.0%}"
         )
     if fit.best is None:
-        out.say(
+        out.error(
             what,
             "no other unit, axis or origin fits better: give the map of this place, and check that"
             " it is of this recording",
@@ -304,57 +310,57 @@ def _check_fit(fit: Fit, columns: Columns, min_share: float, out: Diagnostics) -
         return
     x, y = columns.found["x"].name, columns.found["y"].name
     remedy = ", and ".join(fit.best.remedies(x, y))
-    out.say(f"{what}; {fit.best.share:.0%} {fit.best.words}", f"in a TOML file: {remedy}")
+    out.error(f"{what}; {fit.best.share:.0%} {fit.best.words}", f"in a TOML file: {remedy}")
 
 
 def _usual(length: float, width: float) -> bool:
     return _LENGTHS[0] <= length <= _LENGTHS[1] and _WIDTHS[0] <= width <= _WIDTHS[1]
 
 
-def _has_usual_sizes(motion: Motion) -> bool:
-    return motion.vehicle_size is not None and _usual(*motion.vehicle_size)
+def _has_usual_sizes(stats: TrackStatistics) -> bool:
+    return stats.vehicle_size is not None and _usual(*stats.vehicle_size)
 
 
-def _velocities_fit(motion: Motion) -> bool:
-    stored, rows = motion.table.velocities, motion.rows(FAST)
+def _velocities_fit(stats: TrackStatistics) -> bool:
+    stored, rows = stats.table.velocities, stats.rows(FAST)
     if stored is None or not len(rows):
         return False
-    wrong, _ = contradiction(stored, motion.derived, motion.time, motion.table.track)
-    return bool(wrong[motion.table.track[rows]].mean() <= LEAST_CONTRADICTING)
+    wrong, _ = contradiction(stored, stats.derived, stats.time, stats.table.track)
+    return bool(wrong[stats.table.track[rows]].mean() <= LEAST_CONTRADICTING)
 
 
-def _check_sizes(motion: Motion, out: Diagnostics) -> None:
-    sizes = motion.table.sizes
+def _check_sizes(stats: TrackStatistics, out: Diagnostics) -> None:
+    sizes = stats.table.sizes
     if sizes is None:
         return
     large = np.flatnonzero((sizes[:, 0] > _LONGEST) | (sizes[:, 1] > _WIDEST))
     if 0 < len(large) < 0.5 * len(sizes):
         row = large[0]
-        name = motion.table.track_ids[motion.table.track[row]].item()
-        out.say(
+        name = stats.table.track_ids[stats.table.track[row]].item()
+        out.error(
             f"object {name!r} is {sizes[row, 0]:.4g} m long and {sizes[row, 1]:.4g} m wide"
             f" ({len(large)} rows), at most {_LONGEST:g} m and {_WIDEST:g} m",
             "correct its size, or leave it empty for the usual one of its kind",
         )
     if (sizes < 0.0).all():
-        out.say(
+        out.error(
             "all lengths and widths are negative",
             "turn the signs: [columns] length = '-NAME', width = '-NAME'; or leave the columns out",
         )
-    walks = [KINDS.get(name) == AgentKind.PEDESTRIAN for name in motion.table.categories]
-    lengths = sizes[np.array(walks, np.bool_)[motion.table.category], 0]
+    walks = [KINDS.get(name) == AgentKind.PEDESTRIAN for name in stats.table.categories]
+    lengths = sizes[np.array(walks, np.bool_)[stats.table.category], 0]
     lengths = lengths[lengths > 0.0]
     if len(lengths) and np.median(lengths) > _LONGEST_WALKER:
-        out.say(
+        out.error(
             f"the median pedestrian is {np.median(lengths):.3g} m long, at most"
             f" {_LONGEST_WALKER:g} m",
             "check the column of kinds; or leave sizes that are not known empty",
         )
-    if motion.vehicle_size is None:
+    if stats.vehicle_size is None:
         return
-    length, width = motion.vehicle_size
+    length, width = stats.vehicle_size
     out.figures.update({"median_length_m": length, "median_width_m": width})
-    columns = motion.table.columns.found
+    columns = stats.table.columns.found
     names = columns["length"].name, columns["width"].name
 
     if _usual(length, width):
@@ -372,7 +378,7 @@ def _check_sizes(motion: Motion, out: Diagnostics) -> None:
             )
     if _usual(2.0 * length, 2.0 * width):
         remedy = "these look like halves (extents from the middle): write whole lengths and widths"
-    out.say(
+    out.error(
         f"the median vehicle is {length:.3g} m long and {width:.3g} m wide, need"
         f" {_LENGTHS[0]:g} … {_LENGTHS[1]:g} m and {_WIDTHS[0]:g} … {_WIDTHS[1]:g} m",
         remedy,
