@@ -1,6 +1,6 @@
 """Writes a demo town and its traffic as the files of open data sets, for tests.
 
-`demo_content` gives plain values; `data/readers/open_data/write_py123d.py` hands them to py123d.
+`demo_content` gives plain values; `data/readers/write_py123d.py` hands them to py123d.
 """
 
 import json

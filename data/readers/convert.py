@@ -81,7 +81,8 @@ class ConversionReport:
     skipped: dict[str, str] = field(default_factory=dict)  # why, by name, the others are not
     converted: int = 0  # how many recordings this call has converted
     kept: int = 0  # how many were converted before, by an interrupted or an earlier call
-    map_warnings: Counter[str] = field(default_factory=Counter)  # what was repaired, by kind
+    # count by kind of what was repaired in the map
+    map_warnings: dict[str, int] = field(default_factory=dict)
     details: dict[str, Any] = field(default_factory=dict)  # what else its source tells
 
     @property
@@ -89,12 +90,12 @@ class ConversionReport:
         """Number of scenarios of the recordings."""
         return sum(summary.accepted for summary in self.recordings)
 
-    def count(self, what: str) -> dict[str, int]:
+    def count(self, what: str) -> Counter[str]:
         """Sum over the recordings of `rejected` or `warnings`, by kind."""
         total: Counter[str] = Counter()
         for summary in self.recordings:
             total.update(getattr(summary, what))
-        return dict(sorted(total.items()))
+        return total
 
 
 def convert(
@@ -169,16 +170,17 @@ def _convert_into(
     if site is not None:
         writer.add_map(site.road)
         report.lanes = len(site.road.edges)
-        report.map_warnings.update(site.warnings)
+    map_warnings = Counter(site.warnings if site is not None else {})
     maps: set[str] = set()
     for name, part in parts.items():
-        report.map_warnings.update(part["map_warnings"])
+        map_warnings.update(part["map_warnings"])
         if part["windows"]:
             folder, city = stage.folder(name), part["city"]
             writer.take_recording(folder / _FILES, part["log_name"], part["windows"])
             if site is None and city not in maps:
                 writer.take_map(folder / _MAP, city)
             maps.add(city)
+    report.map_warnings = dict(map_warnings)
     report.recordings = [
         RecordingSummary(**entries[name]["summary"]) for name in names if name in entries
     ]
@@ -186,7 +188,7 @@ def _convert_into(
         content = {
             "city": reader.name,
             "lanes": report.lanes,
-            "map_warnings": dict(report.map_warnings),
+            "map_warnings": report.map_warnings,
             "recordings": before | entries,
             "skipped": report.skipped,
         }

@@ -354,27 +354,16 @@ def _convert_scenes(
     reader: "Reader", store: str, settings: cli.Settings, *, quiet: bool, as_json: bool
 ) -> None:
     report, folder = _convert(reader, store, settings, quiet=quiet or as_json)
-    rejected, warnings = report.count("rejected"), report.count("warnings")
-    warnings = dict(sorted((report.map_warnings + Counter(warnings)).items()))
-    without = sum(not summary.accepted for summary in report.recordings)
     if as_json:
-        say_json(
-            {
-                "scenes": report.converted,
-                "scenarios": report.accepted,
-                "kept": report.kept,
-                "without": without,
-                "rejected": rejected,
-                "warnings": warnings,
-                "failed": report.skipped,
-            }
-        )
+        say_json({"dataset": report.name, **_contents(report)})
     else:
-        for title, counts in (("not an ego by rule", rejected), ("note", warnings)):
-            for name, number in counts.items():
+        warnings = Counter(report.map_warnings) + report.count("warnings")
+        for title, counts in ("not an ego by rule", report.count("rejected")), ("note", warnings):
+            for name, number in sorted(counts.items()):
                 say(f" {title}: {name} ({number})")
         for name, reason in list(report.skipped.items())[:MAX_NAMED]:
             say(f" failed: {name}: {reason}")
+        without = sum(not summary.accepted for summary in report.recordings)
         say(
             f" {plural(report.converted, 'scene')} converted, {without} of them without a "
             f"scenario, {report.kept} kept from before, {len(report.skipped)} failed"

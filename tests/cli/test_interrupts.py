@@ -17,7 +17,7 @@ CASES = [
     ("filter {store}", "shiftsim.runs.filter.filter_store", "kept; go on with: shiftsim filter"),
     (
         "convert dsc3d x --store y",
-        "shiftsim.data.readers.convert.convert",
+        "shiftsim.data.readers.dsc3d.open_site",
         "kept; go on with: shiftsim convert dsc3d x --store y",
     ),
     (

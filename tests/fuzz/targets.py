@@ -285,11 +285,16 @@ def _py123d(folder: Path) -> None:
 def _read_scenes(name: str, folder: Path) -> Any:
     from shiftsim.data.readers.av2 import Av2Reader
     from shiftsim.data.readers.commonroad import CommonRoadReader
+    from shiftsim.data.readers.convert import convert_recording
     from shiftsim.data.readers.py123d import Py123dReader
 
-    reader = {"av2": Av2Reader, "commonroad": CommonRoadReader, "py123d": Py123dReader}[name]()
-    made = [convert_scene(reader.read(path)) for path in reader.find(folder)]
-    return [(one.road, one.converted.egos, one.converted.windows) for one in made]
+    reader = {"av2": Av2Reader, "commonroad": CommonRoadReader, "py123d": Py123dReader}[name](
+        folder
+    )
+    sources = [reader.read(name) for name in reader.recordings()]
+    converted = [convert_recording(source) for source in sources]
+    roads = [source.map.road for source in sources]
+    return roads, [(one.egos, one.windows) for one in converted]
 
 
 def _stores(folder: Path) -> None:

@@ -126,7 +126,11 @@ class TracksReader:
         self.name, self.source = inspection.road.name, inspection.path
         self.site = site_map(inspection.road, inspection.map_warnings)
         columns = asdict(inspection.table.columns) | {"hz": inspection.table.hz}
-        self.settings: Mapping[str, Any] = {"egos": egos, "config": asdict(config), "columns": columns}
+        self.settings: Mapping[str, Any] = {
+            "egos": egos,
+            "config": asdict(config),
+            "columns": columns,
+        }
 
     def recordings(self) -> Sequence[str]:
         """The name of the table."""

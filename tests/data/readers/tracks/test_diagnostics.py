@@ -61,8 +61,8 @@ def _merged(c):
 
 
 NO_SPEEDS = dict.fromkeys(SPEEDS)
-# what is done to a right table; a word of what is said, a word of the remedy, and the same remedy
-# in TOML where there is one
+# what is done to a right table; a word of the error, a word of the remedy, and the same remedy in
+# TOML where there is one
 SPOILT = {
     "centimetres": (_times(PLACES, 100), "m/s", "'cm'", {"units": {"position": "cm"}}),
     "millimetres": (_times(PLACES, 1e3), "m/s", "'mm'", {"units": {"position": "mm"}}),
@@ -230,54 +230,54 @@ def town(tmp_path_factory):
     return columns, build_road_map(read_opendrive(map_path), name="roundabout")[0]
 
 
-def _doubts(path, road, **how):
+def _diagnose(path, road, **how):
     return diagnose(read_tracks(path, **how), road, 0.95)
 
 
 def test_a_right_table_raises_no_doubt(town, tmp_path):
     columns, road = town
-    found = _doubts(write_tracks(tmp_path / "t.csv", columns), road)
-    assert (found.found, found.notes) == ([], [])
+    found = _diagnose(write_tracks(tmp_path / "t.csv", columns), road)
+    assert (found.errors, found.warnings) == ([], [])
 
 
 @pytest.mark.parametrize("name", SPOILT)
 def test_what_is_wrong_is_named_and_its_remedy_repairs_it(name, town, tmp_path):
-    change, what, remedy, said = SPOILT[name]
+    change, what, remedy, overrides = SPOILT[name]
     columns, road = town
     path = write_tracks(tmp_path / "t.csv", columns, **change(columns))
-    found = _doubts(path, road).found
-    assert what in " ".join(doubt.what for doubt in found)
-    assert remedy in " ".join(doubt.remedy for doubt in found)
-    if said is not None:
-        assert _doubts(path, road, said=said).found == []
+    found = _diagnose(path, road).errors
+    assert what in " ".join(error.what for error in found)
+    assert remedy in " ".join(error.remedy for error in found)
+    if overrides is not None:
+        assert _diagnose(path, road, overrides=overrides).errors == []
 
 
 def test_frames_per_second_that_contradict_the_velocities_are_named(town, tmp_path):
     columns, road = town
     path = write_tracks(tmp_path / "t.csv", columns, time_s=None)
-    (found,) = _doubts(path, road, hz=25.0).found
+    (found,) = _diagnose(path, road, hz=25.0).errors
     assert "0.5 times" in found.what
     assert "--hz looks too large" in found.remedy
-    assert _doubts(path, road, hz=12.5).found == []
+    assert _diagnose(path, road, hz=12.5).errors == []
 
 
 def test_twice_the_speed_is_unusual_where_nothing_else_tells(town, tmp_path):
     columns, road = town
     path = write_tracks(tmp_path / "t.csv", columns, time_s=None, **NO_SPEEDS)
-    found = _doubts(path, road, hz=25.0)
-    assert found.found == []
-    assert "speed limit" in found.notes[0].what
-    assert "--hz" in found.notes[0].remedy
+    found = _diagnose(path, road, hz=25.0)
+    assert found.errors == []
+    assert "speed limit" in found.warnings[0].what
+    assert "--hz" in found.warnings[0].remedy
 
 
 @pytest.mark.parametrize(("hz", "walking"), [(6.25, "0.67"), (25.0, "2.7")])
 def test_half_and_twice_the_speed_are_noted_where_pedestrians_walk(hz, walking, town, tmp_path):
     columns, road = town
     path = write_tracks(tmp_path / "t.csv", columns, time_s=None, **NO_SPEEDS)
-    found = _doubts(path, road, hz=hz)
-    assert found.found == []
-    assert f"pedestrian walks with {walking} m/s" in found.notes[-1].what
-    assert "--hz" in found.notes[-1].remedy
+    found = _diagnose(path, road, hz=hz)
+    assert found.errors == []
+    assert f"pedestrian walks with {walking} m/s" in found.warnings[-1].what
+    assert "--hz" in found.warnings[-1].remedy
 
 
 @pytest.mark.parametrize(("hz", "value"), [(37.5, 8.9), (50.0, 15)])
@@ -286,7 +286,7 @@ def test_three_times_the_speed_cannot_be_for_how_cars_would_turn_and_brake(
 ):
     columns, road = town
     path = write_tracks(tmp_path / "t.csv", columns, time_s=None, **NO_SPEEDS)
-    (found,) = _doubts(path, road, hz=hz).found
+    (found,) = _diagnose(path, road, hz=hz).errors
     assert f"with {value} m/s²" in found.what
     assert "--hz" in found.remedy
 
@@ -295,7 +295,7 @@ def test_the_map_of_another_place_is_named(town, tmp_path):
     columns, _ = town
     other = export_town(tmp_path / "towns", "junction")[1]
     road = build_road_map(read_opendrive(other), name="junction")[0]
-    (found,) = _doubts(write_tracks(tmp_path / "t.csv", columns), road).found
+    (found,) = _diagnose(write_tracks(tmp_path / "t.csv", columns), road).errors
     assert "drivable area" in found.what
     assert "the map of this place" in found.remedy
 
@@ -304,14 +304,14 @@ def test_a_gap_in_the_recording_is_named(town, tmp_path):
     columns, road = town
     kept = (columns["time_s"] < 10.0) | (columns["time_s"] > 14.0)
     path = write_tracks(tmp_path / "t.csv", {n: v[kept] for n, v in columns.items()})
-    assert "between 9.92 s and 14.08 s" in _doubts(path, road).notes[0].what
+    assert "between 9.92 s and 14.08 s" in _diagnose(path, road).warnings[0].what
 
 
 def test_a_clock_that_begins_anew_at_midnight_is_named(town, tmp_path):
     time = np.mod(town[0]["time_s"] + 86_390.0, 86_400.0)
-    found = _doubts(write_tracks(tmp_path / "t.csv", town[0], time_s=time, frame=None), town[1])
-    assert "no object has a row between" in found.found[0].what
-    assert "midnight" in found.found[0].remedy
+    found = _diagnose(write_tracks(tmp_path / "t.csv", town[0], time_s=time, frame=None), town[1])
+    assert "no object has a row between" in found.errors[0].what
+    assert "midnight" in found.errors[0].remedy
 
 
 UNREADABLE = {
@@ -360,18 +360,18 @@ def test_an_infinite_speed_or_size_is_no_missing_one(name, town, tmp_path):
 def test_pedestrians_as_long_as_cars_are_named(town, tmp_path):
     columns, road = town
     length = np.maximum(columns["length_m"], 4.5)
-    (found,) = _doubts(write_tracks(tmp_path / "t.csv", columns, length_m=length), road).found
+    (found,) = _diagnose(write_tracks(tmp_path / "t.csv", columns, length_m=length), road).errors
     assert "the median pedestrian is 4.5 m long" in found.what
 
 
 def test_repeated_rows_are_named(town, tmp_path):
     columns = {n: np.r_[v, v[50:60]] for n, v in town[0].items()}
-    (found,) = _doubts(write_tracks(tmp_path / "t.csv", columns), town[1]).found
+    (found,) = _diagnose(write_tracks(tmp_path / "t.csv", columns), town[1]).errors
     assert "has two rows at 4 s (10 such rows)" in found.what
 
 
 @pytest.mark.parametrize(
-    ("said", "what"),
+    ("overrides", "what"),
     [
         ({"columns": {"x": "xx"}}, "no column 'xx'"),
         ({"columns": {"z": "x_m"}}, "column 'z' unknown"),
@@ -382,9 +382,9 @@ def test_repeated_rows_are_named(town, tmp_path):
         ({"reference": "axle"}, "reference 'axle' unknown"),
     ],
 )
-def test_what_is_said_wrongly_is_named(said, what, town, tmp_path):
+def test_what_is_said_wrongly_is_named(overrides, what, town, tmp_path):
     with pytest.raises(ConfigError, match=what):
-        read_tracks(write_tracks(tmp_path / "t.csv", town[0]), said=said)
+        read_tracks(write_tracks(tmp_path / "t.csv", town[0]), overrides=overrides)
 
 
 def test_a_clock_of_its_own_for_every_object_is_named(town, tmp_path):
@@ -392,7 +392,7 @@ def test_a_clock_of_its_own_for_every_object_is_named(town, tmp_path):
     first = {name: columns["time_s"][columns["track"] == name].min() for name in columns["track"]}
     since = columns["time_s"] - np.array([first[name] for name in columns["track"].tolist()])
     path = write_tracks(tmp_path / "t.csv", columns, frame=None, time_s=np.round(since, 3))
-    (note,) = _doubts(path, road).notes
+    (note,) = _diagnose(path, road).warnings
     assert "24 objects appear at the first time" in note.what
     assert "one clock for all" in note.remedy
 
@@ -417,7 +417,7 @@ def test_times_may_be_dates_or_durations(kind, town, tmp_path):
         time, unit = time.cast(pa.timestamp("s")).cast(types[kind]), "s"
     table = pa.table({**columns, "time_s": time, "frame": columns["frame"]}).drop_columns("frame")
     pq.write_table(table, tmp_path / "t.parquet")
-    found = read_tracks(tmp_path / "t.parquet", said={"units": {"time": unit}})
+    found = read_tracks(tmp_path / "t.parquet", overrides={"units": {"time": unit}})
     assert set(np.diff(np.unique(found.time_us)).tolist()) == {1_000_000}
     assert found.time_us.min() == 1_700_000_000_000_000
 

@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shiftsim.data.readers.dsc3d import convert_dsc3d, open_site, read_recording
+from shiftsim.data.readers.samples import find_runs
 from shiftsim.data.readers.states import ego_states, resample, slope
 from shiftsim.data.readers.windows import (
     ConversionConfig,
     evaluate_windows,
-    find_runs,
     shared_area,
-    window_starts,
+    window_spans,
 )
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError, ConversionError
@@ -34,7 +34,7 @@ def _verdicts(tmp_path, tracks, duration=18.08, config=CONFIG):
     runs = find_runs(recording, config.max_hole_s)
     return [
         dict(zip(recording.track_ids[w.tracks].tolist(), w.verdicts, strict=True))
-        for w in evaluate_windows(recording, runs, config)
+        for w in evaluate_windows(recording, runs, config, window_spans(duration, config))
     ]
 
 
@@ -42,7 +42,7 @@ def _verdicts(tmp_path, tracks, duration=18.08, config=CONFIG):
     ("duration", "count"), [(17.9, 0), (17.92, 0), (18.0, 1), (29.9, 1), (30.0, 2), (42.04, 3)]
 )
 def test_windows_are_counted_in_time(duration, count):
-    assert len(window_starts(duration, CONFIG)) == count
+    assert len(window_spans(duration, CONFIG)) == count
 
 
 def test_a_moving_car_that_is_always_there_is_an_ego(tmp_path):
@@ -215,7 +215,7 @@ def test_a_map_that_carries_its_utm_offset_is_placed_once(tmp_path):
         '<offset x="500000" y="5300000" z="0" hdg="0"/></header>',
     )
     folder = writer.write_site(tmp_path / "s", [writer.car(1, times)], 18.08, road=road)
-    assert convert_dsc3d(folder, tmp_path / "store").drivable_share == 1.0
+    assert convert_dsc3d(folder, tmp_path / "store").details["drivable_share"] == 1.0
 
 
 def test_a_short_recording_is_converted_with_a_short_window_and_marked(tmp_path):

@@ -3,6 +3,7 @@
 import json
 import os
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from open_data_files import (
 
 from shiftsim.data.maps.opendrive.check import check_map
 from shiftsim.data.readers.av2 import Av2Reader
+from shiftsim.data.readers.convert import convert, convert_recording
 from shiftsim.data.readers.py123d import Py123dReader
 from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import ScenarioStore
@@ -36,7 +38,7 @@ def scenes(tmp_path_factory):
     out = {}
     for name, (reader, write) in WRITERS.items():
         path = write(tmp_path_factory.mktemp(name))
-        out[name] = reader().read(path)
+        out[name] = reader(path).read(path)
     return out
 
 
@@ -60,7 +62,7 @@ def test_the_map_of_a_town_comes_back(scenes, name):
 
 @pytest.mark.parametrize("name", ["av2", "py123d"])
 def test_the_recording_car_is_the_ego_and_drives_as_recorded(scenes, name):
-    made = convert_scene(scenes[name]).converted
+    made = convert_recording(scenes[name])
     (window,) = made.windows
     assert window.ego == {"av2": "AV", "py123d": "ego"}[name]
     rows = np.array(demo_content()["ego"]["rows"])
@@ -73,7 +75,7 @@ def test_the_recording_car_is_the_ego_and_drives_as_recorded(scenes, name):
 
 
 def test_argoverse_leaves_out_the_squeezed_end_of_its_tracks(scenes):
-    (window,) = convert_scene(scenes["av2"]).converted.windows
+    (window,) = convert_recording(scenes["av2"]).windows
     assert (window.last_row, len(window.iteration_rows), window.is_short) == (209, 85, True)
     assert window.metadata["duration_class"] == "8 s"
     assert window.metadata["licence"] == "CC BY-NC-SA 4.0"
@@ -82,14 +84,15 @@ def test_argoverse_leaves_out_the_squeezed_end_of_its_tracks(scenes):
 
 @pytest.mark.parametrize("name", ["av2", "py123d"])
 def test_with_vehicles_every_car_that_drives_is_an_ego(scenes, name):
-    egos = {window.ego for window in convert_scene(scenes[name], vehicles=True).converted.windows}
-    cars = {w.ego for w in convert_scene(scenes["commonroad"]).converted.windows}
+    every = replace(scenes[name], egos=None, config=None)
+    egos = {window.ego for window in convert_recording(every).windows}
+    cars = {window.ego for window in convert_recording(scenes["commonroad"]).windows}
     assert len(egos) == len(cars) > 3
 
 
 def test_lights_of_py123d_are_those_of_the_connector_of_their_lane(scenes):
     scene = scenes["py123d"]
-    lights = convert_scene(scene).converted.recording.lights
+    lights = convert_recording(scene).recording.lights
     (connector,) = lights.connector_ids
     assert scene.map.origins[connector] == (str(lit_lane(demo_content())),)
     assert lights.status[:, 0].tolist() == [2] * 60 + [0] * (len(lights.status) - 60)
@@ -98,7 +101,7 @@ def test_lights_of_py123d_are_those_of_the_connector_of_their_lane(scenes):
 def test_lights_of_commonroad_govern_what_leaves_their_lanelet(scenes):
     scene = scenes["commonroad"]
     road = scene.map.road
-    lights = convert_scene(scene).converted.recording.lights
+    lights = convert_recording(scene).recording.lights
     assert len(lights.connector_ids) >= 2
     sources = {int(road.incoming.at(road.edge(i))[0]) for i in lights.connector_ids}
     assert len(sources) == 1
@@ -116,10 +119,10 @@ def test_a_store_of_all_three_is_sound_and_goes_on_where_it_stopped(tmp_path):
     for name in COMMANDS:
         reader, write = WRITERS[name]
         write(tmp_path / name)
-        report = convert_scenes(reader(), tmp_path / name, tmp_path / "store")
-        assert (report.scenes, report.failed) == (1, {})
-        again = convert_scenes(reader(), tmp_path / name, tmp_path / "store")
-        assert (again.scenes, again.kept) == (0, 1)
+        report = convert(reader(tmp_path / name), tmp_path / "store")
+        assert (report.converted, report.skipped) == (1, {})
+        second = convert(reader(tmp_path / name), tmp_path / "store")
+        assert (second.converted, second.kept) == (0, 1)
     assert not [problem for problem in check_store(tmp_path / "store") if problem.is_error]
     classes = {scene.duration_class for scene in ScenarioStore(tmp_path / "store")}
     assert classes == {"8 s"}
@@ -129,18 +132,18 @@ def test_a_broken_scene_is_skipped_and_named(tmp_path):
     write_av2(tmp_path / "good")
     bad = write_av2(tmp_path / "bad", "00000000-0000-0000-0000-00000000000b")
     bad.write_bytes(b"nonsense")
-    report = convert_scenes(Av2Reader(), tmp_path, tmp_path / "store")
-    assert (report.scenes, list(report.failed)) == (1, [str(bad)])
-    assert "cannot be read" in report.failed[str(bad)]
+    report = convert(Av2Reader(tmp_path), tmp_path / "store")
+    assert (report.converted, list(report.skipped)) == (1, [str(bad)])
+    assert "cannot be read" in report.skipped[str(bad)]
 
 
 def test_a_log_that_does_not_say_where_its_map_is_is_skipped_and_named(tmp_path):
     write_py123d(tmp_path / "good")
     bad = write_py123d(tmp_path / "bad")
     (bad / "sync.arrow").write_bytes(b"nonsense")
-    report = convert_scenes(Py123dReader(), tmp_path, tmp_path / "store")
-    assert (report.scenes, list(report.failed)) == (1, [str(bad)])
-    assert "sync.arrow: cannot be read" in report.failed[str(bad)]
+    report = convert(Py123dReader(tmp_path), tmp_path / "store")
+    assert (report.converted, list(report.skipped)) == (1, [str(bad)])
+    assert "sync.arrow: cannot be read" in report.skipped[str(bad)]
 
 
 @pytest.mark.slow
@@ -155,7 +158,7 @@ def test_the_command_converts_and_says_what_comes_next(tmp_path):
 def test_a_folder_without_scenes_is_refused(tmp_path):
     for name in COMMANDS:
         with pytest.raises(ConversionError, match=str(tmp_path)):
-            WRITERS[name][0]().find(tmp_path)
+            WRITERS[name][0](tmp_path).recordings()
 
 
 def test_logs_of_a_city_share_its_map(tmp_path):
@@ -163,9 +166,10 @@ def test_logs_of_a_city_share_its_map(tmp_path):
     shared = tmp_path / "maps/demo/demo_here.arrow"
     shared.parent.mkdir(parents=True)
     (log / "map.arrow").rename(shared)
-    scene = Py123dReader().read(log)
+    reader = Py123dReader(tmp_path)
+    scene = reader.read(log)
     assert scene.map.road.name == "demo-here"
-    assert shared in Py123dReader().files(log)
+    assert shared in reader.files(log)
 
 
 @pytest.mark.slow
@@ -180,10 +184,10 @@ def test_a_folder_that_py123d_wrote_is_read_as_ours(tmp_path, scenes):
     command = [python, script, tmp_path / "content.json", tmp_path]
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     subprocess.run(command, check=True, capture_output=True, env=environment)
-    report = convert_scenes(Py123dReader(), tmp_path, tmp_path / "store")
-    assert (report.scenarios, report.failed) == (1, {})
+    report = convert(Py123dReader(tmp_path), tmp_path / "store")
+    assert (report.accepted, report.skipped) == (1, {})
     (found,) = ScenarioStore(tmp_path / "store")
-    expected = convert_scene(scenes["py123d"]).converted
+    expected = convert_recording(scenes["py123d"])
     np.testing.assert_allclose(found.ego, expected.egos[0].states, atol=1e-9)
     assert len(found.route) == len(expected.windows[0].route)
     assert found.traffic_lights.status.tolist() == expected.recording.lights.status.tolist()

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shiftsim.data.readers.dsc3d import find_map, open_site, read_recording
-from shiftsim.data.readers.dsc3d.motion import believed_velocities, held_headings, rotation_angles
+from shiftsim.data.readers.dsc3d import find_map, open_site, read_recording, rotation_angles
+from shiftsim.data.readers.motion import held_headings
 from shiftsim.errors import ConversionError
 
 
@@ -67,14 +67,12 @@ def test_missing_velocities_are_derived_and_counted(tmp_path):
     assert recording.warnings["tracks without stored velocity (derived)"] == 1
 
 
-def test_velocities_that_contradict_the_positions_are_not_believed():
-    time = np.arange(10) * 0.1
-    xy = np.column_stack([3.0 * time, 0.0 * time])
-    warnings = Counter()
-    stored = np.tile([5.0, 0.0], (10, 1))
-    out = believed_velocities(stored, xy, time, np.zeros(10, np.int64), warnings)
-    np.testing.assert_allclose(out[:, 0], 3.0, rtol=0, atol=1e-9)
-    assert sum(warnings.values()) == 1
+def test_velocities_that_contradict_the_positions_are_not_believed(tmp_path):
+    track = writer.car(1, writer.frame_times(5.0))
+    track["velocity"][:, 0] = 5.0
+    recording = read_recording(open_site(_site(tmp_path, [track])), "r")
+    np.testing.assert_allclose(recording.velocities[:, 0], 8.0, rtol=0, atol=1e-9)
+    assert recording.warnings == {"tracks whose stored velocity does not fit (derived)": 1}
 
 
 def test_a_standing_object_that_spins_keeps_its_heading():

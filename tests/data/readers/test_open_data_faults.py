@@ -65,7 +65,7 @@ AV2_FAULTS = {
 def test_a_fault_of_argoverse_is_named(tmp_path, message):
     path = write_av2(tmp_path)
     changed_table(path, AV2_FAULTS[message])
-    refused(Av2Reader(), path, path, message)
+    refused(Av2Reader(tmp_path), path, path, message)
 
 
 AV2_MAP_FAULTS = {
@@ -98,7 +98,7 @@ def test_a_fault_of_a_map_of_argoverse_is_named(tmp_path, message):
     found = json.loads(map_path.read_text())
     AV2_MAP_FAULTS[message](found)
     map_path.write_text(json.dumps(found))
-    refused(Av2Reader(), path, map_path, message)
+    refused(Av2Reader(tmp_path), path, map_path, message)
 
 
 def test_an_obstacle_that_is_no_rectangle_is_left_out_and_counted(tmp_path):
@@ -106,7 +106,7 @@ def test_an_obstacle_that_is_no_rectangle_is_left_out_and_counted(tmp_path):
     text = path.read_text()
     box = text[text.index("<rectangle>") : text.index("</rectangle>") + 12]
     path.write_text(text.replace(box, "<circle><radius>1</radius></circle>", 1))
-    scene = CommonRoadReader().read(path)
+    scene = CommonRoadReader(tmp_path).read(path)
     assert scene.warnings["obstacle that is no rectangle, left out"] == 1
     assert len(scene.samples.track_ids) == len(demo_content()["tracks"])
 
@@ -114,17 +114,17 @@ def test_an_obstacle_that_is_no_rectangle_is_left_out_and_counted(tmp_path):
 def test_two_rows_of_one_object_at_one_time_are_refused(tmp_path):
     path = write_av2(tmp_path)
     changed_table(path, lambda table: pa.concat_tables([table, table.slice(0, 1)]))
-    refused(Av2Reader(), path, path, "object 'AV' has two rows")
+    refused(Av2Reader(tmp_path), path, path, "object 'AV' has two rows")
 
 
 def test_a_time_years_away_is_an_error_and_takes_no_memory(tmp_path):
     path = write_av2(tmp_path)
     changed_table(path, with_value("timestep", 10**8))
-    refused(Av2Reader(), path, path, r"none between 10.9 s and 1e\+07 s")
+    refused(Av2Reader(tmp_path), path, path, r"none between 10.9 s and 1e\+07 s")
     log = write_py123d(tmp_path)
     name = f"{BOXES}.timestamp_us"
     changed_arrow(log / f"{BOXES}.arrow", with_value(name, START_US - 4_000_000_000))
-    refused(Py123dReader(), log, log, "none between 0 s and 4000 s")
+    refused(Py123dReader(tmp_path), log, log, "none between 0 s and 4000 s")
 
 
 XML_FAULTS = {
@@ -142,7 +142,7 @@ def test_a_fault_of_commonroad_is_named(tmp_path, message):
     path = write_commonroad(tmp_path)
     old, new = XML_FAULTS[message]
     path.write_text(path.read_text().replace(old, new, 1))
-    refused(CommonRoadReader(), path, path, message)
+    refused(CommonRoadReader(tmp_path), path, path, message)
 
 
 def changed_arrow(path, change):
@@ -276,7 +276,7 @@ def test_nulls_and_columns_of_another_type_are_named(tmp_path, name):
     for path, column, change, message in damages:
         sound = path.read_bytes()
         changed_file(path, change)
-        refused(reader(), scene, path, f"{column}' {message}")
+        refused(reader(tmp_path), scene, path, f"{column}' {message}")
         path.write_bytes(sound)
 
 
@@ -287,14 +287,16 @@ def test_a_file_without_rows_is_named(tmp_path, name):
     for path in [scene] if name == "av2" else sorted(scene.glob("[bemt]*.arrow")):
         sound = path.read_bytes()
         changed_file(path, lambda table: table[:0])
-        refused(reader(), scene, path, "0 rows")
+        refused(reader(tmp_path), scene, path, "0 rows")
         path.write_bytes(sound)
 
 
 def test_a_velocity_may_be_null(tmp_path):
     log = write_py123d(tmp_path)
     changed_arrow(log / f"{BOXES}.arrow", with_nulls(VELOCITY, 1, 1))
-    assert len(Py123dReader().read(log).samples.track_ids) == len(demo_content()["tracks"]) + 1
+    assert (
+        len(Py123dReader(tmp_path).read(log).samples.track_ids) == len(demo_content()["tracks"]) + 1
+    )
 
 
 NOTES_FAULTS = {
@@ -324,7 +326,7 @@ def test_metadata_of_another_form_are_named(tmp_path, message):
         return table.replace_schema_metadata({b"metadata": msgpack.packb(notes)})
 
     changed_arrow(path, change)
-    refused(Py123dReader(), log, path, message)
+    refused(Py123dReader(tmp_path), log, path, message)
 
 
 @pytest.mark.parametrize("name", [f"{BOXES}.label", "traffic_light_detections.status"])
@@ -332,7 +334,7 @@ def test_lists_of_one_row_that_differ_in_length_are_named(tmp_path, name):
     log = write_py123d(tmp_path)
     path = log / f"{name.partition('.')[0]}.arrow"
     changed_arrow(path, with_value(name, []))
-    refused(Py123dReader(), log, path, "have lengths of their own")
+    refused(Py123dReader(tmp_path), log, path, "have lengths of their own")
 
 
 @pytest.mark.parametrize("message", ARROW_FAULTS)
@@ -340,16 +342,21 @@ def test_a_fault_of_py123d_is_named(tmp_path, message):
     log = write_py123d(tmp_path)
     name, change = ARROW_FAULTS[message]
     changed_arrow(log / f"{name}.arrow", change)
-    refused(Py123dReader(), log, log / f"{name}.arrow", message)
+    refused(Py123dReader(tmp_path), log, log / f"{name}.arrow", message)
 
 
 def test_a_test_split_of_waymo_is_refused(tmp_path):
-    refused(Py123dReader(), write_py123d(tmp_path, "wod-motion_test"), "log-1", "hides the future")
+    refused(
+        Py123dReader(tmp_path),
+        write_py123d(tmp_path, "wod-motion_test"),
+        "log-1",
+        "hides the future",
+    )
 
 
 def test_labels_of_an_unknown_class_are_refused(tmp_path):
     log = write_py123d(tmp_path, labels="MyLabel")
-    refused(Py123dReader(), log, BOXES, "label class 'MyLabel' is unknown")
+    refused(Py123dReader(tmp_path), log, BOXES, "label class 'MyLabel' is unknown")
 
 
 def refused(reader, path, named, message):

@@ -65,10 +65,10 @@ def _samples(columns, **changed):
 
 def test_a_table_gives_the_scenarios_of_the_same_recording_in_dsc3d(towns, town, tmp_path):
     table = write_tracks(tmp_path / "t.csv", town[0])
-    report, _ = convert_tracks(inspect_tracks(table, town[1], city=TOWN), tmp_path / "own")
+    report = convert_tracks(inspect_tracks(table, town[1], city=TOWN), tmp_path / "own")
     convert_dsc3d(towns / TOWN, tmp_path / "theirs", site=TOWN)
     own, theirs = open_store(tmp_path / "own"), open_store(tmp_path / "theirs")
-    assert report.summary.accepted == len(own) == len(theirs) > 0
+    assert report.accepted == len(own) == len(theirs) > 0
 
     def by_place(store):
         return {(w.ego, w.first_row): t for t in store.tokens for w in [store.window(t)]}
@@ -207,22 +207,26 @@ def test_files_of_levelxdata_need_nothing_said(town, tmp_path):
     kinds = {"trackId": tracks, "class": c["kind"][first]}
     pc.write_csv(pa.table(kinds), tmp_path / "07_tracksMeta.csv")
     pc.write_csv(pa.table({"frameRate": [12.5]}), tmp_path / "07_recordingMeta.csv")
-    looked = inspect_tracks(tmp_path / "07_tracks.csv", town[1])
-    assert looked.doubts.found == []
-    assert looked.table.hz == 12.5
-    names = np.array(looked.table.categories)[looked.table.category]
+    inspection = inspect_tracks(tmp_path / "07_tracks.csv", town[1])
+    assert inspection.diagnostics.errors == []
+    assert inspection.table.hz == 12.5
+    names = np.array(inspection.table.categories)[inspection.table.category]
     assert sorted(set(names.tolist())) == sorted(set(c["kind"].tolist()))
 
 
 def test_a_recording_that_is_converted_again_takes_the_place_of_the_old_one(town, tmp_path):
-    looked = inspect_tracks(write_tracks(tmp_path / "t.csv", town[0]), town[1])
-    _, before = convert_tracks(looked, tmp_path / "s")
-    _, made = convert_tracks(looked, tmp_path / "s", egos=[before.windows[-1].ego])
-    assert len(made.windows) < len(before.windows)
-    assert open_store(tmp_path / "s").tokens == tuple(sorted(w.token for w in made.windows))
+    inspection = inspect_tracks(write_tracks(tmp_path / "t.csv", town[0]), town[1])
+    before = convert_tracks(inspection, tmp_path / "s")
+    store = open_store(tmp_path / "s")
+    ego = store.window(store.tokens[-1]).ego
+    report = convert_tracks(inspection, tmp_path / "s", egos=[ego])
+    assert (report.converted, report.accepted < before.accepted) == (1, True)
+    store = open_store(tmp_path / "s")
+    assert {store.window(token).ego for token in store.tokens} == {ego}
+    assert len(store) == report.accepted
     assert check_store(tmp_path / "s") == []
     other = inspect_tracks(tmp_path / "t.csv", export_town(tmp_path, "junction")[1], city="map")
-    other.doubts.found.clear()
+    other.diagnostics.errors.clear()
     with pytest.raises(ConversionError, match="another map named 'map'"):
         convert_tracks(other, tmp_path / "s")
 

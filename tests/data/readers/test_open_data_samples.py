@@ -10,11 +10,12 @@ import shiftsim
 from shiftsim.data.maps.opendrive.check import check_map
 from shiftsim.data.readers.av2 import Av2Reader
 from shiftsim.data.readers.commonroad import CommonRoadReader
+from shiftsim.data.readers.convert import convert, convert_recording
 from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.world.state import AgentKind, center_poses
 
-READERS = {"av2": Av2Reader(), "commonroad": CommonRoadReader()}
+READERS = {"av2": Av2Reader, "commonroad": CommonRoadReader}
 COUNTS = {
     "lanes": lambda road: road.num_lanes,
     "lane_connectors": lambda road: len(road.edges) - road.num_lanes,
@@ -42,7 +43,7 @@ def stores(folder, tmp_path_factory):
     out = {}
     for name, reader in READERS.items():
         out[name] = tmp_path_factory.mktemp(name) / "store"
-        assert not convert_scenes(reader, folder / name, out[name]).failed
+        assert not convert(reader(folder / name), out[name]).skipped
     return out
 
 
@@ -63,8 +64,9 @@ def test_the_map_is_that_of_the_reference(stores, expected, name):
 
 def test_tracks_of_argoverse_are_those_of_the_file(folder, stores, expected):
     facts = expected["av2"]
-    (path,) = READERS["av2"].find(folder / "av2")
-    samples = READERS["av2"].read(path).samples
+    reader = Av2Reader(folder / "av2")
+    (path,) = reader.recordings()
+    samples = reader.read(path).samples
     by_type = dict(facts["tracks"]["tracks_by_type"])
     del by_type["background"]  # left out
     assert {name: samples.categories.count(name) for name in by_type} == by_type
@@ -103,8 +105,8 @@ def test_tracks_of_argoverse_are_those_of_the_file(folder, stores, expected):
 
 def test_tracks_of_commonroad_are_those_of_the_file(folder, expected):
     facts = expected["commonroad"]
-    (path,) = READERS["commonroad"].find(folder / "commonroad")
-    scene = READERS["commonroad"].read(path)
+    reader = CommonRoadReader(folder / "commonroad")
+    scene = reader.read(*reader.recordings())
     samples = scene.samples
     assert len(samples.track_ids) == facts["obstacles"]["count"]
     assert samples.duration == pytest.approx(facts["obstacles"]["duration_s"])
@@ -130,8 +132,8 @@ def test_the_check_of_a_store_finds_no_error(stores, name):
 
 
 def test_an_ego_whose_roads_the_map_does_not_link_is_counted(folder):
-    (path,) = READERS["commonroad"].find(folder / "commonroad")
-    summary = convert_scene(READERS["commonroad"].read(path)).converted.summary
+    reader = CommonRoadReader(folder / "commonroad")
+    summary = convert_recording(reader.read(*reader.recordings())).summary
     assert summary.rejected == {"presence": 4, "route with a gap": 1}
 
 
