@@ -28,7 +28,7 @@ from shiftsim.data.readers.samples import (
     TrackSamples,
     find_runs,
     rows_between,
-    sample_runs,
+    sample_run,
 )
 from shiftsim.errors import ConversionError
 from shiftsim.kernels import FloatArray, IntArray
@@ -157,11 +157,15 @@ def on_common_clock(samples: TrackSamples) -> TrackSamples:
     first[samples.time[runs.first] < samples.period] = 0
     at_end = samples.time[runs.last] > samples.duration - samples.period
     last[at_end] = int(samples.duration / ROW_S + 1e-9)
-    counts = np.maximum(last - first + 1, 0)
-    run = np.repeat(np.arange(len(counts)), counts)
-    frame = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts - first, counts)
-    boxes = sample_runs(samples, runs, run, frame * ROW_S)
-    present, track = np.unique(runs.track[run], return_inverse=True)
+    long = np.flatnonzero(last >= first).tolist()
+    rows = [np.arange(first[run], last[run] + 1) for run in long]
+    parts = [
+        sample_run(samples, runs, run, row * ROW_S) for run, row in zip(long, rows, strict=True)
+    ]
+    poses, velocities, heights = map(np.concatenate, zip(*parts, strict=True))
+    frame = np.concatenate(rows)
+    track_of_row = np.repeat(runs.track[long], [len(row) for row in rows])
+    present, track = np.unique(track_of_row, return_inverse=True)
     warnings = Counter(samples.warnings)
     lost = len(samples.track_ids) - len(present)
     warnings["tracks too short for a row every 0.05 s (left out)"] += lost
@@ -171,10 +175,10 @@ def on_common_clock(samples: TrackSamples) -> TrackSamples:
         clock=np.arange(int(frame.max()) + 1) * ROW_US / 1e6,
         frame=frame,
         track=track,
-        centers=np.column_stack([boxes.poses[:, :2], boxes.heights]),
-        raw_headings=boxes.poses[:, 2],
-        headings=boxes.poses[:, 2],
-        velocities=boxes.velocities,
+        centers=np.column_stack([poses[:, :2], heights]),
+        raw_headings=poses[:, 2],
+        headings=poses[:, 2],
+        velocities=velocities,
         track_ids=samples.track_ids[present],
         categories=tuple(samples.categories[i] for i in present.tolist()),
         kinds=samples.kinds[present],

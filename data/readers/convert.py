@@ -60,17 +60,6 @@ def serial_map(make: Make, tasks: Sequence[str]) -> Iterator[_Outcome]:
     yield from (_Outcome(task, function(task)) for task in tasks)
 
 
-@dataclass(frozen=True)
-class ConversionFailure:
-    """Why a recording cannot be converted."""
-
-    reason: str
-    hint: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.reason} ({self.hint})" if self.hint else self.reason
-
-
 @dataclass
 class ConversionReport:
     """What became of the recordings of a source."""
@@ -154,16 +143,23 @@ def _convert_into(
     todo = [name for name in waiting if stage.part(name) is None]
     report = ConversionReport(reader.name, kept=len(names) - len(todo))
     show(report.kept, len(names), "")
-    failures: dict[str, ConversionFailure] = {}
+    failures: dict[str, DataError] = {}
     for done, outcome in enumerate(executor(make, todo), 1):
         show(report.kept + done, len(names), Path(outcome.task).name)
-        failure = ConversionFailure(outcome.death) if outcome.death else outcome.result
+        failure = ConversionError(outcome.death) if outcome.death else outcome.result
         if failure is not None:
             failures[outcome.task] = failure
     if len(failures) == len(names):
-        _refuse_all(reader, names, failures)
+        first = failures[names[0]]
+        others = f"{reader.source}: none of the {len(names)} recordings can be converted; the first"
+        where = f"{others} is {names[0]}: " if len(names) > 1 else ""
+        raise ConversionError(f"{where}{first.message}", first.hint)
     report.converted = len(todo) - len(failures)
-    report.skipped = {name: str(failures[name]) for name in names if name in failures}
+    for name in names:
+        if name in failures:
+            failure = failures[name]
+            hint = f" ({failure.hint})" if failure.hint else ""
+            report.skipped[name] = f"{failure.message}{hint}"
     parts = {name: stage.part(name) or {} for name in waiting if name not in failures}
     entries |= {name: part["entry"] for name, part in parts.items()}
     report.details = reader.summarise(list(entries.values()))
@@ -246,18 +242,17 @@ class _Stage:
         is_complete = not part["windows"] or (folder / _FILES).is_dir()
         return part if is_complete and part["entry"]["key"] == self.keys[name] else None
 
-    def __call__(self, name: str) -> ConversionFailure | None:
+    def __call__(self, name: str) -> DataError | None:
         """Convert one recording; the folder appears when it is complete."""
         # A process that outlives a killed conversion writes beside its successor, never into it.
         draft = Path(tempfile.mkdtemp(prefix=".", dir=self.work))
         try:
             self._write(name, draft)
         except DataError as error:
-            return ConversionFailure(error.message, error.hint)
+            return error
         except MemoryError:
-            return ConversionFailure(
-                f"{name}: it does not fit into memory", "split the recording, or use less workers"
-            )
+            what = f"{name}: it does not fit into memory"
+            return ConversionError(what, "split the recording, or use less workers")
         finally:
             shutil.rmtree(draft, ignore_errors=True)
         return None
@@ -294,19 +289,6 @@ def _key(reader: Reader, name: str) -> str:
     with suppress(OSError, DataError):  # reading tells what is wrong
         content += [digest(file) for file in reader.files(name)]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def _refuse_all(
-    reader: Reader, names: Sequence[str], failures: Mapping[str, ConversionFailure]
-) -> None:
-    first = failures[names[0]]
-    if len(names) == 1:
-        raise ConversionError(first.reason, first.hint)
-    raise ConversionError(
-        f"{reader.source}: none of the {len(names)} recordings can be converted; the first is"
-        f" {names[0]}: {first.reason}",
-        first.hint,
-    )
 
 
 def _remove(work: Path) -> None:

@@ -64,13 +64,14 @@ class SourceFile:
 
     def content(self, max_bytes: int = _MAX_BYTES) -> bytes:
         """All bytes of it."""
-        self._require_size(max_bytes)
+        self.require_size(max_bytes)
         try:
             return self.path.read_bytes()
         except OSError as error:
             raise self.fault(f"cannot be read ({error})") from error
 
-    def _require_size(self, max_bytes: int) -> None:
+    def require_size(self, max_bytes: int = _MAX_BYTES) -> None:
+        """The file is there, and not too large."""
         try:
             size = self.path.stat().st_size
         except FileNotFoundError as error:
@@ -87,8 +88,7 @@ class SourceFile:
             number = float(value)
         except (TypeError, ValueError):
             raise self.fault(f"{place} is {value!r}, need a number") from None
-        if not OPEN_DATA[field].holds(number):
-            self.require(field, number, place)
+        self.require(field, number, place)
         return number
 
     def require(self, field: str, values: Any, place: str) -> None:
@@ -177,7 +177,7 @@ class SourceFile:
             ConversionError: The file is missing, broken or without rows, a column is missing or of
                 another type, or has nulls where it may not.
         """
-        self._require_size(_MAX_BYTES)
+        self.require_size()
         try:
             table = _read(self.path, wanted)
             table.validate(full=True)

@@ -6,13 +6,13 @@ between frames, angles by the shorter way round. Nothing is stretched (nuPlan ru
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shiftsim.geometry.boxes import wrap_angle
-from shiftsim.kernels import FloatArray, IntArray, kernel
+from shiftsim.geometry.boxes import wrap_angles
+from shiftsim.kernels import FloatArray, IntArray
 
 ROW_S, ROW_US = 0.05, 50_000  # s and us between rows of a converted recording
 _EPS = 1e-9  # s
@@ -73,9 +73,8 @@ class Runs:
     number: IntArray  # (U,) how many runs of the same track came before
 
 
-@dataclass(frozen=True)
-class Boxes:
-    """Boxes of runs at given times. G boxes, in the frame of the recording."""
+class Boxes(NamedTuple):
+    """Boxes of a track at given times. G boxes, in the frame of the recording."""
 
     poses: FloatArray  # (G, 3) box centre x [m], y [m], heading [rad]
     velocities: FloatArray  # (G, 2) [m/s]
@@ -106,77 +105,30 @@ def rows_between(first_s: FloatArray, last_s: FloatArray) -> tuple[IntArray, Int
     return first, np.floor(last_s / ROW_S + _EPS).astype(np.int64)
 
 
-def sample_runs(
-    recording: TrackSamples,
-    runs: Runs,
-    run: IntArray,
-    time: FloatArray,
-    *,
-    out: Boxes | None = None,
-    at: IntArray | None = None,
-) -> Boxes:
-    """Boxes of runs (G,) at times (G,) since the first frame [s], linear between the frames.
+def sample_run(recording: TrackSamples, runs: Runs, run: int, time: FloatArray) -> Boxes:
+    """Boxes of a run at times (G,) since the first frame [s], linear between the frames.
 
     Beyond the ends of a run motion goes on: linearly for one frame, then with constant velocity and
-    heading. Callers decide how far that is allowed. With `out` and `at`, the boxes are written into
-    these rows (G,) of existing arrays.
+    heading. Callers decide how far that is allowed.
     """
-    if out is None or at is None:
-        at = np.arange(len(time))
-        out = Boxes(np.empty((len(time), 3)), np.empty((len(time), 2)), np.empty(len(time)))
-    _sample(
-        recording.time,
-        recording.centers,
-        recording.headings,
-        recording.velocities,
-        runs.first,
-        runs.last,
-        run,
-        time,
-        recording.period,
-        at,
-        out.poses,
-        out.velocities,
-        out.heights,
+    first, last = int(runs.first[run]), int(runs.last[run])
+    row_time, velocities = recording.time, recording.velocities
+    row = first - 1 + np.searchsorted(row_time[first : last + 1], time + _EPS, side="right")
+    row = np.clip(row, first, max(last - 1, first))
+    following = np.minimum(row + 1, last)
+    span = np.where(following > row, row_time[following] - row_time[row], recording.period)
+    share = (time - row_time[row]) / span
+    reach = recording.period / span
+    linear = np.clip(share, -reach, 1.0 + reach)
+    inside = np.clip(share, 0.0, 1.0)[:, None]
+    beyond = (share - linear) * span  # s
+    end = np.where(share < 0.0, row, following)
+    way = recording.centers[following] - recording.centers[row]
+    centers = recording.centers[row] + linear[:, None] * way
+    places = centers[:, :2] + beyond[:, None] * velocities[end]
+    turn = wrap_angles(recording.headings[following] - recording.headings[row])
+    headings = wrap_angles(recording.headings[row] + linear * turn)
+    change = velocities[following] - velocities[row]
+    return Boxes(
+        np.column_stack([places, headings]), velocities[row] + inside * change, centers[:, 2]
     )
-    return out
-
-
-@kernel
-def _sample(
-    row_time: FloatArray,
-    centers: FloatArray,
-    headings: FloatArray,
-    velocities: FloatArray,
-    firsts: IntArray,
-    lasts: IntArray,
-    runs: IntArray,
-    times: FloatArray,
-    period: float,
-    at: IntArray,
-    out_poses: FloatArray,
-    out_velocities: FloatArray,
-    out_heights: FloatArray,
-) -> None:
-    """Write boxes at times (G,) of runs (G,) to rows `at`; the others are as in `TrackSamples`."""
-    for number in range(len(times)):
-        run, time, index = runs[number], times[number], at[number]
-        first, last = firsts[run], lasts[run]
-        row = first + np.searchsorted(row_time[first : last + 1], time + _EPS, side="right") - 1
-        row = min(max(row, first), max(last - 1, first))
-        following = min(row + 1, last)
-        span = row_time[following] - row_time[row] if following > row else period
-        share = (time - row_time[row]) / span
-        reach = period / span
-        linear = min(max(share, -reach), 1.0 + reach)
-        inside = min(max(share, 0.0), 1.0)
-        beyond = (share - linear) * span  # s
-        end = row if share < 0 else following
-        for axis in range(2):
-            place = centers[row, axis] + linear * (centers[following, axis] - centers[row, axis])
-            out_poses[index, axis] = place + beyond * velocities[end, axis]
-            change = velocities[following, axis] - velocities[row, axis]
-            out_velocities[index, axis] = velocities[row, axis] + inside * change
-        out_heights[index] = centers[row, 2] + linear * (centers[following, 2] - centers[row, 2])
-        turn = wrap_angle(headings[following] - headings[row])
-        out_poses[index, 2] = wrap_angle(headings[row] + linear * turn)

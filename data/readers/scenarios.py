@@ -23,7 +23,7 @@ from shiftsim.data.readers.samples import (
     find_runs,
     rows_between,
     rows_of,
-    sample_runs,
+    sample_run,
 )
 from shiftsim.data.readers.states import ego_trace, resample
 from shiftsim.data.readers.windows import (
@@ -143,7 +143,7 @@ def make_scenarios(
             padding=padding,
         )
         starts = np.array([span.start_s + span.history_s for span in own])
-        poses = sample_runs(samples, runs, np.full(len(starts), run), starts).poses
+        poses = sample_run(samples, runs, run, starts).poses
         poses[:, :2] += offset
         before = len(scenarios)
         for number, span, pose in zip(numbers, own, poses, strict=True):

@@ -5,19 +5,17 @@ import numpy as np
 from shiftsim.data.readers.samples import (
     ROW_S,
     ROW_US,
-    Boxes,
     Runs,
     TrackSamples,
     rows_between,
     rows_of,
-    sample_runs,
+    sample_run,
 )
 from shiftsim.data.recording import EgoTrace, Recording
 from shiftsim.kernels import FloatArray
 from shiftsim.world import state
 from shiftsim.world.state import LAST_AGENT_KIND, PACIFICA, Tracks, TrafficLights
 
-_BLOCK_ROWS = 256  # rows that are sampled at once
 _HALF_WINDOW = 5  # rows on each side of a derivative: 0.55 s in all, second order
 
 
@@ -51,21 +49,18 @@ def resample(
     kinds = recording.kinds[runs.track[present]]
     shape = num_rows, len(present)
     valid = np.zeros(shape, np.bool_)
-    out = Boxes(np.full((*shape, 3), np.nan), np.full((*shape, 2), np.nan), np.empty(shape))
-    flat = Boxes(out.poses.reshape(-1, 3), out.velocities.reshape(-1, 2), out.heights.ravel())
-    for start in range(-padding, num_rows - padding, _BLOCK_ROWS):  # more would need more memory
-        low = np.maximum(first[present], start)
-        counts = np.maximum(np.minimum(last[present] + 1, start + _BLOCK_ROWS) - low, 0)
-        column = np.repeat(np.arange(len(present)), counts)
-        row = np.arange(len(column)) + np.repeat(low - np.cumsum(counts) + counts, counts)
-        at = (row + padding) * len(present) + column
-        valid.ravel()[at] = True
-        sample_runs(recording, runs, present[column], row * ROW_S, out=flat, at=at)
-    out.poses[..., :2] += offset
-    out.velocities[:, kinds > LAST_AGENT_KIND] = np.nan
-    sizes = np.where(valid[..., None], recording.sizes[runs.track[present], :2], np.nan)
+    poses, velocities, sizes = (np.full((*shape, parts), np.nan) for parts in (3, 2, 2))
+    for column, run in enumerate(present.tolist()):
+        row = np.arange(first[run], last[run] + 1)
+        boxes = sample_run(recording, runs, run, row * ROW_S)
+        valid[row + padding, column] = True
+        poses[row + padding, column] = boxes.poses
+        sizes[row + padding, column] = recording.sizes[runs.track[run], :2]
+        if kinds[column] <= LAST_AGENT_KIND:
+            velocities[row + padding, column] = boxes.velocities
+    poses[..., :2] += offset
     tokens = tuple(run_token(recording, runs, run) for run in present.tolist())
-    tracks = Tracks(valid, out.poses, out.velocities, sizes, kinds, tokens)
+    tracks = Tracks(valid, poses, velocities, sizes, kinds, tokens)
     times = recording.start_us + (np.arange(num_rows) - padding) * ROW_US
     return Recording(log_name, city, times, tracks, TrafficLights.empty(num_rows))
 
@@ -91,7 +86,7 @@ def ego_trace(
     low = min(int(begin[0]) + padding, first_row)
     high = max(int(end[0]) + 1 + padding, last_row)
     times = np.arange(low - padding, high - padding).astype(np.float64) * ROW_S
-    boxes = sample_runs(recording, runs, np.full(len(times), run, np.int64), times)
+    boxes = sample_run(recording, runs, run, times)
     states = ego_states(boxes.poses, boxes.velocities)
     states[:, :2] += offset
     wanted = np.ascontiguousarray(states[first_row - low : last_row - low])

@@ -14,14 +14,9 @@ import pyproj
 from shiftsim.data.maps.opendrive.lanes import LaneKey
 from shiftsim.data.maps.opendrive.map import Origin, build_road_map
 from shiftsim.data.maps.opendrive.reading import read_opendrive
-from shiftsim.data.readers.dsc3d import (
-    Annotations,
-    Site,
-    find_map,
-    open_site,
-    read_recording,
-)
-from shiftsim.data.readers.samples import ROW_S, find_runs, rows_between, sample_runs
+from shiftsim.data.readers.annotations import Annotations
+from shiftsim.data.readers.dsc3d import Site, find_map, open_site, read_recording
+from shiftsim.data.readers.samples import ROW_S, Boxes, find_runs, rows_between, sample_run
 from shiftsim.data.readers.scenarios import Converted, make_scenarios
 from shiftsim.data.readers.windows import EGO, ConversionConfig, evaluate_windows, window_spans
 from shiftsim.geometry.boxes import wrap_angles
@@ -108,11 +103,12 @@ def _compare_samples(file: Source, recording: Annotations) -> None:
     recording = replace(recording, centers=recording.bottom)
     runs = find_runs(recording, _CONFIG.max_hole_s)
     first, last = rows_between(recording.time[runs.first], recording.time[runs.last])
+    steps = [*map(np.arange, first, last + 1)]
+    boxes = [sample_run(recording, runs, run, row * ROW_S) for run, row in enumerate(steps)]
     run = np.repeat(np.arange(len(first)), last - first + 1)
-    step = np.concatenate([*map(np.arange, first, last + 1)])
-    time = step * ROW_S
-    names = {"recording": recording, "track": runs.track[run], "step": step, "time": time}
-    samples = sample_runs(recording, runs, run, time)
+    step = np.concatenate(steps)
+    names = {"recording": recording, "track": runs.track[run], "step": step, "time": step * ROW_S}
+    samples = Boxes(*map(np.concatenate, zip(*boxes, strict=True)))
     FACTS["samples"].match(file, "recording", samples=samples, **names)
 
 
