@@ -13,7 +13,7 @@ from typing import Any
 
 MODULES = {
     "shiftsim.data.deepplan_route": "shiftsim.data.readers.routes",
-    "shiftsim.data.deepplan_states": "shiftsim.data.readers.states",
+    "shiftsim.data.deepplan_states": "shiftsim.data.readers.samples",
     "shiftsim.data.deepplan_windows": "shiftsim.data.readers.windows",
     "shiftsim.data.opendrive_map": "shiftsim.data.maps.opendrive.map",
     "shiftsim.log": "shiftsim.sim.log",

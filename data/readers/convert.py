@@ -136,9 +136,11 @@ def _convert_into(
     make = partial(_Stage, reader, work, keys)
     stage, site = make(), reader.site
     before = read_report(writer.path, reader.name).get("recordings", {}) if site else {}
-    entries = {n: before[n] for n in names if n in before and before[n]["key"] == keys[n]}
-    known = {entry["key"] for entry in entries.values()}
-    known |= {writer.window(token).metadata.get("source_key") for token in writer.tokens}
+    entries = {n: before[n] for n in names if n in before and before[n].get("key") == keys[n]}
+    if site is not None:
+        known = {entry["key"] for entry in entries.values()}
+    else:
+        known = {writer.window(token).metadata.get("source_key") for token in writer.tokens}
     waiting = [name for name in names if keys[name] not in known]
     todo = [name for name in waiting if stage.part(name) is None]
     report = ConversionReport(reader.name, kept=len(names) - len(todo))

@@ -20,12 +20,13 @@ from shiftsim.data.readers.samples import (
     ROW_S,
     ROW_US,
     TrackSamples,
+    ego_trace,
     find_runs,
+    resample,
     rows_between,
     rows_of,
     sample_run,
 )
-from shiftsim.data.readers.states import ego_trace, resample
 from shiftsim.data.readers.windows import (
     CATEGORY,
     EGO,

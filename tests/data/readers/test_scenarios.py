@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shiftsim.data.readers.dsc3d import convert_dsc3d, open_site, read_recording
-from shiftsim.data.readers.samples import find_runs
-from shiftsim.data.readers.states import ego_states, resample, slope
+from shiftsim.data.readers.samples import ego_states, find_runs, resample, slope
 from shiftsim.data.readers.windows import (
     ConversionConfig,
     evaluate_windows,
