@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import call
+from map_checks import check_map
 from open_data_files import (
     COMMANDS,
     LABELS,
@@ -22,7 +23,6 @@ from open_data_files import (
     write_py123d,
 )
 
-from shiftsim.data.maps.opendrive.check import check_map
 from shiftsim.data.readers.av2 import Av2Reader
 from shiftsim.data.readers.convert import convert, convert_recording
 from shiftsim.data.readers.py123d import Py123dReader
