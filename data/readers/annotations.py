@@ -46,6 +46,29 @@ _MAX_NAMES = 1_000  # distinct categories
 
 
 @dataclass(frozen=True)
+class Site:
+    """One DSC3D folder."""
+
+    folder: Path  # where `data_meta.json` lies
+    zone: int  # UTM zone
+    is_north: bool  # whether the zone is a northern one
+    offset: FloatArray  # (3,) UTM easting, northing and altitude of the local origin [m]
+    frame_rate: float  # rate of the camera [Hz]
+    frame_distance: int  # camera frames between two annotated ones
+    recordings: tuple[str, ...]  # names of the recordings
+
+    @property
+    def epsg(self) -> int:
+        """Code of the site's UTM coordinate system (WGS 84)."""
+        return (32600 if self.is_north else 32700) + self.zone
+
+    @property
+    def period(self) -> float:
+        """Time between annotated frames [s]."""
+        return self.frame_distance / self.frame_rate
+
+
+@dataclass(frozen=True)
 class Annotations(TrackSamples):
     """One recording, in the local frame."""
 
@@ -98,37 +121,27 @@ class Dsc3dFile(SourceFile):
         return values
 
 
-def read_annotations(
-    folder: Path,
-    *,
-    frame_rate: float,
-    frame_distance: int,
-    category_map: dict[str, str] | None = None,
+def read_recording(
+    site: Site, name: str, category_map: dict[str, str] | None = None
 ) -> Annotations:
-    """One recording, checked.
-
-    Args:
-        folder: Folder with `annotations.parquet` and `frames.parquet`.
-        frame_rate: Rate of the camera [Hz].
-        frame_distance: Camera frames between two annotated ones.
-        category_map: Known category by a name of the data set.
+    """One recording, checked; `category_map` gives the known category for names of the data set.
 
     Raises:
         ConversionError: A file is missing or broken, or its content contradicts itself.
     """
+    folder = site.folder / "annotations" / name
     warnings: Counter[str] = Counter()
-    period = frame_distance / frame_rate
-    frames, stamps = _read_frames(Dsc3dFile(folder / "frames.parquet"), frame_distance)
-    clock = (frames - frames[0]) / frame_rate
+    frames, stamps = _read_frames(Dsc3dFile(folder / "frames.parquet"), site.frame_distance)
+    clock = (frames - frames[0]) / site.frame_rate
     file = Dsc3dFile(folder / "annotations.parquet")
     if clock[-1] > _MAX_DURATION:
         raise ConversionError(
             f"{folder}: the frames span {clock[-1]:.0f} s, at most {_MAX_DURATION:.0f} s are read",
             "check frame_id, and frame_rate in data_meta.json; or split the recording",
         )
-    wrong = np.abs((stamps - stamps[0]) * 1e-6 - clock) > 0.5 * period
+    wrong = np.abs((stamps - stamps[0]) * 1e-6 - clock) > 0.5 * site.period
     warnings["frames whose time disagrees with their id"] += int(wrong.sum())
-    warnings["frames missing"] += int((np.diff(frames) // frame_distance - 1).sum())
+    warnings["frames missing"] += int((np.diff(frames) // site.frame_distance - 1).sum())
     table = file.table(_WANTED, _MAX_ROWS)
     ids = file.values(table, "track_id").astype(np.int64)
     row_frames = file.values(table, "frame_id").astype(np.int64)
@@ -153,9 +166,9 @@ def read_annotations(
     contradicts = None if stored is None else _contradicts(stored, derived, track)
     velocities = believed_velocities(stored, derived, contradicts, track, warnings)
     return Annotations(
-        name=folder.name,
+        name=name,
         start_us=int(stamps[0]),
-        period=period,
+        period=site.period,
         clock=clock,
         frame=frame,
         track=track,

@@ -6,7 +6,7 @@
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,21 +17,14 @@ from shiftsim.data.maps.build import PieceMap
 from shiftsim.data.maps.opendrive.map import build_road_map
 from shiftsim.data.maps.opendrive.reading import read_opendrive
 from shiftsim.data.maps.opendrive.records import OpenDrive
-from shiftsim.data.readers.annotations import Annotations, Dsc3dFile, read_annotations
-from shiftsim.data.readers.convert import (
-    ConversionReport,
-    Executor,
-    Progress,
-    convert,
-    serial_map,
-)
+from shiftsim.data.readers.annotations import Dsc3dFile, Site, read_recording
+from shiftsim.data.readers.convert import ConversionReport, Executor, Progress, convert, serial_map
 from shiftsim.data.readers.placement import place_on_map
 from shiftsim.data.readers.reader import SourceRecording, site_map
 from shiftsim.data.readers.samples import TrackSamples
 from shiftsim.data.readers.windows import ConversionConfig, window_spans
 from shiftsim.data.store.tables import digest
 from shiftsim.errors import ConversionError, DataError
-from shiftsim.kernels import FloatArray
 from shiftsim.world.state import AgentKind
 
 SCENARIO_TYPE = "deepplan"
@@ -45,30 +38,6 @@ _META = {
     "frame_distance": float,
     "locations": [{"recordings": [str]}],
 }
-
-
-@dataclass(frozen=True)
-class Site:
-    """One DSC3D folder."""
-
-    folder: Path  # where `data_meta.json` lies
-    name: str  # free text of the data set
-    zone: int  # UTM zone
-    is_north: bool  # whether the zone is a northern one
-    offset: FloatArray  # (3,) UTM easting, northing and altitude of the local origin [m]
-    frame_rate: float  # rate of the camera [Hz]
-    frame_distance: int  # camera frames between two annotated ones
-    recordings: tuple[str, ...]  # names of the recordings
-
-    @property
-    def epsg(self) -> int:
-        """Code of the site's UTM coordinate system (WGS 84)."""
-        return (32600 if self.is_north else 32700) + self.zone
-
-    @property
-    def period(self) -> float:
-        """Time between annotated frames [s]."""
-        return self.frame_distance / self.frame_rate
 
 
 class Dsc3dReader:
@@ -227,7 +196,6 @@ def open_site(src: Path) -> Site:
         file.require_that(is_plain, f"recording name {name!r} is not a plain folder name")
     return Site(
         folder=found[0],
-        name=str(meta.get("dataset_name", "")),
         zone=int(zone),
         is_north=str(utm["zone"][1]).upper() == "N",
         offset=np.array(utm["offset"], np.float64),
@@ -254,18 +222,6 @@ def find_map(site: Site, given: Path | None = None) -> Path:
     raise ConversionError(
         f"{site.folder}: this download has no OpenDRIVE map (map/map.xodr)",
         "ask DeepScenario support for the map, or give one with --map",
-    )
-
-
-def read_recording(
-    site: Site, name: str, category_map: dict[str, str] | None = None
-) -> Annotations:
-    """One recording of a site, checked: `read_annotations`."""
-    return read_annotations(
-        site.folder / "annotations" / name,
-        frame_rate=site.frame_rate,
-        frame_distance=site.frame_distance,
-        category_map=category_map,
     )
 
 

@@ -120,12 +120,7 @@ def make_scenarios(
     log_name = f"{road.name}_{samples.name}"
     padding = rows_of(config.padding_s)
     recording = resample(
-        samples,
-        runs,
-        log_name=log_name,
-        city=road.name,
-        offset=offset,
-        padding_s=config.padding_s,
+        samples, runs, log_name=log_name, city=road.name, offset=offset, padding_s=config.padding_s
     )
     rejected: Counter[str] = Counter()
     accepted = _accepted_runs(windows, config, rejected)

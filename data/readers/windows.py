@@ -141,10 +141,7 @@ def window_spans(duration: float, config: ConversionConfig) -> list[Span]:
 
 
 def evaluate_windows(
-    recording: TrackSamples,
-    runs: Runs,
-    config: ConversionConfig,
-    spans: Sequence[Span],
+    recording: TrackSamples, runs: Runs, config: ConversionConfig, spans: Sequence[Span]
 ) -> list[WindowVerdicts]:
     """The verdict on every track in every window, rules of category to overlap."""
     only = np.array([span.only for span in spans if span.only >= 0], np.int64)

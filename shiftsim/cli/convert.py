@@ -8,17 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from shiftsim import cli
-from shiftsim.cli import (
-    Debug,
-    Json,
-    Quiet,
-    new_app,
-    plural,
-    progress_bar,
-    say,
-    say_json,
-    values,
-)
+from shiftsim.cli import Debug, Json, Quiet, new_app, plural, progress_bar, say, say_json, values
 
 if TYPE_CHECKING:
     from shiftsim.data.readers.convert import ConversionReport

@@ -14,8 +14,8 @@ import pyproj
 from shiftsim.data.maps.opendrive.lanes import LaneKey
 from shiftsim.data.maps.opendrive.map import Origin, build_road_map
 from shiftsim.data.maps.opendrive.reading import read_opendrive
-from shiftsim.data.readers.annotations import Annotations
-from shiftsim.data.readers.dsc3d import Site, find_map, open_site, read_recording
+from shiftsim.data.readers.annotations import Annotations, Site, read_recording
+from shiftsim.data.readers.dsc3d import find_map, open_site
 from shiftsim.data.readers.samples import ROW_S, Boxes, find_runs, rows_between, sample_run
 from shiftsim.data.readers.scenarios import Converted, make_scenarios
 from shiftsim.data.readers.windows import EGO, ConversionConfig, evaluate_windows, window_spans

@@ -7,7 +7,8 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shiftsim.data.readers.dsc3d import convert_dsc3d, open_site, read_recording
+from shiftsim.data.readers.annotations import read_recording
+from shiftsim.data.readers.dsc3d import convert_dsc3d, open_site
 from shiftsim.data.readers.samples import ego_states, find_runs, resample, slope
 from shiftsim.data.readers.windows import (
     ConversionConfig,
