@@ -21,12 +21,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from shiftsim import __version__
-from shiftsim.data.maps.lights import light_rows
-from shiftsim.data.readers.reader import Reader, SourceRecording
+from shiftsim.data.readers.reader import Reader
 from shiftsim.data.readers.scenarios import (
-    Converted,
     RecordingSummary,
-    make_scenarios,
+    convert_recording,
     require_scenarios,
 )
 from shiftsim.data.store import schema
@@ -193,35 +191,6 @@ def _convert_into(
         writer.add_report(reader.name, content | report.details)
     writer.close()
     return report
-
-
-def convert_recording(source: SourceRecording) -> Converted:
-    """One recording to scenarios.
-
-    Raises:
-        DataError: Its numbers are out of range.
-        ConfigError: An ego is not among the tracks.
-    """
-    converted = make_scenarios(
-        source.samples,
-        source.map.road,
-        egos=source.egos,
-        config=source.config,
-        scenario_type=source.scenario_type,
-        left_out_s=source.left_out_s,
-        offset=source.offset,
-        spans=source.spans,
-    )
-    recording, summary = converted.recording, converted.summary
-    if source.lights is not None:
-        lights = light_rows(source.lights, source.map.lights, recording.time_us)
-        recording = replace(recording, lights=lights)
-    windows = tuple(
-        replace(window, metadata={**window.metadata, **source.metadata})
-        for window in converted.windows
-    )
-    warnings = dict(Counter(summary.warnings) + Counter(source.warnings))
-    return Converted(recording, converted.egos, windows, replace(summary, warnings=warnings))
 
 
 class _Stage:

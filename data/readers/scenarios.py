@@ -15,6 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
+from shiftsim.data.maps.lights import light_rows
+from shiftsim.data.readers.reader import SourceRecording, site_map
 from shiftsim.data.readers.routes import find_route, starts_on_lane
 from shiftsim.data.readers.samples import (
     ROW_S,
@@ -89,10 +91,8 @@ def make_scenarios(
     config: ConversionConfig | None = None,
     scenario_type: str = "unknown",
     left_out_s: float = 0.0,
-    offset: FloatArray | None = None,
-    spans: Sequence[Span] | None = None,
 ) -> Converted:
-    """All scenarios of a recording on its map.
+    """All scenarios of a recording; both it and the map are in the frame of the map.
 
     Args:
         samples: The recording.
@@ -102,19 +102,32 @@ def make_scenarios(
         config: Thresholds of DeepPlan's conversion.
         scenario_type: Tag of the scenarios.
         left_out_s: Time at the end of the recording that no window reaches [s].
-        offset: (2,) what to add to places of the recording to get those of the map [m].
-        spans: The windows; by default all that fit into the recording, or a shorter one.
 
     Raises:
         ConfigError: No object has the id of an ego.
     """
-    config = config or ConversionConfig(ego_categories=EGO_CATEGORIES)
-    offset = np.zeros(2) if offset is None else offset
-    if spans is None and egos is None:
-        rows = int(np.floor((samples.duration - left_out_s) / ROW_S + 1e-9)) + 1
+    return convert_recording(
+        SourceRecording(
+            samples,
+            site_map(road, {}),
+            config=config,
+            scenario_type=scenario_type,
+            egos=egos,
+            left_out_s=left_out_s,
+        )
+    )
+
+
+def convert_recording(source: SourceRecording) -> Converted:
+    """All scenarios of one recording of a source; see `make_scenarios`."""
+    samples, road, spans = source.samples, source.map.road, source.spans
+    config = source.config or ConversionConfig(ego_categories=EGO_CATEGORIES)
+    offset = np.zeros(2) if source.offset is None else source.offset
+    if spans is None and source.egos is None:
+        rows = int(np.floor((samples.duration - source.left_out_s) / ROW_S + 1e-9)) + 1
         spans = list(_spans(0, rows, -1, config))
     elif spans is None:
-        spans = list(_named_spans(samples, egos or (), config, left_out_s))
+        spans = list(_named_spans(samples, source.egos or (), config, source.left_out_s))
     runs = find_runs(samples, config.max_hole_s)
     windows = evaluate_windows(samples, runs, config, spans)
     log_name = f"{road.name}_{samples.name}"
@@ -151,10 +164,15 @@ def make_scenarios(
             if isinstance(window, str):
                 rejected[window] += 1
             else:
-                scenarios.append(replace(window, scenario_type=scenario_type))
+                metadata = {**window.metadata, **source.metadata}
+                kind = source.scenario_type
+                scenarios.append(replace(window, scenario_type=kind, metadata=metadata))
         if len(scenarios) > before:
             traces.append(trace)
-    warnings = Counter(samples.warnings)
+    if source.lights is not None:
+        lights = light_rows(source.lights, source.map.lights, recording.time_us)
+        recording = replace(recording, lights=lights)
+    warnings = Counter(samples.warnings) + Counter(source.warnings)
     warnings["rows far outside the map"] += _rows_outside_map(samples, road, offset)
     summary = RecordingSummary(
         name=samples.name,

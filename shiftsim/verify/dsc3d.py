@@ -16,8 +16,9 @@ from shiftsim.data.maps.opendrive.map import Origin, build_road_map
 from shiftsim.data.maps.opendrive.reading import read_opendrive
 from shiftsim.data.readers.annotations import Annotations, Site, read_recording
 from shiftsim.data.readers.dsc3d import find_map, open_site
+from shiftsim.data.readers.reader import SourceRecording, site_map
 from shiftsim.data.readers.samples import ROW_S, Boxes, find_runs, rows_between, sample_run
-from shiftsim.data.readers.scenarios import Converted, make_scenarios
+from shiftsim.data.readers.scenarios import Converted, convert_recording
 from shiftsim.data.readers.windows import EGO, ConversionConfig, evaluate_windows, window_spans
 from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.kernels import FloatArray
@@ -174,9 +175,10 @@ def _compare_scripted(expected: Source, where: str, folder: Path, maps: Path | N
     if found := next(filter(Path.is_file, places), None):
         lanes = Lanes(found, site)
         spans = window_spans(recording.duration, _CONFIG)
-        made = make_scenarios(
-            recording, lanes.road, config=_CONFIG, offset=lanes.offset, spans=spans
+        source = SourceRecording(
+            recording, site_map(lanes.road, {}), config=_CONFIG, offset=lanes.offset, spans=spans
         )
+        made = convert_recording(source)
         _compare_made(folder, made, lanes, ways, report)
     else:
         report.skip(f"lane sequences and poses: map {expected['map']} not found (--maps)")

@@ -286,8 +286,8 @@ def _py123d(folder: Path) -> None:
 def _read_scenes(name: str, folder: Path) -> Any:
     from shiftsim.data.readers.av2 import Av2Reader
     from shiftsim.data.readers.commonroad import CommonRoadReader
-    from shiftsim.data.readers.convert import convert_recording
     from shiftsim.data.readers.py123d import Py123dReader
+    from shiftsim.data.readers.scenarios import convert_recording
 
     reader = {"av2": Av2Reader, "commonroad": CommonRoadReader, "py123d": Py123dReader}[name](
         folder

@@ -24,8 +24,9 @@ from open_data_files import (
 )
 
 from shiftsim.data.readers.av2 import Av2Reader
-from shiftsim.data.readers.convert import convert, convert_recording
+from shiftsim.data.readers.convert import convert
 from shiftsim.data.readers.py123d import Py123dReader
+from shiftsim.data.readers.scenarios import convert_recording
 from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConversionError

@@ -10,7 +10,8 @@ from map_checks import check_map
 import shiftsim
 from shiftsim.data.readers.av2 import Av2Reader
 from shiftsim.data.readers.commonroad import CommonRoadReader
-from shiftsim.data.readers.convert import convert, convert_recording
+from shiftsim.data.readers.convert import convert
+from shiftsim.data.readers.scenarios import convert_recording
 from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.world.state import AgentKind, center_poses
