@@ -249,7 +249,7 @@ def _sizes(
         warnings["tracks without size (that of their kind)"] += len(kinds)
         return usual
     known = (sizes > 0.0).all(axis=1)
-    if not known.all():  # the rows that have one tell it
+    if not known.all():  # rows without a size say nothing of it
         sizes, track = sizes[known], track[known]
     medians = np.zeros_like(usual)
     if len(track):

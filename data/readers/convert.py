@@ -70,7 +70,7 @@ class ConversionReport:
     kept: int = 0  # how many were converted before, by an interrupted or an earlier call
     # count by kind of what was repaired in the map
     map_warnings: dict[str, int] = field(default_factory=dict)
-    details: dict[str, Any] = field(default_factory=dict)  # what else its source tells
+    details: dict[str, Any] = field(default_factory=dict)  # what the reader adds
 
     @property
     def accepted(self) -> int:
@@ -257,7 +257,7 @@ class _Stage:
 def _key(reader: Reader, name: str) -> str:
     """Equal where the result of a recording is equal."""
     content = [__version__, schema.VERSION, Path(name).name, dict(reader.settings)]
-    with suppress(OSError, DataError):  # reading tells what is wrong
+    with suppress(OSError, DataError):  # reading reports what is wrong
         content += [digest(file) for file in reader.files(name)]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 

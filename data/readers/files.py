@@ -54,7 +54,7 @@ class SourceFile:
 
     @contextmanager
     def naming(self) -> Iterator[None]:
-        """Errors of what is made of the file name it."""
+        """Add the path of the file to errors raised inside."""
         try:
             yield
         except DataError as error:

@@ -13,7 +13,7 @@ from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 
 _HALF_WINDOW = 0.25  # s on each side of a fit
 _EPS = 1e-6  # s
-_SLOW = 0.3  # m/s, below which a direction of motion tells nothing
+_SLOW = 0.3  # m/s, below which there is no direction of motion
 _END = 1.0  # s at both ends of a track, where trackers settle
 MAX_SHARE, _LEAST_ERROR = 0.1, 0.3  # of the speed; m/s that noise of positions may cause
 _MAX_STANDING_TURN = 0.5  # rad/s

@@ -97,7 +97,7 @@ class _File(SourceFile):
     remedy = "convert the log again with py123d 0.7.0"  # the version that is tested
 
     def steps(self, columns: dict[str, Any], form: Any) -> tuple[IntArray, pa.Table, Any]:
-        """(R,) time stamps [us] of a file of a log, other columns, and what its metadata say."""
+        """(R,) time stamps [us] of a file of a log, other columns, and its metadata."""
         kinds = {"timestamp_us": pa.int64(), **columns}
         table = self.columns({f"{self.path.stem}.{name}": kind for name, kind in kinds.items()})
         stamps = self.numbers(table, table.column_names[0], "time").astype(np.int64)
@@ -128,7 +128,7 @@ def _array(found: dict[Any, Any]) -> Any:
 
 
 def _read_sync(log: Path) -> tuple[dict[str, Any], Path]:
-    """What a log says of itself; its map: beside it, or in the `maps` of the whole folder."""
+    """What a log says of itself; its map, beside it or in the folder `maps`."""
     place = {"dataset": str, "location": (str,)}
     form = {**place, "split": str, "version": (str,), "map_metadata": (place,)}
     *_, about = _File(log / "sync.arrow").steps({}, form)

@@ -98,7 +98,7 @@ def diagnose(table: TrackTable, road: VectorMap, min_share: float) -> Diagnostic
 
 
 def _check_times(table: TrackTable, step: FloatArray, out: Diagnostics) -> bool:
-    """Whether motion can be told at all."""
+    """Whether the motion of objects can be determined at all."""
     if not len(step):
         out.error(
             f"each of the {len(table.track_ids)} objects has one row only",
@@ -177,7 +177,7 @@ def _check_starts(stats: TrackStatistics, out: Diagnostics) -> None:
 
 
 def _check_jumps(stats: TrackStatistics, same: BoolArray, out: Diagnostics) -> bool:
-    """Single rows that are far from their neighbours; whether speeds tell anything beside them."""
+    """Single rows that are far from their neighbours; whether speeds mean anything beside them."""
     table = stats.table
     way = np.hypot(*np.diff(table.xy, axis=0).T)
     far = same & (way > _JUMP) & (way > _JUMP_SPEED * np.diff(stats.time))
