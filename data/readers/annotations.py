@@ -94,12 +94,15 @@ class Dsc3dFile(SourceFile):
         """The columns wanted, as far as the file has them."""
         self.require_size()
         try:
-            file = pq.ParquetFile(self.path, read_dictionary=["category"])  # of long names
-            rows, names = file.metadata.num_rows, file.schema_arrow.names
+            file = pq.ParquetFile(self.path)
+            rows, present = file.metadata.num_rows, file.schema_arrow.names
             self.require_that(
                 rows <= max_rows, f"{rows} rows, at most {max_rows} can be read", "split it"
             )
-            return file.read([name for name in wanted if name in names], use_threads=False)
+            names = [name for name in wanted if name in present]
+            long = [name for name in names if name == "category"]  # its texts are not repeated
+            file = pq.ParquetFile(self.path, read_dictionary=long)
+            return file.read(names, use_threads=False)
         except (pa.ArrowException, OSError, ValueError) as error:
             raise self.fault(f"not a readable Parquet file ({error})") from error
 
