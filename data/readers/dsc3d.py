@@ -189,7 +189,7 @@ def open_site(src: Path) -> Site:
     zone = file.known(utm["zone"][0], range(1, 61), "reference_utm.zone")
     for key in ("frame_rate", "frame_distance"):
         file.require(key, meta[key], "key")
-    file.require("reference_utm.offset", np.array(utm["offset"], np.float64), "key")
+    offset = [file.number(value, "reference_utm.offset", "key") for value in utm["offset"]]
     file.require_that(names, "no recordings are listed under locations")
     for name in names:
         is_plain = Path(name).name == name and name not in ("", ".", "..")
@@ -198,7 +198,7 @@ def open_site(src: Path) -> Site:
         folder=found[0],
         zone=int(zone),
         is_north=str(utm["zone"][1]).upper() == "N",
-        offset=np.array(utm["offset"], np.float64),
+        offset=np.array(offset),
         frame_rate=float(meta["frame_rate"]),
         frame_distance=int(meta["frame_distance"]),
         recordings=tuple(names),

@@ -86,7 +86,7 @@ class SourceFile:
         """A number, or a text that is one, in the range of its field."""
         try:
             number = float(value)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise self.fault(f"{place} is {value!r}, need a number") from None
         self.require(field, number, place)
         return number

@@ -103,12 +103,15 @@ def test_the_map_is_found_under_any_name_and_missing_maps_are_explained(tmp_path
     [
         ({"interface_version": "2.0"}, "interface_version '2.0'"),
         ({"reference_utm": {"zone": [99, "N"], "offset": [0, 0, 0]}}, "99"),
-        ({"reference_utm": {"zone": [32, "N"]}}, "reference_utm.offset"),
+        ({"reference_utm": {"zone": [32, "N"]}}, "'offset' is missing"),
         ({"frame_rate": 0}, "frame_rate"),
-        ({"frame_rate": "fast"}, "wrong type"),
+        ({"frame_rate": "fast"}, "need a number"),
         ({"locations": []}, "no recordings"),
         ({"locations": [{"recordings": ["../x"]}]}, "not a plain folder name"),
-        ({"reference_utm": {"zone": [32, "N"], "offset": [float("nan"), 0, 0]}}, "not finite"),
+        (
+            {"reference_utm": {"zone": [32, "N"], "offset": [float("nan"), 0, 0]}},
+            "not a finite number",
+        ),
     ],
 )
 def test_a_wrong_data_meta_is_one_clear_error(tmp_path, change, message):
