@@ -21,7 +21,7 @@ from shiftsim.data.readers.samples import ROW_S, Boxes, find_runs, rows_between,
 from shiftsim.data.readers.scenarios import Converted, convert_recording
 from shiftsim.data.readers.windows import EGO, ConversionConfig, evaluate_windows, window_spans
 from shiftsim.geometry.boxes import wrap_angles
-from shiftsim.kernels import FloatArray
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.metrics.route import driven_route
 from shiftsim.verify.files import Compare, Parts, Source, open_tables, read_file, verify_files
 from shiftsim.verify.report import Report
@@ -104,7 +104,7 @@ def _compare_samples(file: Source, recording: Annotations) -> None:
     recording = replace(recording, centers=recording.bottom)
     runs = find_runs(recording, _CONFIG.max_hole_s)
     first, last = rows_between(recording.time[runs.first], recording.time[runs.last])
-    steps = [*map(np.arange, first, last + 1)]
+    steps: list[IntArray] = [*map(np.arange, first, last + 1)]
     boxes = [sample_run(recording, runs, run, row * ROW_S) for run, row in enumerate(steps)]
     run = np.repeat(np.arange(len(first)), last - first + 1)
     step = np.concatenate(steps)
