@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from shiftsim.data.nuplan.scenarios import FUTURE_ROWS, PAST_ROWS
-from shiftsim.data.readers.deepplan.states import ego_states as states_of
+from shiftsim.data.readers.samples import ego_states as states_of
 from shiftsim.data.recording import EgoTrace, Recording, scenario
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.data.store.tracks import ego_span, ego_states

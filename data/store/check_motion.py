@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.data.readers.tracks.motion import (
+from shiftsim.data.readers.motion import (
     MAX_SHARE,
     contradiction,
     fitted_velocities,

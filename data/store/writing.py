@@ -162,6 +162,13 @@ class StoreWriter:
             self._note(path)
         self._rows |= {row["token"]: row for row in rows}
 
+    def take_map(self, file: Path, city: str) -> None:
+        """Move a map that was written elsewhere into the store, in place of the one it has."""
+        path = tables.map_file(self.path, city)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(file, path)
+        self._note(path)
+
     def forget_recording(self, log_name: str) -> Path:
         """Remove a recording with all its scenarios, if there is one; the folder it had or will."""
         target = tables.recording_folder(self.path, log_name)

@@ -16,8 +16,9 @@ import numpy as np
 from shiftsim.data.demo.files import write_site
 from shiftsim.data.demo.lights import Lights
 from shiftsim.data.demo.scenes import DemoSite, Scene
-from shiftsim.data.readers.deepplan.convert import convert_dsc3d
-from shiftsim.data.readers.deepplan.windows import ROW_S, ConversionConfig
+from shiftsim.data.readers.dsc3d import convert_dsc3d
+from shiftsim.data.readers.samples import ROW_S
+from shiftsim.data.readers.windows import ConversionConfig
 from shiftsim.data.recording import Window
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.data.store.tables import recording_folder
@@ -85,7 +86,7 @@ def _make(name: str, rng: np.random.Generator, source: Path, store: Path) -> int
     write_site(source, site, place.town, [random_traffic(place, rng, _DURATION)])
     config = ConversionConfig(overlap_s=_OVERLAP)
     report = convert_dsc3d(source, store, site=name, options=config)
-    if place.lights:
+    if place.lights and report.accepted:
         _add_lights(store, f"{name}_{scene.name}", place, np.array(offset[:2]))
     return len(usable(ScenarioStore(store))) if report.accepted else 0
 

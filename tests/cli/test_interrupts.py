@@ -17,12 +17,12 @@ CASES = [
     ("filter {store}", "shiftsim.runs.filter.filter_store", "kept; go on with: shiftsim filter"),
     (
         "convert dsc3d x --store y",
-        "shiftsim.data.readers.deepplan.convert.convert_dsc3d",
+        "shiftsim.data.readers.dsc3d.open_site",
         "kept; go on with: shiftsim convert dsc3d x --store y",
     ),
     (
         "convert av2 x --store y",
-        "shiftsim.data.readers.open_data.scenes.convert_scenes",
+        "shiftsim.data.readers.convert.convert",
         "kept; go on with: shiftsim convert av2 x --store y",
     ),
     (

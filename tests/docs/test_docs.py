@@ -38,7 +38,7 @@ from track_files import table_of, write_tracks
 import shiftsim
 from shiftsim.benchmarks import load_track
 from shiftsim.data.demo import store as synthetic
-from shiftsim.data.readers.dsc3d.recording import open_site
+from shiftsim.data.readers.dsc3d import open_site
 from shiftsim.data.store import map as store_map
 from shiftsim.data.store import schema
 from shiftsim.metrics import MULTIPLIERS, PROFILES, SHORT_NAMES, WEIGHTS
