@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 
-from shiftsim.data.store.tables import TableWriter
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.files import below, draft, whole_file, write_text
 from shiftsim.runs.journal import Journal
@@ -251,7 +251,7 @@ class _SortedTable:
     def __init__(self, path: Path, schema: pa.Schema) -> None:
         self.path, self.schema = path, schema
         self._partial = draft(path)
-        self._writer = TableWriter(self._partial, schema, **WRITE_OPTIONS)
+        self._writer = pq.ParquetWriter(self._partial, schema, **WRITE_OPTIONS)
         self._pending = schema.empty_table()
 
     def add(self, rows: list[dict[str, Any]]) -> None:

@@ -22,12 +22,12 @@ from shiftsim.data.readers.deepplan.windows import ConversionConfig
 from shiftsim.data.readers.dsc3d.recording import Annotations, Site, read_recording
 from shiftsim.data.store import schema
 from shiftsim.data.store.map import read_map_file
+from shiftsim.data.store.recordings import write_ego, write_recording
 from shiftsim.data.store.tables import digest, file_name
-from shiftsim.data.store.tracks import write_ego, write_recording
 from shiftsim.data.store.writing import StoreWriter, window_row
 from shiftsim.errors import DataError
 
-MAP_FILE = "map.parquet"
+MAP_FILE = "map.arrow"
 _PART, _FILES = "part.json", "files"
 
 
