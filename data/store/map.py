@@ -4,6 +4,7 @@ The file is mapped into memory and its arrays are used as they lie there, so tha
 machine share them. Kernels follow the indices of a map without looking: they are checked here.
 """
 
+import os
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -130,10 +131,10 @@ def read_map_file(path: Path) -> VectorMap:
             raise ValueError(f"{len(table)} rows, not 1, or values are missing")
         items = {name: table[name].chunk(0) for name in SCHEMA.names}
         road = _assemble({name: _value(array) for name, array in items.items()})
-    except FileNotFoundError as error:
-        raise DataError(f"{path}: the file is missing", hint=REPAIR) from error
     except (OSError, KeyError, ValueError, TypeError, pa.ArrowException) as error:
-        raise DataError(f"{path}: not a readable map: {error}", hint=REPAIR) from error
+        is_there = os.path.exists(path)
+        what = f"not a readable map: {error}" if is_there else "the file is missing"
+        raise DataError(f"{path}: {what}", hint=REPAIR) from error
     require_sound(road, str(path))
     return road
 
