@@ -30,8 +30,8 @@ from shiftsim.data.readers.scenarios import (
 from shiftsim.data.store import schema
 from shiftsim.data.store.map import write_map
 from shiftsim.data.store.reading import read_report
+from shiftsim.data.store.recordings import write_ego, write_recording
 from shiftsim.data.store.tables import PARTIAL, digest, file_name
-from shiftsim.data.store.tracks import write_ego, write_recording
 from shiftsim.data.store.writing import StoreWriter, window_row
 from shiftsim.errors import ConversionError, DataError, ShiftsimError
 from shiftsim.files import safe_join

@@ -21,8 +21,6 @@ from shiftsim.data.readers.samples import ROW_S
 from shiftsim.data.readers.windows import ConversionConfig
 from shiftsim.data.recording import Window
 from shiftsim.data.store.reading import ScenarioStore
-from shiftsim.data.store.tables import recording_folder
-from shiftsim.data.store.tracks import open_recording
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.data.towns.layouts import KINDS, Place, random_place
 from shiftsim.data.towns.people import random_traffic
@@ -101,7 +99,7 @@ def _add_lights(store: Path, recording: str, place: Place, offset: FloatArray) -
     """Write what the traffic lights showed into a recording."""
     opened = ScenarioStore(store)
     road = opened.map(place.town.name)
-    stored = open_recording(recording_folder(store, recording))
+    stored = opened.recording(recording)
     found = stored.read(0, stored.num_rows)
     seconds = (np.arange(stored.num_rows) * ROW_S).tolist()
     names, columns = [], []

@@ -17,9 +17,10 @@ import open_data_files
 import opendrive_xml
 from fuzz.tables import read_results, read_track_table, write_results, write_track_tables
 from places import GOLDEN
+from recordings import require_plausible
 from stores import write_toy_store
 
-from shiftsim.data.store.plausible import require_plausible, require_sound
+from shiftsim.data.store.map import require_sound
 from shiftsim.errors import DataError
 from shiftsim.planners.table import shipped_file
 from shiftsim.runs.tables import _RANGES as RUN_COLUMNS
@@ -144,7 +145,7 @@ def _outside(found: np.ndarray, where: str, field: str) -> Iterator[str]:
 
 
 def _implausible_scenario(scene: Scenario, where: str) -> Iterator[str]:
-    require_plausible(scene, "ego", Path(where))
+    require_plausible(scene)
     names = ("duration_s", "offset_s", "subsample_ratio")
     values = dict(zip(names, scene.mapping, strict=True)) | {"goal_pose": scene.mission_goal}
     yield from implausible(values, f"{where}.mapping")
