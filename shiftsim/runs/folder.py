@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.files import atomic_write, safe_join, write_text
