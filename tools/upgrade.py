@@ -1,7 +1,7 @@
 """Convert a store or a run folder of an earlier format: python tools/upgrade.py STORE|RUN.
 
 The folder takes the new content when all of it is written; the numbers stay the same to the last
-bit (plans of rollouts are rounded, as ever). A run knows its store by the hash of the content:
+bit (plans of rollouts in single precision). A run knows its store by the hash of the content:
 convert the store first, then its runs.
 """
 
