@@ -166,7 +166,7 @@ class StoredRecording:
         Raises:
             DataError: A file is damaged or does not have the rows.
         """
-        return self._read(first, last, lambda valid, kinds, names: np.arange(len(names)), False)
+        return self._read(first, last, lambda valid, *_: np.flatnonzero(valid.any(axis=0)), False)
 
     def read_window(self, window: Window, *, plausible: bool) -> Recording:
         """The rows of a window, and the tracks that it shows.
@@ -189,67 +189,78 @@ class StoredRecording:
 
     def _lights(self, first: int, last: int, plausible: bool) -> TrafficLights:
         found = self.lights.read(self.lights.blocks(first, last), plausible=plausible)
-        here, row, light, each = _cells(found, "light", first, last)
+        row = column(found, "row")
+        found = found.filter(pa.array((row >= first) & (row < last)))
+        light, each = _columns(found, "light")
         status = np.full((last - first, len(each)), LightStatus.ABSENT, np.int8)
-        status[row, light] = column(found, "status")[here]
+        status[column(found, "row") - first, light] = column(found, "status")
         return TrafficLights(tuple(found["connector"].take(each).to_pylist()), status)
 
     def _tracks(self, first: int, last: int, choose: _Choice, plausible: bool) -> Tracks:
         found = self.tracks.read(self.tracks.blocks(first, last), plausible=plausible)
-        here, row, track, each = _cells(found, "track", first, last)
+        row = column(found, "row") - first
+        track, each = _columns(found, "track")
         tokens: list[str] = found["token"].take(each).to_pylist()
         kinds = column(found, "kind")[each].astype(np.int64)
         valid = np.zeros((last - first, len(each)), np.bool_)
-        valid[row, track] = True
+        _mark(row, track, valid)
         order = choose(valid, kinds, tokens)
+        place = np.full(len(each), -1)
+        place[order] = np.arange(len(order))
         if len(order) < len(each) or (order != np.arange(len(each))).any():
-            place = np.full(len(each), -1)
-            place[order] = np.arange(len(order))
-            track = place[track]
             valid, kinds, tokens = valid.take(order, 1), kinds[order], [tokens[i] for i in order]
         poses, velocities, sizes = (np.full((*valid.shape, n), np.nan) for n in (3, 2, 2))
         numbers = tuple([column(found, name) for name in schema.BOX])
-        _scatter(numbers, here, row, track, poses, velocities, sizes)
+        _scatter(numbers, row, track, place, poses, velocities, sizes)
         return Tracks(valid, poses, velocities, sizes, kinds, tuple(tokens))
 
 
-def _cells(
-    found: pa.Table, name: str, first: int, last: int
-) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """Where the rows of a table are in dense arrays over the rows first … last - 1.
+def _columns(found: pa.Table, name: str) -> tuple[IntArray, pa.Array]:
+    """Columns in dense arrays of what the rows of a table are about.
 
     Args:
-        found: Has columns `row` and `name`, the number of a track or light.
-        name: Of that column.
-        first: First row of the recording.
-        last: One past the last one.
+        found: The table, of A rows; it has few runs of equal numbers, as files are written.
+        name: Column with the number of a track or light.
 
     Returns:
-        Indices (A,) of the rows of the table that are inside, their rows (A,) and columns (A,) in
-        the arrays; and the index (N,) of a row of the table for each column.
+        Column (A,) of each row, in the order of the numbers; and the index (N,) of a row of the
+        table for each column.
     """
-    row = column(found, "row")
-    here = np.flatnonzero((row >= first) & (row < last))
-    numbers = column(found, name)[here]
-    _, each, place = np.unique(numbers, return_index=True, return_inverse=True)
-    return here, row[here] - first, place.reshape(-1), here[each]
+    numbers = column(found, name)
+    begins = np.ones(len(numbers), np.bool_)
+    begins[1:] = numbers[1:] != numbers[:-1]
+    starts = np.flatnonzero(begins)
+    _, each, place = np.unique(numbers[starts], return_index=True, return_inverse=True)
+    lengths = np.diff(starts, append=len(numbers))
+    return np.repeat(place, lengths), starts[each]
+
+
+@kernel
+def _mark(row: IntArray, track: IntArray, valid: BoolArray) -> None:
+    """Mark in `valid` (R, N) which tracks have a box in which row; other rows are left out."""
+    for box in range(len(row)):
+        if 0 <= row[box] < len(valid):
+            valid[row[box], track[box]] = True
 
 
 @kernel
 def _scatter(
     numbers: tuple[FloatArray, ...],
-    here: IntArray,
     row: IntArray,
     track: IntArray,
+    place: IntArray,
     poses: FloatArray,
     velocities: FloatArray,
     sizes: FloatArray,
 ) -> None:
-    """Spread `schema.BOX` of rows of a table over dense arrays; tracks below 0 are left out."""
+    """Spread `schema.BOX` of rows of a table over dense arrays (R, N, ...).
+
+    `place` is the column of each track, -1 where it is left out; so are other rows.
+    """
     x, y, heading, vx, vy, length, width = numbers
-    for index in range(len(here)):
-        box, t, n = here[index], row[index], track[index]
-        if n >= 0:
+    for box in range(len(row)):
+        t, n = row[box], place[track[box]]
+        if n >= 0 and 0 <= t < len(poses):
             poses[t, n, 0], poses[t, n, 1], poses[t, n, 2] = x[box], y[box], heading[box]
             velocities[t, n, 0], velocities[t, n, 1] = vx[box], vy[box]
             sizes[t, n, 0], sizes[t, n, 1] = length[box], width[box]

@@ -311,7 +311,9 @@ def require_ranges(table: pa.Table, where: str) -> None:
             continue
         values, may_be_nan = column(table, name), named == "token" and name in schema.MAY_BE_NAN
         bad = STORE[name].outside(values, may_be_nan=may_be_nan)
-        if len(bad) and named:
+        if not len(bad):
+            continue
+        if named:
             at = int(bad[0][0])
             place = f"{named} {table[named][at].as_py()!r}, row {table['row'][at]}"
             require(STORE, name, values[at], f"{where}: {place}: column")
