@@ -59,7 +59,7 @@ def nuplan(
 ) -> None:
     """Convert scenarios of nuPlan logs (.db) and maps (map.gpkg)."""
     from shiftsim.data.nuplan.convert import convert_nuplan
-    from shiftsim.data.nuplan.mapping import parse_mapping
+    from shiftsim.data.nuplan.scenarios import parse_mapping
     from shiftsim.files import store_path
 
     folder = store_path(store)

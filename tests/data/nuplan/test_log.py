@@ -16,8 +16,14 @@ from shiftsim.data.nuplan.boxes import read_boxes
 from shiftsim.data.nuplan.convert import convert_nuplan
 from shiftsim.data.nuplan.log import open_log, read_ego
 from shiftsim.data.nuplan.map import read_map
-from shiftsim.data.nuplan.mapping import NAMED_TYPES, mapping_of, parse_mapping
-from shiftsim.data.nuplan.scenarios import cut_window, list_scenarios, read_scenario
+from shiftsim.data.nuplan.scenarios import (
+    NAMED_TYPES,
+    cut_window,
+    list_scenarios,
+    mapping_of,
+    parse_mapping,
+    read_scenario,
+)
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError, ConversionError, DataError
 from shiftsim.planners.basic.log_future import LogFuture
