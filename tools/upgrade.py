@@ -23,14 +23,12 @@ from shiftsim.data.store.reading import window_of
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import DataError
 from shiftsim.files import store_path
-from shiftsim.runs.folder import WRITE_OPTIONS
+from shiftsim.runs.filter import RESULTS, SCHEMA
 from shiftsim.runs.results import FORMAT_VERSION, Run
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.rollouts.columns import COMMAND_COLUMNS, NOISE_COLUMNS, rollout_rows
 from shiftsim.runs.rollouts.files import FOLDER, PartWriter
 from shiftsim.runs.scenarios import open_run_store
-from shiftsim.runs.verdicts import SCHEMA as VERDICTS_SCHEMA
-from shiftsim.runs.verdicts import VERDICTS
 from shiftsim.sim.log import NUM_KEPT, SimulationLog
 from shiftsim.world.layers import Layer, Lists, index_polygons, index_polylines
 from shiftsim.world.map import LAYERS, VectorMap
@@ -86,8 +84,8 @@ def upgrade_store(folder: Path) -> str:
         if path.is_file() and is_overlay and not target.exists():
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, target)
-    if (partial / VERDICTS).is_file():
-        _rename_store_of_verdicts(partial / VERDICTS, content["hash"])
+    if (partial / RESULTS).is_file():
+        _rename_store_of_verdicts(partial / RESULTS, content["hash"])
     shutil.rmtree(folder)
     partial.rename(folder)
     return f"{folder}: {len(scenarios)} scenarios now have format {schema.VERSION}"
@@ -95,7 +93,7 @@ def upgrade_store(folder: Path) -> str:
 
 def _rename_store_of_verdicts(path: Path, store_hash: str) -> None:
     """Verdicts of the filter are of the converted content, too."""
-    table = tables.Table(path, VERDICTS_SCHEMA)
+    table = tables.Table(path, SCHEMA)
     conditions = {**table.footer, "store": store_hash}
     conditions.pop("hash", None)
     text = json.dumps(conditions, sort_keys=True)
@@ -240,7 +238,7 @@ def _rewrite_rollouts(run: Run, store: str | None) -> int:
     writer.close()
     shutil.rmtree(run.path / FOLDER)
     partial.rename(run.path / FOLDER)
-    pq.write_table(pa.Table.from_pylist(rows, tasks.schema), path, **WRITE_OPTIONS)
+    pq.write_table(pa.Table.from_pylist(rows, tasks.schema), path, compression="zstd")
     return len(stored)
 
 
