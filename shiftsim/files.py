@@ -162,9 +162,6 @@ def read_toml(path: Path) -> dict[str, Any]:
         ) from error
 
 
-_IMPORTING: list[str] = []  # modules of the user that are being imported
-
-
 def import_named(module: str) -> ModuleType:
     """A module by its name, or by its file, `folder/name.py`.
 
@@ -173,25 +170,19 @@ def import_named(module: str) -> ModuleType:
 
     Raises:
         ImportError: There is none, it fails, or it ends the process.
-        ConfigError: It starts a run.
     """
     name, folder = (module, Path.cwd()) if not module.endswith(".py") else _module_of(Path(module))
     own = not name.startswith("shiftsim.")
     if own and str(folder) not in sys.path:
         sys.path.append(str(folder))
-    _IMPORTING.append(module)
     try:
         found = import_module(name)
-    except (ImportError, ConfigError):
+    except ImportError:
         raise
-    except SystemExit as error:  # else the command would end as if all were well
-        raise ImportError(f"it leaves with SystemExit: {error.code}", name=name) from error
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         where = place_of(error)
         text = f"{type(error).__name__}: {error}{where and f' ({where})'}"
         raise ImportError(text, name=name) from error
-    finally:
-        _IMPORTING.pop()
     if module.endswith(".py") and not Path(module).samefile(found.__file__ or ""):
         raise ImportError(f"{name!r} is the name of {found.__file__}; rename the file", name=name)
     return found
@@ -205,19 +196,6 @@ def _module_of(file: Path) -> tuple[str, Path]:
     while (folder / "__init__.py").is_file():
         folder, name = folder.parent, f"{folder.name}.{name}"
     return name, folder
-
-
-def require_no_import() -> None:
-    """Refuse to start a run from a module that is being imported for one.
-
-    Raises:
-        ConfigError: There is such a module.
-    """
-    if _IMPORTING:
-        raise ConfigError(
-            f"{_IMPORTING[-1]!r} starts a run while it is imported",
-            hint="put what is to run as a script below: if __name__ == '__main__':",
-        )
 
 
 def place_of(error: BaseException) -> str:

@@ -5,7 +5,6 @@ known here are checked by the constructor; planners, stores and splits are check
 The options of the command line are made from the fields, too.
 """
 
-import json
 import math
 import os
 import tomllib
@@ -186,12 +185,6 @@ def _check(name: str, value: Any, kind: Any, option: Option) -> None:
         good, wanted = _is_a(value, kind), kind.__name__
     if not good:
         raise ConfigError(f"{name} is {value!r}; it must be {wanted}")
-    try:
-        json.dumps(value, ensure_ascii=False, default=str).encode()
-    except UnicodeEncodeError as error:
-        raise ConfigError(
-            f"{name} is {value!r}, which is not text in UTF-8", hint="give it another name"
-        ) from error
     if isinstance(value, tuple) and len(set(value)) != len(value):
         raise ConfigError(
             f"{name} {list(value)!r}: a value is listed twice",
