@@ -17,7 +17,6 @@ from shiftsim.cli import (
     progress_bar,
     say,
     say_json,
-    values,
 )
 
 if TYPE_CHECKING:
@@ -32,9 +31,7 @@ _DATA, PARTIAL = 2, 3
 
 Store = Annotated[
     str,
-    typer.Option(
-        "--store", "-s", help="Name or folder of the store.", autocompletion=values.stores
-    ),
+    typer.Option("--store", "-s", help="Name or folder of the store."),
 ]
 _Window = Annotated[
     float | None, typer.Option(help="Length of a scenario with its history [s]. [18]")

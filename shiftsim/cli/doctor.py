@@ -75,24 +75,6 @@ def doctor(
 
 
 @dataclass(frozen=True)
-class Compiled:
-    """What `compile_kernels` left on disk."""
-
-    folder: str  # where the machine code is
-    files: int  # kernels, one for each combination of types
-    bytes: int  # their size
-    compiled: int  # of the files, those that were not there before
-    seconds: float  # from start to end [s]
-
-    def line(self) -> str:
-        """As text."""
-        return (
-            f"kernels: {self.files} ({self.bytes / 1e6:.1f} MB) in {self.folder}, "
-            f"{self.compiled} of them compiled in {self.seconds:.0f} s"
-        )
-
-
-@dataclass(frozen=True)
 class Diagnosis:
     """What was found."""
 
@@ -105,7 +87,7 @@ class Diagnosis:
     seconds: float  # how long the checks took, compilation included [s]
     cases: int  # reference values compared
     mismatches: tuple[str, ...]  # those that differ, in words
-    kernels: Compiled | None = None  # what was compiled before, where it was asked for
+    kernels: dict[str, Any] | None = None  # of `compile_kernels`, where it was asked for
 
     @property
     def is_well(self) -> bool:
@@ -117,12 +99,16 @@ class Diagnosis:
         packages = "  ".join(f"{name} {version}" for name, version in self.versions.items())
         memory = f"{self.memory / 1e9:.1f} GB memory" if self.memory else "memory unknown"
         equal = self.cases - len(self.mismatches)
+        compiled = (
+            " kernels: {files} ({bytes:.3g} bytes) in {folder}, {compiled} of them compiled in "
+            "{seconds:.0f} s"
+        )
         return [
             f" {packages}",
             f" torch: {self.torch}",
             f" {self.cores} cores, {memory}, suggested workers {self.workers}",
             f" kernel cache: {self.kernel_cache}",
-            *([f" {self.kernels.line()}"] if self.kernels else []),
+            *([compiled.format(**self.kernels)] if self.kernels else []),
             f" reference checks {equal}/{self.cases} equal in {self.seconds:.1f} s",
             *(f" MISMATCH {line}" for line in self.mismatches[:20]),
         ]
@@ -143,7 +129,7 @@ def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
     reports.append(verify(REFERENCE / "dynamics"))
     advance(2, 3, "metrics")
     reports.append(verify(REFERENCE / "metric_worlds"))
-    advance(3, 3, "")
+    advance(3, 3)
     return Diagnosis(
         versions=versions(),
         torch=torch,
@@ -175,8 +161,8 @@ def _torch() -> str:
     return f"{torch.__version__}, CUDA {torch.version.cuda}: {', '.join(names)}"
 
 
-def compile_kernels(advance: Advance) -> Compiled:
-    """Make small runs that together use every kernel of a run.
+def compile_kernels(advance: Advance) -> dict[str, Any]:
+    """Make small runs that together use every kernel of a run; what is on disk then.
 
     Raises:
         ShiftsimError: A run failed.
@@ -193,15 +179,15 @@ def compile_kernels(advance: Advance) -> Compiled:
             advance(number, len(runs), f"{', '.join(planners)} in {settings['traffic']} traffic")
             settings |= {"store": str(store), "split": "demo-mini", "limit": 6, "workers": 1}
             run(planners, noise="ou-high", out=f"{folder}/run-{number}", **settings)
-        advance(len(runs), len(runs), "")
+        advance(len(runs), len(runs))
     files = machine_code()
-    return Compiled(
-        folder=CACHE_FOLDER,
-        files=len(files),
-        bytes=sum(path.stat().st_size for path in files),
-        compiled=len(files) - before,
-        seconds=perf_counter() - began,
-    )
+    return {
+        "folder": CACHE_FOLDER,
+        "files": len(files),
+        "bytes": sum(path.stat().st_size for path in files),
+        "compiled": len(files) - before,
+        "seconds": perf_counter() - began,
+    }
 
 
 def _compiling_runs() -> Iterator[tuple[Sequence[str], dict[str, Any]]]:

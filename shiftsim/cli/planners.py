@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from shiftsim.cli import Debug, Json, new_app, plural, say, say_json, show, stdout_to_stderr, values
+from shiftsim.cli import Debug, Json, new_app, plural, say, say_json, show, stdout_to_stderr
 
 _USAGE = 1
 app = new_app("Planners: what there is, and does mine obey the contract.")
@@ -61,7 +61,6 @@ def check_one_planner(
         str,
         typer.Argument(
             help="Name, ./file.py:Class or package.module:Class.",
-            autocompletion=values.planners,
         ),
     ],
     planner_arg: Annotated[
@@ -69,7 +68,7 @@ def check_one_planner(
     ] = None,
     store: Annotated[
         str,
-        typer.Option(help="Store with scenarios to try it on.", autocompletion=values.stores),
+        typer.Option(help="Store with scenarios to try it on."),
     ] = "demo",
     token: Annotated[str | None, typer.Option(help="Scenario. [the first]")] = None,
     as_json: Json = False,

@@ -94,7 +94,7 @@ def report(
         say(f"{plural(len(files), 'file')} in {out}: {', '.join(path.name for path in files)}")
     if site is not None:
         with progress_bar(quiet=quiet) as advance:
-            _write_pages(site, title, opened, tables, drawn, lambda i, n: advance(i, n, ""))
+            _write_pages(site, title, opened, tables, drawn, advance)
         say(f"written: {site / 'index.html'}")
     if out is not None or site is not None:
         return

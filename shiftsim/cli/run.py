@@ -330,7 +330,7 @@ def score(
         finished = rescore(
             run,
             **{"thresholds": run.manifest["config"]["thresholds"], **settings},
-            on_progress=lambda progress: advance(progress.done, progress.total, ""),
+            on_progress=lambda progress: advance(progress.done, progress.total),
             argv=sys.argv,
         )
     leave_with(finished, allow_partial=allow_partial, as_json=as_json)
@@ -426,9 +426,7 @@ def _make_towns(
         write_towns(folder, towns=towns, seed=seed, spread=spread, progress=advance)
     say("driving every scenario as recorded, to leave out those that cannot be driven so")
     with progress_bar(quiet=quiet) as advance:
-        found = filter_store(
-            folder, workers=workers, on_progress=lambda done, total: advance(done, total, "")
-        )
+        found = filter_store(folder, workers=workers, on_progress=advance)
     counts = found.counts()
     say(f" {counts['accepted']} of {plural(len(found.rows), 'scenario')} accepted → {folder}")
     say(f" next: shiftsim run --planner log-future --store {folder} --limit 20")

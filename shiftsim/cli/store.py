@@ -15,7 +15,6 @@ from shiftsim.cli import (
     progress_bar,
     say,
     say_json,
-    values,
 )
 
 if TYPE_CHECKING:
@@ -31,7 +30,7 @@ export = new_app("Write scenarios in the formats of others.", no_args_is_help=Tr
 
 Store = Annotated[
     str,
-    typer.Argument(metavar="STORE", help="Store, by name or folder.", autocompletion=values.stores),
+    typer.Argument(metavar="STORE", help="Store, by name or folder."),
 ]
 
 
@@ -124,7 +123,7 @@ def filter_scenarios(
             folder,
             config,
             workers=settings.get("workers", 0),
-            on_progress=lambda done, total: advance(done, total, ""),
+            on_progress=advance,
         )
     if as_json:
         say_json({"config": found.config, "counts": found.counts(), "verdicts": found.rows})
@@ -293,7 +292,7 @@ def show_stats(
     tokens = _chosen(opened, settings)
     with progress_bar(quiet=quiet or as_json) as advance:
         found = store_stats(
-            opened, tokens, progress=lambda done, total, token: advance(done, total, "")
+            opened, tokens, progress=lambda done, total, token: advance(done, total)
         )
     text = stats_table(found, by=by, style=style)
     if figure is not None:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from shiftsim.cli import Debug, Json, Quiet, new_app, say, show, values
+from shiftsim.cli import Debug, Json, Quiet, new_app, say, show
 
 app = new_app("Train networks.")
 
@@ -15,14 +15,11 @@ app = new_app("Train networks.")
 @app.command()
 def carl(
     out: Annotated[Path, typer.Option(help="Folder for networks, curves and what was collected.")],
-    store: Annotated[
-        str, typer.Option(help="Store by name, path or URL.", autocompletion=values.stores)
-    ] = "demo",
+    store: Annotated[str, typer.Option(help="Store by name, path or URL.")] = "demo",
     split: Annotated[
         str,
         typer.Option(
             help="Split of the store; all its scenarios if empty.",
-            autocompletion=values.splits,
         ),
     ] = "",
     checkpoint: Annotated[

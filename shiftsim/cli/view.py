@@ -69,7 +69,7 @@ def view(
                 found,
                 title=f"Replays of {run.name}",
                 limit=limit,
-                on_progress=lambda done, total: advance(done, total, ""),
+                on_progress=advance,
             )
         left = sum(len(gallery.tokens) for gallery in found) - count
         say(f"{plural(count, 'replay')}{f', {left} more with --limit 0' if left else ''}")

@@ -60,7 +60,7 @@ def test_a_planner_that_leaves_fails_its_task(toy, tmp_path, error, method):
 @pytest.mark.parametrize(
     ("place", "code", "text"),
     [
-        (0, 1, "cannot be imported: SystemExit: 0"),
+        (0, 1, "cannot be imported (SystemExit: 0"),
         (1, 1, "cannot be made: SystemExit: 0"),
         (2, 0, "results: run"),
     ],
