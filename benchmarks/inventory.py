@@ -32,7 +32,7 @@ def list_available_data() -> Row:
     Returns:
         `store_folder` and `stores`: each with `name`, `path`, `maps` (cities), `problem` (why it
         cannot be opened) and `sets` (the whole store first, then splits: `name`, `scenarios`, and
-        the `known` list that it is); `checkpoint_folder` and `checkpoints`: what each planner lacks,
+        the `known` list that it is); `checkpoint_folder` and `checkpoints`: what a planner lacks,
         or empty; `rows`: a `planner` of a `track`, the set that is its published list (`reference`,
         "–" where it has none), sets of `own` scenarios, and what is `missing`: `what`, the command
         to `get` it, and the `page` of the documentation.
