@@ -16,8 +16,8 @@ from shiftsim.metrics.result import MetricRow, Statistic
 from shiftsim.metrics.route import EdgeLists, driven_route
 from shiftsim.metrics.score import MULTIPLIERS, WEIGHTS, MetricResult
 from shiftsim.sim.log import SimulationLog
+from shiftsim.world.events import RolloutEvents
 from shiftsim.world.map import NONE, VectorMap
-from shiftsim.world.script import RolloutEvents
 from shiftsim.world.state import center_poses
 
 LANES = "lane_changes_to_goal"
@@ -180,6 +180,11 @@ def simplified(route: EdgeLists) -> list[list[int]]:
         if edges and (not out or set(edges).isdisjoint(out[-1])):
             out.append(edges)
     return out
+
+
+def driven_lanes(road: VectorMap, centers: FloatArray) -> list[int]:
+    """The first edge of each stretch that box centres (K, 3) were on, as nuPlan simplifies it."""
+    return [edges[0] for edges in simplified(driven_route(road, centers))]
 
 
 def changes_between(road: VectorMap, lane: int, goal: int) -> int | None:

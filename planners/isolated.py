@@ -143,6 +143,6 @@ class Isolated:
 def at_home(hello: Mapping[str, Any]) -> tuple[Any, dict[str, Any], dict[str, Any]]:
     """In the child: what makes planners, the classes of what they are given, and a fingerprint."""
     spec, arguments = hello["spec"], hello["arguments"]
-    original = PlannerPrototype(lambda: load_planner(spec, arguments))
+    prototype = PlannerPrototype(lambda: load_planner(spec, arguments))
     classes = {kind.__name__: kind for kind in _GIVEN}
-    return original.copy, classes, planner_fingerprint(spec, arguments)
+    return prototype.copy, classes, planner_fingerprint(spec, arguments)

@@ -73,7 +73,7 @@ def planner_factory(spec: str) -> Any:
 
     Raises:
         ConfigError: There is none.
-        MissingExtraError: It needs more of nuPlan's devkit than its stand-ins have.
+        MissingExtraError: It needs more of nuPlan's devkit than its shims have.
     """
     for prefix, adapter in _ADAPTERS.items():
         if spec.startswith(prefix):

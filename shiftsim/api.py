@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import shiftsim.edits  # noqa: F401  # attaches Scenario.edited
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.planners import registry
 from shiftsim.runs import results

@@ -49,8 +49,7 @@ def checkpoint_folder() -> Path:
 def user_cache(part: str) -> Path:
     """Folder of what is kept to save time, below `SHIFTSIM_CACHE` (`~/.cache/shiftsim`).
 
-    `stores` are files copied from stores behind a URL, `maps` are maps as they are in memory,
-    `kernels` are compiled kernels.
+    `stores` are files copied from stores behind a URL, `kernels` are compiled kernels.
     """
     return Path(os.environ.get("SHIFTSIM_CACHE", "~/.cache/shiftsim")).expanduser() / part
 

@@ -52,7 +52,6 @@ TESTS_OF = {
     "shiftsim.sim.loop": (
         "sim/test_plan_check.py",
         "sim/test_lock_step.py",
-        "sim/test_drive_on.py",
     ),
 }
 Name = tuple[str, str]  # a module and a top-level name of it

@@ -1,6 +1,6 @@
 """Writes a demo town and its traffic as the files of open data sets, for tests.
 
-`demo_content` gives plain values; `data/readers/open_data/write_py123d.py` hands them to py123d.
+`demo_content` gives plain values; `data/readers/write_py123d.py` hands them to py123d.
 """
 
 import json
@@ -19,9 +19,9 @@ from shiftsim.data.demo.scenes import demo_sites, traffic_of
 from shiftsim.data.demo.traffic import DT
 from shiftsim.data.maps.opendrive.map import build_road_map
 from shiftsim.data.maps.opendrive.reading import parse_opendrive
-from shiftsim.data.readers.open_data.av2 import Av2Reader
-from shiftsim.data.readers.open_data.commonroad import CommonRoadReader
-from shiftsim.data.readers.open_data.py123d import Py123dReader
+from shiftsim.data.readers.av2 import Av2Reader
+from shiftsim.data.readers.commonroad import CommonRoadReader
+from shiftsim.data.readers.py123d import Py123dReader
 
 AV2_NAME = "00000000-aaaa-bbbb-cccc-000000000001"
 START_US = 1_900_000_000_000_000

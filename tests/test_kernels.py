@@ -23,8 +23,8 @@ from numba.core.runtime import _nrt_python, rtsys
 from track_files import export_town, write_tracks
 from worlds import cruise_scenario
 
-from shiftsim.data.readers.deepplan.convert import convert_dsc3d
-from shiftsim.data.readers.tracks.convert import convert_tracks, look_at
+from shiftsim.data.readers.dsc3d import convert_dsc3d
+from shiftsim.data.readers.tracks.inspection import convert_tracks, inspect_tracks
 from shiftsim.data.recording import visible_columns
 from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import ScenarioStore
@@ -101,7 +101,7 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
 
     def convert_table() -> None:
         shutil.rmtree(folder / "own", ignore_errors=True)
-        convert_tracks(look_at(table, town[1], city="roundabout"), folder / "own")
+        convert_tracks(inspect_tracks(table, town[1], city="roundabout"), folder / "own")
         check_store(folder / "own")
 
     def drive_edited() -> None:

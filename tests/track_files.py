@@ -7,7 +7,8 @@ import pyarrow as pa
 import pyarrow.csv as pc
 
 from shiftsim.data.demo.files import write_demo
-from shiftsim.data.readers.dsc3d.recording import find_map, open_site, read_recording
+from shiftsim.data.readers.annotations import read_recording
+from shiftsim.data.readers.dsc3d import find_map, open_site
 
 
 def export_town(folder: Path, town: str):

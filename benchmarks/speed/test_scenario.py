@@ -9,6 +9,7 @@ from time import process_time
 
 import numpy as np
 import pytest
+from parity_cases import Scenes
 
 from shiftsim.data.demo.store import bench_scene
 from shiftsim.data.recording import EgoTrace, Recording, Window
@@ -23,7 +24,6 @@ from shiftsim.sim import loop
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.noise import parse_noise
 from shiftsim.sim.planner import HISTORY_SAMPLES, History, Observation, ObservationBuilder
-from shiftsim.verify.files import Scenes
 
 GOLDEN = Path(__file__).resolve().parents[2] / "tests" / "golden" / "nuplan.tar.xz"
 WHOLE_TARGET, SEALING_TARGET = 25e-3, 1e-6  # s
@@ -98,14 +98,13 @@ class PlainSight(ObservationBuilder):
     """Shows views of the rows of the rollout, writable as they are: what costs least to write."""
 
     def __init__(self, *arrays):
-        super().__init__(*arrays)  # takes its time once per rollout
         self._plain = arrays
 
     def at(self, iteration, row):
         time_us, ego, tracks, lights = self._plain
         past = slice(row + 1 - HISTORY_SAMPLES if row >= HISTORY_SAMPLES else 0, row + 1)
         history = History(time_us[past], ego[past], tracks.rows(past))
-        return Observation(iteration, self._times[row], history, lights.rows(slice(row, row + 1)))
+        return Observation(iteration, int(time_us[row]), history, lights.rows(slice(row, row + 1)))
 
 
 @pytest.mark.parametrize("agents", [10, 100, 300])

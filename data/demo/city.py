@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.data.readers.deepplan.states import ego_states
-from shiftsim.data.readers.deepplan.windows import ROW_S
+from shiftsim.data.readers.samples import ROW_S, ego_states
 from shiftsim.kernels import FloatArray
 from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
 from shiftsim.world.map import VectorMap

@@ -12,7 +12,8 @@ import numpy as np
 
 from shiftsim.data.demo.city import bench_scene
 from shiftsim.data.demo.files import write_demo
-from shiftsim.data.readers.deepplan.convert import ConversionReport, convert_dsc3d
+from shiftsim.data.readers.convert import ConversionReport
+from shiftsim.data.readers.dsc3d import convert_dsc3d
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.data.store.writing import StoreWriter
 

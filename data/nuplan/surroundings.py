@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from shiftsim.data.nuplan.scenarios import FUTURE_ROWS, PAST_ROWS
-from shiftsim.data.readers.deepplan.states import ego_states as states_of
+from shiftsim.data.readers.samples import ego_states as states_of
 from shiftsim.data.recording import EgoTrace, Recording, scenario
 from shiftsim.data.store.reading import ScenarioStore
-from shiftsim.data.store.tracks import ego_span, ego_states
+from shiftsim.data.store.recordings import ego_span, ego_states
 from shiftsim.kernels import FloatArray
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import NUM_STATE

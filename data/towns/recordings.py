@@ -16,12 +16,11 @@ import numpy as np
 from shiftsim.data.demo.files import write_site
 from shiftsim.data.demo.lights import Lights
 from shiftsim.data.demo.scenes import DemoSite, Scene
-from shiftsim.data.readers.deepplan.convert import convert_dsc3d
-from shiftsim.data.readers.deepplan.windows import ROW_S, ConversionConfig
+from shiftsim.data.readers.dsc3d import convert_dsc3d
+from shiftsim.data.readers.samples import ROW_S
+from shiftsim.data.readers.windows import ConversionConfig
 from shiftsim.data.recording import Window
 from shiftsim.data.store.reading import ScenarioStore
-from shiftsim.data.store.tables import recording_folder
-from shiftsim.data.store.tracks import open_recording
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.data.towns.layouts import KINDS, Place, random_place
 from shiftsim.data.towns.people import random_traffic
@@ -85,7 +84,7 @@ def _make(name: str, rng: np.random.Generator, source: Path, store: Path) -> int
     write_site(source, site, place.town, [random_traffic(place, rng, _DURATION)])
     config = ConversionConfig(overlap_s=_OVERLAP)
     report = convert_dsc3d(source, store, site=name, options=config)
-    if place.lights:
+    if place.lights and report.accepted:
         _add_lights(store, f"{name}_{scene.name}", place, np.array(offset[:2]))
     return len(usable(ScenarioStore(store))) if report.accepted else 0
 
@@ -100,7 +99,7 @@ def _add_lights(store: Path, recording: str, place: Place, offset: FloatArray) -
     """Write what the traffic lights showed into a recording."""
     opened = ScenarioStore(store)
     road = opened.map(place.town.name)
-    stored = open_recording(recording_folder(store, recording))
+    stored = opened.recording(recording)
     found = stored.read(0, stored.num_rows)
     seconds = (np.arange(stored.num_rows) * ROW_S).tolist()
     names, columns = [], []

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from shiftsim.data.readers.deepplan.convert import Spread
+from shiftsim.data.readers.convert import Executor
 from shiftsim.data.store.reading import ScenarioStore, read_report
 from shiftsim.data.store.tables import MANIFEST
 from shiftsim.data.store.writing import StoreWriter, window_row
@@ -22,7 +22,7 @@ def write_towns(
     *,
     towns: int,
     seed: int,
-    spread: Spread,
+    spread: Executor,
     progress: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> ScenarioStore:
     """A store of random towns, the same bytes for the same number and seed.

@@ -5,19 +5,18 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.geometry.boxes import box_corners, circle_around, wrap_angle
-from shiftsim.geometry.rings import centroid, ring_bounds
+from shiftsim.geometry.boxes import box_corners, wrap_angle
+from shiftsim.geometry.rings import centroid
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.pdm.parameters import PdmParameters
 from shiftsim.planners.proposals.areas import index_ranks
-from shiftsim.planners.proposals.contacts import Obstacles, touches_box
-from shiftsim.planners.proposals.places import EgoBox
+from shiftsim.planners.proposals.contacts import Obstacles, touches_boxes
+from shiftsim.planners.proposals.places import EgoBox, ego_corners
 from shiftsim.planners.proposals.tracker import STEPS
 from shiftsim.planners.routes.lights import RedLights
-from shiftsim.world.state import HEADING, LAST_AGENT_KIND, Tracks, X, Y
+from shiftsim.world.state import LAST_AGENT_KIND, Tracks
 
 LIGHT_TOKEN = "red_light_"
-_TIED = -1
 NUM_FORECASTS = STEPS // 2 + 1  # nuPlan rule 188: every other time index has a map of its own
 
 
@@ -32,27 +31,21 @@ class Forecast(NamedTuple):
     light_xy: FloatArray  # (V, 2) vertices of the red connectors, not closed [m]
     light_ptr: IntArray  # (lights + 1,) first vertex of each
     light_bounds: FloatArray  # (lights, 4) min x, min y, max x, max y of each [m]
-    light_runs: FloatArray  # (R, 4) likewise of runs of edges, as in `RedLights`
-    light_run_ptr: IntArray  # (lights + 1,) first run of each
 
 
 def select_tracks(
     tracks: Tracks, x: float, y: float, collided: set[str], params: PdmParameters
 ) -> IntArray:
     """Tracks of the last row that are seen from the ego centre, in nuPlan's order."""
-    seen, poses, kinds = tracks.valid[-1].copy(), tracks.poses[-1].copy(), tracks.kinds.copy()
-    if collided:
-        seen &= np.array([token not in collided for token in tracks.tokens], np.bool_)
-    most = params.max_static, params.max_vehicles, params.max_pedestrians, params.max_bicycles
-    chosen, distance = np.empty(len(seen), np.int64), np.empty(len(seen))
-    count = _select(seen, poses, kinds, x, y, params.map_radius, most, distance, chosen)
-    if count != _TIED:
-        return chosen[:count]
+    poses, kinds = tracks.poses[-1], tracks.kinds
     distance = np.hypot(poses[:, 0] - x, poses[:, 1] - y)
-    near = np.flatnonzero(seen & ~(distance > params.map_radius))
+    near = np.flatnonzero(tracks.valid[-1] & ~(distance > params.map_radius))
+    if collided:
+        near = near[[tracks.tokens[i] not in collided for i in near.tolist()]]
     near = near[np.argsort(kinds[near], kind="stable")]
     groups = [near[kinds[near] > LAST_AGENT_KIND]]
     groups += [near[kinds[near] == kind] for kind in range(LAST_AGENT_KIND + 1)]
+    most = params.max_static, params.max_vehicles, params.max_pedestrians, params.max_bicycles
     # nuPlan rule 189: NumPy's default sort, which is not stable
     return np.concatenate(
         [
@@ -60,41 +53,6 @@ def select_tracks(
             for group, first in zip(groups, most, strict=True)
         ]
     )
-
-
-@kernel
-def _select(
-    seen: BoolArray,
-    poses: FloatArray,
-    kinds: IntArray,
-    x: float,
-    y: float,
-    radius: float,
-    most: tuple[int, int, int, int],
-    distances: FloatArray,  # (N,) scratch
-    chosen: IntArray,  # (N,) receives them
-) -> int:
-    """Select tracks, static ones first; how many, or _TIED where two are equally far."""
-    count = 0
-    for group in range(len(most)):
-        begin = count
-        for index in range(len(seen)):
-            of = 0 if kinds[index] > LAST_AGENT_KIND else kinds[index] + 1
-            if of != group or not seen[index]:
-                continue
-            distance = np.hypot(poses[index, 0] - x, poses[index, 1] - y)
-            if distance > radius:
-                continue
-            place = count
-            while place > begin and distances[place - 1] > distance:
-                distances[place], chosen[place] = distances[place - 1], chosen[place - 1]
-                place -= 1
-            if place > begin and distances[place - 1] == distance:
-                return _TIED
-            distances[place], chosen[place] = distance, index
-            count += 1
-        count = min(count, begin + most[group])
-    return count
 
 
 def make_forecast(tracks: Tracks, chosen: IntArray, lights: RedLights) -> Forecast:
@@ -111,7 +69,7 @@ def make_forecast(tracks: Tracks, chosen: IntArray, lights: RedLights) -> Foreca
         is_agent=np.empty(count, np.bool_),
         ignored=ignored[:count],
     )
-    made = Forecast(
+    forecast = Forecast(
         others,
         np.empty(count, np.bool_),
         np.empty(count),
@@ -119,12 +77,10 @@ def make_forecast(tracks: Tracks, chosen: IntArray, lights: RedLights) -> Foreca
         lights.xy,
         lights.ptr,
         lights.bounds,
-        lights.runs,
-        lights.run_ptr,
     )
     now = (array[-1].copy() for array in (tracks.poses, tracks.velocities, tracks.sizes))
-    _forecast(chosen, tracks.kinds.copy(), *now, made)
-    return made
+    _forecast(chosen, tracks.kinds.copy(), *now, forecast)
+    return forecast
 
 
 @kernel
@@ -175,52 +131,17 @@ def touched(forecast: Forecast, ego: FloatArray, size: EgoBox) -> list[int]:
 
     A red light counts only once the ego is entirely on its connector.
     """
-    boxes, found = forecast.others.boxes, np.empty(len(forecast.ignored), np.int64)
-    footprint = np.empty((4, 2))
-    count = _touched(ego, size, boxes, forecast.light_bounds, footprint, found)
-    chosen = [
-        index
-        for index in found[:count].tolist()
-        if index < boxes.shape[1]
-        or shapely.Polygon(footprint).within(shapely.Polygon(ring_of(forecast, index)))
-    ]
-    if len(chosen) > 1:
-        ranks = forecast_ranks(forecast, 0)
-        chosen.sort(key=lambda i: int(ranks[i]))
-    return chosen
-
-
-@kernel
-def _touched(
-    ego: FloatArray,
-    size: EgoBox,
-    boxes: FloatArray,
-    light_bounds: FloatArray,
-    footprint: FloatArray,  # (4, 2) receives the ego's
-    found: IntArray,  # (M,) receives them
-) -> int:
-    """Find boxes that touch the ego, and lights whose bounds hold it; how many."""
-    heading, count = ego[HEADING], 0
-    x = ego[X] + size.rear_axle_to_center * np.cos(heading)
-    y = ego[Y] + size.rear_axle_to_center * np.sin(heading)
-    box_corners(x, y, heading, size.length, size.width, footprint)
-    circle = circle_around(footprint)
-    for index in range(boxes.shape[1]):
-        if touches_box(footprint, circle, boxes[0, index]):
-            found[count] = index
-            count += 1
-    low_x, low_y, high_x, high_y = ring_bounds(footprint)
-    for light in range(len(light_bounds)):
-        bounds = light_bounds[light]
-        if (
-            bounds[0] <= low_x
-            and bounds[1] <= low_y
-            and bounds[2] >= high_x
-            and bounds[3] >= high_y
-        ):
-            found[count] = boxes.shape[1] + light
-            count += 1
-    return count
+    boxes, bounds, footprint = forecast.others.boxes[0], forecast.light_bounds, np.empty((4, 2))
+    ego_corners(ego, size, footprint)
+    found = np.flatnonzero(touches_boxes(footprint, boxes)).tolist()
+    low, high = footprint.min(axis=0), footprint.max(axis=0)
+    holds = (bounds[:, :2] <= low).all(axis=1) & (bounds[:, 2:] >= high).all(axis=1)
+    for index in (len(boxes) + np.flatnonzero(holds)).tolist():
+        if shapely.Polygon(footprint).within(shapely.Polygon(ring_of(forecast, index))):
+            found.append(index)
+    if len(found) > 1:
+        found.sort(key=forecast_ranks(forecast, 0).__getitem__)
+    return found
 
 
 def ring_of(forecast: Forecast, index: int, row: int = 0) -> FloatArray:

@@ -8,13 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.geometry.boxes import box_corners
+from shiftsim.geometry.rings import ring_bounds
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.planners.proposals.areas import Areas, ScanlineIndex, held_points
-from shiftsim.world.state import HEADING, VehicleParameters, X, Y
+from shiftsim.planners.proposals.areas import Areas, held_points
+from shiftsim.world.state import VehicleParameters, X, Y
 
 MULTIPLE, OFF_ROAD, OFF_ROUTE = 0, 1, 2  # flags of a pose
-_ALL_CORNERS, _WHOLE = 0b1111, 0b11111  # corners on some area; all of them on one
-_MIDDLE = 0b10000  # the point that decides whether the ego is on the route
+_ALL_CORNERS, _MIDDLE = 0b1111, 0b10000  # bits of the points of a pose
 
 
 class EgoBox(NamedTuple):
@@ -46,20 +46,13 @@ def find_places(
     size: EgoBox,
     areas: Areas,  # all areas of the map
     selected: IntArray,  # those of this step
-    limits: FloatArray,  # (M,) speed limits of all areas, or none of them [m/s]
+    limits: FloatArray,  # (M,) speed limits of all areas [m/s]
     *,
     by_center: bool,  # whether the ego is on the route where its centre is, not its rear axle
 ) -> ProposalStates:
     """ProposalStates of driven states (P, T, 11)."""
-    at, near = empty_places(states), np.empty_like(selected)
-    find(areas.slabs, areas.on_route, selected, limits, by_center, size, near, at)
-    return at
-
-
-def empty_places(states: FloatArray) -> ProposalStates:
-    """Driven states (P, T, 11) and arrays for their places."""
     shape = states.shape[:2]
-    return ProposalStates(
+    places = ProposalStates(
         states,
         np.empty((*shape, 4, 2)),
         np.empty((*shape, 2)),
@@ -67,111 +60,98 @@ def empty_places(states: FloatArray) -> ProposalStates:
         np.empty(shape, np.bool_),
         np.empty(shape),
     )
+    _locate(areas, selected, limits, by_center, size, places)
+    return places
 
 
 @kernel
-def find(
-    slabs: ScanlineIndex,
-    on_route: BoolArray,
+def ego_corners(pose: FloatArray, size: EgoBox, out: FloatArray) -> tuple[float, float]:
+    """Write the corners (4, 2) of the ego at a rear axle x, y, heading; the centre of its box."""
+    x = pose[0] + size.rear_axle_to_center * np.cos(pose[2])
+    y = pose[1] + size.rear_axle_to_center * np.sin(pose[2])
+    box_corners(x, y, pose[2], size.length, size.width, out)
+    return x, y
+
+
+@kernel
+def _locate(
+    areas: Areas,
     selected: IntArray,
     limits: FloatArray,
     by_center: bool,
     size: EgoBox,
-    near: IntArray,  # (M,) scratch
-    at: ProposalStates,  # the states are there
+    places: ProposalStates,  # the states are there
 ) -> None:
-    """Fill in the places."""
-    bounds, flags = slabs.bounds, at.flags
-    num_near, highest = _place_ego(at, size, bounds, selected, near), 0.0
-    has_limits = len(limits) > 0
-    for entry in range(num_near if has_limits else 0):
-        highest = max(highest, limits[near[entry]])
+    """Fill in boxes, flags and speed limits."""
+    polygons, bounds, run_ptr, runs = (
+        areas.polygons,
+        areas.polygons.bounds,
+        areas.run_ptr,
+        areas.runs,
+    )
     points = np.empty((5, 2))  # corners of the ego, and what decides whether it is on the route
-    guess = -1  # the area that held the whole ego last is tried first
-    for row in range(len(flags)):
-        for step in range(flags.shape[1]):
-            box = at.corners[row, step]
-            for corner in range(4):
-                points[corner, 0], points[corner, 1] = box[corner, 0], box[corner, 1]
-            if by_center:
-                points[4, 0], points[4, 1] = at.centers[row, step, 0], at.centers[row, step, 1]
-            else:
-                points[4, 0], points[4, 1] = at.states[row, step, X], at.states[row, step, Y]
-            low_x = min(box[0, 0], box[1, 0], box[2, 0], box[3, 0])
-            low_y = min(box[0, 1], box[1, 1], box[2, 1], box[3, 1])
-            high_x = max(box[0, 0], box[1, 0], box[2, 0], box[3, 0])
-            high_y = max(box[0, 1], box[1, 1], box[2, 1], box[3, 1])
-            num_touched, held, is_on_route, limit = 0, 0, False, 0.0
-            for entry in range(-1, num_near):
-                area = guess if entry < 0 else near[entry]
-                if area < 0 or (entry >= 0 and area == guess):
-                    continue
-                is_known = is_on_route and limit >= highest
-                if held == _WHOLE and is_known:
-                    break
-                if not (
-                    low_x <= bounds[area, 2]
-                    and high_x >= bounds[area, 0]
-                    and low_y <= bounds[area, 3]
-                    and high_y >= bounds[area, 1]
-                ):
-                    continue
-                is_settled = held == _WHOLE or (
-                    num_touched > 1
-                    and held == _ALL_CORNERS  # only an area that holds the box changes anything
-                    and not (
-                        bounds[area, 0] <= low_x
-                        and bounds[area, 2] >= high_x
-                        and bounds[area, 1] <= low_y
-                        and bounds[area, 3] >= high_y
-                    )
-                )
-                if is_settled and is_known:
-                    continue
-                first, stop = 4 if is_settled else 0, 4 if is_known else 5
-                within = held_points(slabs, area, points, first, stop)[0]
-                if within & _MIDDLE != 0:
-                    limit = max(limit, limits[area]) if has_limits else limit
-                    is_on_route = is_on_route or on_route[area]
-                within &= _ALL_CORNERS
-                if within == _ALL_CORNERS:
-                    held, guess = _WHOLE, area
-                elif within > 0:
-                    held |= within
-                    num_touched += 1
-            flags[row, step, MULTIPLE] = num_touched > 1 and held != _WHOLE
-            flags[row, step, OFF_ROAD] = held != _WHOLE and held != _ALL_CORNERS
-            flags[row, step, OFF_ROUTE] = not is_on_route
-            at.off_lane[row, step] = flags[row, step, MULTIPLE] or flags[row, step, OFF_ROAD]
-            at.speed_limits[row, step] = limit
-
-
-@kernel
-def _place_ego(
-    at: ProposalStates, size: EgoBox, bounds: FloatArray, selected: IntArray, near: IntArray
-) -> int:
-    """Write corners and centres, and which of the selected areas may be met; how many they are."""
-    low_x = low_y = np.inf
-    high_x = high_y = -np.inf
-    for row in range(at.states.shape[0]):
-        for step in range(at.states.shape[1]):
-            heading = at.states[row, step, HEADING]
-            x = at.states[row, step, X] + size.rear_axle_to_center * np.cos(heading)
-            y = at.states[row, step, Y] + size.rear_axle_to_center * np.sin(heading)
-            at.centers[row, step, 0], at.centers[row, step, 1] = x, y
-            corners = at.corners[row, step]
-            box_corners(x, y, heading, size.length, size.width, corners)
-            for corner in range(4):
-                low_x, high_x = min(low_x, corners[corner, 0]), max(high_x, corners[corner, 0])
-                low_y, high_y = min(low_y, corners[corner, 1]), max(high_y, corners[corner, 1])
-    count = 0
+    for row in range(places.states.shape[0]):
+        for step in range(places.states.shape[1]):
+            x, y = ego_corners(places.states[row, step], size, places.corners[row, step])
+            places.centers[row, step, 0], places.centers[row, step, 1] = x, y
+    low_x, low_y, high_x, high_y = ring_bounds(places.corners.reshape(-1, 2))
+    near, num_near, highest, latest = np.empty_like(selected), 0, 0.0, -1
     for area in selected:
         if (
             bounds[area, 0] <= high_x
-            and bounds[area, 2] >= low_x
             and bounds[area, 1] <= high_y
+            and bounds[area, 2] >= low_x
             and bounds[area, 3] >= low_y
         ):
-            near[count] = area
-            count += 1
-    return count
+            near[num_near] = area
+            num_near, highest = num_near + 1, max(highest, limits[area])
+    for row in range(places.states.shape[0]):
+        for step in range(places.states.shape[1]):
+            box = places.corners[row, step]
+            low_x, low_y, high_x, high_y = ring_bounds(box)
+            for corner in range(4):
+                points[corner, 0], points[corner, 1] = box[corner, 0], box[corner, 1]
+            points[4, 0], points[4, 1] = places.states[row, step, X], places.states[row, step, Y]
+            if by_center:
+                points[4, 0] = places.centers[row, step, 0]
+                points[4, 1] = places.centers[row, step, 1]
+            num_touched, held, is_whole, is_on_route, limit = 0, 0, False, False, 0.0
+            for entry in range(-1, num_near):
+                # the area that held the whole ego last probably holds it again
+                area = latest if entry < 0 else near[entry]
+                if area < 0 or (entry >= 0 and area == latest):
+                    continue
+                is_known = is_on_route and limit >= highest
+                if is_whole and is_known:
+                    break
+                if (
+                    bounds[area, 0] > high_x
+                    or bounds[area, 1] > high_y
+                    or bounds[area, 2] < low_x
+                    or bounds[area, 3] < low_y
+                ):
+                    continue
+                if num_touched > 1 and held == _ALL_CORNERS and is_known:
+                    # only an area that holds the whole ego changes anything
+                    if low_x < bounds[area, 0] or low_y < bounds[area, 1]:
+                        continue
+                    if high_x > bounds[area, 2] or high_y > bounds[area, 3]:
+                        continue
+                within = held_points(polygons, run_ptr, runs, area, points)
+                if within & _MIDDLE:
+                    limit, is_on_route = (
+                        max(limit, limits[area]),
+                        is_on_route or areas.on_route[area],
+                    )
+                within &= _ALL_CORNERS
+                if within == _ALL_CORNERS:
+                    is_whole, latest = True, area
+                elif within > 0:
+                    held |= within
+                    num_touched += 1
+            flags = places.flags[row, step]
+            flags[MULTIPLE] = num_touched > 1 and not is_whole
+            flags[OFF_ROAD] = held != _ALL_CORNERS and not is_whole
+            flags[OFF_ROUTE] = not is_on_route
+            places.off_lane[row, step] = flags[MULTIPLE] or flags[OFF_ROAD]
+            places.speed_limits[row, step] = limit

@@ -228,7 +228,7 @@ _COMMANDS = {
     "split": "store:make_split",
     "edits": "edits:app",
     "planners": "planners:app",
-    "convert": "open_data:app",
+    "convert": "convert:app",
     "export": "store:export",
     "checkpoint": "planners:checkpoint",
     "train": "training:app",

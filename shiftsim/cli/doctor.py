@@ -1,7 +1,4 @@
-"""Commands that try this installation: doctor, and verify on whole folders of reference outputs.
-
-The few reference values that come with the package are compared by the code that `verify` uses.
-"""
+"""Commands that try this installation: doctor, and verify on a user's own results from nuPlan."""
 
 import os
 import tempfile
@@ -14,14 +11,12 @@ from typing import Annotated, Any
 import typer
 
 from shiftsim.cli import Advance, Debug, Json, Quiet, progress_bar, say, show
-from shiftsim.files import PACKAGE
 
-REFERENCE = PACKAGE / "verify" / "reference"
 _DATA = 2
 
 
 def verify(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of reference outputs.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of results.")],
     experiment: Annotated[
         bool, typer.Option("--experiment", help="DIR holds what nuPlan's run_simulation.py wrote.")
     ] = False,
@@ -29,26 +24,40 @@ def verify(
         str | None, typer.Option("--store", "-s", help="Store with the scenarios of --experiment.")
     ] = None,
     mode: Annotated[str | None, typer.Option(help="Only runs of this mode: NR, R or PT.")] = None,
-    scenes: Annotated[Path | None, typer.Option(help="Folder with logs and maps.")] = None,
-    maps: Annotated[Path | None, typer.Option(help="Folder with OpenDRIVE maps.")] = None,
     require_all: Annotated[
         bool, typer.Option("--require-all", help="Exit with 3 if anything is not covered.")
     ] = False,
     debug: Debug = False,
 ) -> None:
-    """Compare with reference outputs of nuPlan's own code, or with results of your own from nuPlan.
+    """Compare results of your own from nuPlan with what shiftsim computes.
 
     Exit codes: 0 all covered cases equal, 1 a mismatch, 2 nothing covered or not recognised,
     3 not all covered (with --require-all).
     """
-    from shiftsim.errors import one_of
-    from shiftsim.verify import MODES
-    from shiftsim.verify import verify as compare
+    from shiftsim.errors import ConfigError, DataError, one_of
+    from shiftsim.runs.scenarios import open_named_store
+    from shiftsim.verify.experiment import verify_experiment
+    from shiftsim.verify.rollouts import CHALLENGES
 
+    if not folder.is_dir():
+        raise DataError(f"{folder}: no such folder")
+    if not experiment:
+        raise ConfigError(
+            f"{folder}: without --experiment there is nothing to compare it with",
+            hint="results of nuPlan's own simulation: shiftsim verify --experiment DIR --store "
+            "NAME; reference outputs: python -m pytest tests/parity --reference DIR in a checkout",
+        )
     if mode is not None:
-        one_of("mode", mode, MODES)
-    kind = "experiment" if experiment else None
-    result = compare(folder, kind=kind, mode=mode, scenes=scenes, maps=maps, store=store)
+        one_of("mode", mode, tuple(CHALLENGES))
+    if store is None:
+        raise ConfigError(
+            f"{folder}: nothing says where the scenarios are",
+            hint="--store NAME; shiftsim convert nuplan LOGS MAPS --store NAME makes it",
+        )
+    opened = open_named_store(store)
+    result = verify_experiment(
+        folder, lambda token: opened.read_recorded(token) if token in opened else None, mode
+    )
     for line in result.lines():
         say(line)
     raise typer.Exit(result.exit_code(require_all=require_all))
@@ -119,17 +128,16 @@ def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
     from shiftsim.kernels import CACHE_FOLDER
     from shiftsim.runs.config import default_workers
     from shiftsim.runs.manifest import versions
-    from shiftsim.verify import verify
+    from shiftsim.verify.report import Report
+    from shiftsim.verify.self_check import CHECKS, check_reference
 
-    began = perf_counter()
-    reports = []
-    advance(0, 3, "torch")
+    began, report = perf_counter(), Report()
+    advance(0, len(CHECKS) + 1, "torch")
     torch = _torch()
-    advance(1, 3, "dynamics")
-    reports.append(verify(REFERENCE / "dynamics"))
-    advance(2, 3, "metrics")
-    reports.append(verify(REFERENCE / "metric_worlds"))
-    advance(3, 3)
+    for number, name in enumerate(CHECKS, start=1):
+        advance(number, len(CHECKS) + 1, name)
+        check_reference(name, report)
+    advance(len(CHECKS) + 1, len(CHECKS) + 1)
     return Diagnosis(
         versions=versions(),
         torch=torch,
@@ -138,8 +146,8 @@ def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
         workers=default_workers(),
         kernel_cache=CACHE_FOLDER or "none can be written",
         seconds=perf_counter() - began,
-        cases=sum(report.num_cases for report in reports),
-        mismatches=tuple(line for report in reports for line in report.mismatches),
+        cases=report.num_cases,
+        mismatches=tuple(report.mismatches),
     )
 
 

@@ -111,11 +111,12 @@ def import_edits(
     debug: Debug = False,
 ) -> None:
     """Edits that make interPlan's scenarios, from interPlan's own two files."""
+    from shiftsim.data.nuplan.filter import read_yaml
     from shiftsim.edits.interplan.codes import import_names
     from shiftsim.files import write_text
     from shiftsim.runs.edited import edits_text, make_edits
 
-    table = import_names(names, modifications, window)
+    table = import_names(read_yaml(names), read_yaml(modifications), window)
     made = make_edits(table, out.stem)
     write_text(out, edits_text(table))
     tokens = {token for edit in made.edits for token in edit.tokens}

@@ -6,13 +6,13 @@ Order: window, remove, move, slow, stop, reroute, density, spawn, block_lane, wa
 import random
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from shiftsim.edits.builder import ScenarioBuilder, begin
 from shiftsim.edits.density import fill_lanes
-from shiftsim.edits.draft import ScenarioBuilder, begin
-from shiftsim.edits.movers import add_mover
+from shiftsim.edits.interplan.build import assemble, build
+from shiftsim.edits.interplan.path import DrivenLanes
 from shiftsim.edits.places import EgoPath, ego_path, require_on_map
 from shiftsim.edits.route import reroute
 from shiftsim.edits.spec import (
@@ -25,15 +25,13 @@ from shiftsim.edits.spec import (
     Slow,
     Spawn,
     digest_of,
-    make_edit,
+    edited_id,
 )
 from shiftsim.errors import ConfigError, ShiftsimError
 from shiftsim.kernels import FloatArray, IntArray
-from shiftsim.world.script import CAUTIOUS, FOLLOW, OFF, STOPPED, RolloutEvents, ScriptedPedestrian
+from shiftsim.world.events import CAUTIOUS, FOLLOW, OFF, STOPPED, RolloutEvents, ScriptedPedestrian
+from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import VX, AgentKind, LightStatus, TrafficLights
-
-if TYPE_CHECKING:
-    from shiftsim.world.scenario import Scenario
 
 SIZES = {  # length, width [m]
     "vehicle": (4.6, 1.9),
@@ -47,27 +45,26 @@ SIZES = {  # length, width [m]
 _BEHAVIORS = {"idm": FOLLOW, "stopped": STOPPED, "cautious": CAUTIOUS}
 
 
-def edited_id(token: str, edit: Edit) -> str:
-    """Id of the scenario that an edit makes of a recorded one; never parsed back."""
-    return f"{token}-{edit.name}"
-
-
-def apply_edit(scenario: "Scenario", edit: Edit) -> "Scenario":
+def apply_edit(scenario: Scenario, edit: Edit, driven_lanes: DrivenLanes | None = None) -> Scenario:
     """The scenario that an edit makes of a recorded one.
+
+    Codes of interPlan need `driven_lanes`, such as `metrics.interplan.driven_lanes`.
 
     Raises:
         ConfigError: It cannot be applied; the message names scenario, edit and reason.
     """
     try:
-        return _Editor(scenario, edit).result()
+        if not edit.code:
+            return _Editor(scenario, edit).result()
+        if driven_lanes is None:
+            raise ConfigError(
+                f"the code {edit.code!r} is applied in runs only",
+                hint='write it into a file with profile = "interplan", and run that',
+            )
+        return assemble(scenario, build(scenario, edit.code, edit.details, driven_lanes), edit)
     except ShiftsimError as error:
         text = f"edit {edit.name!r} of scenario {scenario.token!r}: {error.message}"
         raise ConfigError(text, error.hint) from error
-
-
-def edit_scenario(scenario: "Scenario", name: str = "edited", **tables: object) -> "Scenario":
-    """As `Scenario.edited`."""
-    return apply_edit(scenario, make_edit({"name": name, **tables}, "edited"))
 
 
 def seed_of(edit: Edit, token: str) -> int:
@@ -78,9 +75,9 @@ def seed_of(edit: Edit, token: str) -> int:
 
 
 class _Editor:
-    def __init__(self, scenario: "Scenario", edit: Edit) -> None:
+    def __init__(self, scenario: Scenario, edit: Edit) -> None:
         self.edit, self.base = edit, scenario
-        self.draft = begin(scenario)
+        self.builder = begin(scenario)
         self.seed = seed_of(edit, scenario.token)
         self.random = random.Random(self.seed)
         self.count: dict[str, int] = {}
@@ -93,52 +90,54 @@ class _Editor:
             self._path = ego_path(self.base)
         return self._path
 
-    def result(self) -> "Scenario":
-        edit, draft = self.edit, self.draft
+    def result(self) -> Scenario:
+        edit, builder = self.edit, self.builder
         if edit.window_s is not None:
-            _set_window(draft, edit.window_s)
+            _set_window(builder, edit.window_s)
         self._remove()
         self._change_motion()
         if edit.reroute:
-            reroute(draft, edit.reroute, ends=edit.ends_at_goal)
+            reroute(builder, edit.reroute, ends=edit.ends_at_goal)
         if edit.speed and edit.speed.ego_mps is not None:
-            ego = np.array(draft.scenario.ego)
-            ego[draft.now, VX] = edit.speed.ego_mps
-            draft.change(ego=ego)
+            ego = np.array(builder.scenario.ego)
+            ego[builder.now, VX] = edit.speed.ego_mps
+            builder.change(ego=ego)
         if edit.density:
-            fill_lanes(draft, edit.density, self.random, self.name)
+            fill_lanes(builder, edit.density, self.random, self.name)
         for spawn in edit.spawn:
             self._spawn(spawn)
         self._block_lanes()
         self._walk()
         for light in edit.light:
-            _set_lights(draft, light)
+            _set_lights(builder, light)
         if edit.speed and edit.speed.limit != 1.0:
-            road = draft.scenario.map
-            draft.change(map=replace(road, speed_limits=road.speed_limits * edit.speed.limit))
+            road = builder.scenario.map
+            builder.change(map=replace(road, speed_limits=road.speed_limits * edit.speed.limit))
         return self._finished()
 
-    def _finished(self) -> "Scenario":
-        edit, draft = self.edit, self.draft
-        places = {token: i for i, token in enumerate(draft.tracks.tokens)}
-        walkers = tuple(replace(walker, track=places[token]) for token, walker in draft.walkers)
+    def _finished(self) -> Scenario:
+        edit, builder = self.edit, self.builder
+        places = {token: i for i, token in enumerate(builder.tracks.tokens)}
+        pedestrians = tuple(
+            replace(pedestrian, track=places[token]) for token, pedestrian in builder.pedestrians
+        )
         script = RolloutEvents(
             base=self.base.token,
             name=edit.name,
             digest=edit.digest,
             words=edit.words,
-            tokens=tuple(token for token in draft.touched if token in places),
-            behaviors=draft.behaviors,
-            manner=MANNERS.index(edit.agents) if edit.agents else OFF,
-            walkers=walkers,
-            finish=draft.finish,
+            tokens=tuple(token for token in builder.touched if token in places),
+            behaviors=builder.behaviors,
+            yielding=MANNERS.index(edit.agents) if edit.agents else OFF,
+            pedestrians=pedestrians,
+            termination=builder.termination,
             seed=self.seed,
         )
         return replace(
-            draft.scenario,
+            builder.scenario,
             token=edited_id(self.base.token, edit),
             scenario_type=edit.type or self.base.scenario_type,
-            tracks=draft.tracks,
+            tracks=builder.tracks,
             script=script,
         )
 
@@ -155,58 +154,58 @@ class _Editor:
         return found
 
     def _remove(self) -> None:
-        draft = self.draft
+        builder = self.builder
         for remove in self.edit.remove:
-            chosen = draft.which(remove.kinds, remove.tokens)
+            chosen = builder.which(remove.kinds, remove.tokens)
             if remove.near:
                 x, y, radius = remove.near
-                poses = draft.tracks.poses[draft.now, chosen]
+                poses = builder.tracks.poses[builder.now, chosen]
                 chosen = chosen[np.hypot(poses[:, 0] - x, poses[:, 1] - y) <= radius]
             if remove.share < 1.0:
                 count = round(remove.share * len(chosen))
                 chosen = np.array(sorted(self.random.sample(chosen.tolist(), count)), np.int64)
-            kept = np.ones(draft.tracks.num_tracks, np.bool_)
-            kept[chosen] = False
-            draft.keep(kept)
+            stays = np.ones(builder.tracks.num_tracks, np.bool_)
+            stays[chosen] = False
+            builder.keep(stays)
 
     def _change_motion(self) -> None:
-        draft, edit = self.draft, self.edit
+        builder, edit = self.builder, self.edit
         if edit.move or edit.slow or edit.stop or edit.speed:
-            draft.own()
+            builder.own()
         for move in edit.move:
-            for track in draft.which((), move.tokens).tolist():
-                _shift(draft, track, move.ahead_m, move.left_m)
+            for track in builder.which((), move.tokens).tolist():
+                _shift(builder, track, move.ahead_m, move.left_m)
         slows = list(edit.slow)
         if edit.speed and edit.speed.tracks != 1.0:
             if edit.speed.tracks > 1.0:
                 raise ConfigError("speed: tracks is above 1", "a recording cannot be sped up")
             slows.append(Slow(edit.speed.tracks, kinds=("vehicle",)))
-        seconds = draft.seconds
+        seconds = builder.seconds
         for slow in slows:
             late = np.maximum(seconds - slow.from_s, 0.0)
             recorded = np.minimum(seconds, slow.from_s) + slow.factor * late
-            _warp(draft, draft.which(slow.kinds, slow.tokens), seconds, recorded)
+            _warp(builder, builder.which(slow.kinds, slow.tokens), seconds, recorded)
         for stop in edit.stop:
-            for track in draft.which((), stop.tokens):
+            for track in builder.which((), stop.tokens):
                 row = min(int(np.searchsorted(seconds, stop.from_s)), len(seconds) - 1)
-                speed = float(np.hypot(*np.nan_to_num(draft.tracks.velocities[row, track])))
+                speed = float(np.hypot(*np.nan_to_num(builder.tracks.velocities[row, track])))
                 # the clock of the recording slows down evenly until it stands
                 needed = max(speed / max(stop.decel_mps2, 0.1), 1e-3)
                 late = np.clip(seconds - stop.from_s, 0.0, needed)
                 recorded = np.minimum(seconds, stop.from_s) + late - 0.5 * late**2 / needed
-                _warp(draft, np.array([track]), seconds, recorded)
+                _warp(builder, np.array([track]), seconds, recorded)
 
     def _spawn(self, spawn: Spawn) -> None:
-        draft, kind = self.draft, KIND_CODES[spawn.kind]
+        builder, kind = self.builder, KIND_CODES[spawn.kind]
         name = self.name(spawn.kind)
         what = f"spawned {spawn.kind.replace('_', ' ')}"
         pose, size = self.pose(spawn, what), np.array(spawn.size_m or SIZES[spawn.kind])
         is_mover = kind == AgentKind.VEHICLE and spawn.behavior != "stopped"
         if not is_mover:
-            draft.require_free(pose[None], size, what)
-            draft.add_standing([name], kind, size, pose[None])
+            builder.require_free(pose[None], size, what)
+            builder.add_standing([name], kind, size, pose[None])
             return
-        add_mover(draft, name, pose, size, spawn.speed_mps, _BEHAVIORS[spawn.behavior])
+        builder.add_vehicle(name, pose, size, spawn.speed_mps, _BEHAVIORS[spawn.behavior])
 
     def _block_lanes(self) -> None:
         for block in self.edit.block_lane:
@@ -236,12 +235,12 @@ class _Editor:
                     place = _ahead_of(pose, distance, aside)
                 places.append(place)
             poses, what = np.array(places), block.kind.replace("_", " ")
-            self.draft.require_free(poses, size, f"{what} of a closed lane")
+            self.builder.require_free(poses, size, f"{what} of a closed lane")
             names = [self.name(block.kind) for _ in places]
-            self.draft.add_standing(names, KIND_CODES[block.kind], size, poses)
+            self.builder.add_standing(names, KIND_CODES[block.kind], size, poses)
 
     def _walk(self) -> None:
-        draft, size = self.draft, np.array(SIZES["pedestrian"])
+        builder, size = self.builder, np.array(SIZES["pedestrian"])
         for walk in self.edit.walk:
             start, end = (self.pose(place, "pedestrian") for place in (walk.start, walk.end))
             step = end[:2] - start[:2]
@@ -249,39 +248,16 @@ class _Editor:
             if length < 1e-3:
                 raise ConfigError("a pedestrian walks from a place to the same place")
             start[2] = np.arctan2(step[1], step[0])
-            draft.require_free(start[None], size, "pedestrian")
+            builder.require_free(start[None], size, "pedestrian")
             name, speed = self.name("pedestrian"), max(walk.speed_mps, 1e-3)
-            begins = np.inf if walk.start_s is None else walk.start_s
-            poses, velocities, valid = stroll(
-                draft.seconds, start, end[:2], speed, begins, visible=walk.visible
+            pedestrian = ScriptedPedestrian(
+                -1, start, end[:2], size, speed, walk.ego_within_m, walk.visible
             )
-            draft.add(name, AgentKind.PEDESTRIAN, size, poses, valid=valid, velocities=velocities)
+            start_time = np.inf if walk.start_s is None else walk.start_s
+            poses, velocities, valid = pedestrian.walk(builder.seconds, start_time)
+            builder.add(name, AgentKind.PEDESTRIAN, size, poses, valid=valid, velocities=velocities)
             if walk.start_s is None:
-                walker = ScriptedPedestrian(
-                    -1, start, end[:2], size, speed, walk.ego_within_m, walk.visible
-                )
-                draft.walkers.append((name, walker))
-
-
-def stroll(
-    seconds: FloatArray,
-    start: FloatArray,
-    end: FloatArray,
-    speed: float,
-    begins: float,
-    *,
-    visible: bool,
-) -> tuple[FloatArray, FloatArray, np.ndarray]:
-    """Poses (R, 3), velocities (R, 2) and presence (R,) of a walk at some times (R,) [s]."""
-    step = end - start[:2]
-    length = float(np.hypot(*step))
-    gone = np.clip((seconds - begins) * speed, 0.0, length) if begins < np.inf else 0.0 * seconds
-    poses = np.tile(start, (len(seconds), 1))
-    poses[:, :2] += (gone / length)[:, None] * step
-    walks = (seconds >= begins) & (gone < length)
-    velocities = np.where(walks[:, None], speed * step / length, 0.0)
-    valid = np.ones(len(seconds), np.bool_) if visible else seconds >= begins
-    return poses, velocities, valid
+                builder.pedestrians.append((name, pedestrian))
 
 
 def _ahead_of(pose: FloatArray, ahead: float, left: float) -> FloatArray:
@@ -291,9 +267,9 @@ def _ahead_of(pose: FloatArray, ahead: float, left: float) -> FloatArray:
     )
 
 
-def _set_window(draft: ScenarioBuilder, seconds: float) -> None:
-    scenario = draft.scenario
-    rows: IntArray = np.arange(draft.now, len(scenario.time_us), scenario.row_step)
+def _set_window(builder: ScenarioBuilder, seconds: float) -> None:
+    scenario = builder.scenario
+    rows: IntArray = np.arange(builder.now, len(scenario.time_us), scenario.row_step)
     time_us = scenario.time_us[rows]
     inside = rows[time_us <= time_us[0] + round(seconds * 1e6)]
     known = float(time_us[-1] - time_us[0]) * 1e-6
@@ -305,11 +281,11 @@ def _set_window(draft: ScenarioBuilder, seconds: float) -> None:
             hint="convert the recording with a longer duration",
         )
     _, offset, ratio = scenario.mapping
-    draft.change(iteration_rows=inside, mapping=(seconds, offset, ratio), is_short=False)
+    builder.change(iteration_rows=inside, mapping=(seconds, offset, ratio), is_short=False)
 
 
-def _shift(draft: ScenarioBuilder, track: int, ahead: float, left: float) -> None:
-    tracks, now = draft.tracks, draft.now
+def _shift(builder: ScenarioBuilder, track: int, ahead: float, left: float) -> None:
+    tracks, now = builder.tracks, builder.now
     if not tracks.valid[now, track]:
         raise ConfigError(
             f"track {tracks.tokens[track]!r} is not there at the start, so it cannot be moved"
@@ -318,17 +294,17 @@ def _shift(draft: ScenarioBuilder, track: int, ahead: float, left: float) -> Non
     size = tracks.sizes[now, track].copy()
     by = pose[:2] - tracks.poses[now, track, :2]
     tracks.valid[now, track] = False  # it may be in its own way
-    draft.require_free(pose[None], size, f"moved track {tracks.tokens[track]!r}")
+    builder.require_free(pose[None], size, f"moved track {tracks.tokens[track]!r}")
     tracks.valid[now, track] = True
     tracks.poses[:, track, :2] += by
-    draft.touched.append(tracks.tokens[track])
+    builder.touched.append(tracks.tokens[track])
 
 
 def _warp(
-    draft: ScenarioBuilder, which: IntArray, seconds: FloatArray, recorded: FloatArray
+    builder: ScenarioBuilder, which: IntArray, seconds: FloatArray, recorded: FloatArray
 ) -> None:
     """Have tracks be at each time (R,) where they were at another one (R,), never a later one."""
-    tracks = draft.tracks
+    tracks = builder.tracks
     pace = np.gradient(recorded, seconds)
     low = np.clip(np.searchsorted(seconds, recorded, side="right") - 1, 0, len(seconds) - 2)
     span = seconds[low + 1] - seconds[low]
@@ -350,11 +326,11 @@ def _warp(
         tracks.poses[late, track] = moved[late]
         tracks.velocities[late, track] = (velocities[near] * pace[:, None])[late]
         tracks.sizes[late, track] = sizes[near][late]
-        draft.touched.append(tracks.tokens[track])
+        builder.touched.append(tracks.tokens[track])
 
 
-def _set_lights(draft: ScenarioBuilder, light: Light) -> None:
-    scenario = draft.scenario
+def _set_lights(builder: ScenarioBuilder, light: Light) -> None:
+    scenario = builder.scenario
     road, lights = scenario.map, scenario.traffic_lights
     names: Iterable[str] = light.connectors
     if light.route:
@@ -369,7 +345,7 @@ def _set_lights(draft: ScenarioBuilder, light: Light) -> None:
     for name in names:
         if not road.is_connector(road.edge(name)):
             raise ConfigError(f"light: {name!r} is a lane, not a connector")
-    seconds = draft.seconds
+    seconds = builder.seconds
     during = (seconds >= light.from_s) & (seconds < (np.inf if light.to_s is None else light.to_s))
     ids, status = list(lights.connector_ids), np.array(lights.status)
     for name in names:
@@ -382,4 +358,4 @@ def _set_lights(draft: ScenarioBuilder, light: Light) -> None:
         status[during, columns[0]] = LIGHT_CODES[light.status]
         for column in columns[1:]:  # nuPlan rule 429: an id listed twice would show both
             status[during, column] = LightStatus.ABSENT
-    draft.change(traffic_lights=TrafficLights(tuple(ids), status))
+    builder.change(traffic_lights=TrafficLights(tuple(ids), status))

@@ -12,14 +12,13 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from shiftsim.edits.draft import ScenarioBuilder
-from shiftsim.edits.movers import add_mover
+from shiftsim.edits.builder import ScenarioBuilder
 from shiftsim.edits.spec import LEVELS, Density
 from shiftsim.errors import ConfigError
 from shiftsim.kernels import FloatArray
+from shiftsim.world.events import FOLLOW
 from shiftsim.world.lanes import find_start, initial_curvature, poses_on_line
 from shiftsim.world.map import VectorMap
-from shiftsim.world.script import FOLLOW
 from shiftsim.world.state import VX, center_poses
 
 NEAR_EGO = 10.0  # m, a vehicle nearer to the ego in its lane becomes the ego
@@ -37,15 +36,15 @@ class Slot(NamedTuple):
 
 
 def fill_lanes(
-    draft: ScenarioBuilder, density: Density, draws: random.Random, name: Callable[[str], str]
+    builder: ScenarioBuilder, density: Density, draws: random.Random, name: Callable[[str], str]
 ) -> None:
     """Add vehicles that drive; those for which there is no space are left out.
 
     Raises:
         ConfigError: The ego is on no lane.
     """
-    road, now = draft.scenario.map, draft.now
-    center = center_poses(draft.scenario.ego[now : now + 1, :3])[0]
+    road, now = builder.scenario.map, builder.now
+    center = center_poses(builder.scenario.ego[now : now + 1, :3])[0]
     start = find_start(road, center)
     if start is None:
         raise ConfigError("density: the ego is on no lane at the start")
@@ -54,12 +53,12 @@ def fill_lanes(
         road, start.edge, center, gap, density.also_at, draws, reach=density.reach_m
     )
     if speed is not None:
-        ego = np.array(draft.scenario.ego)
+        ego = np.array(builder.scenario.ego)
         ego[now, VX] = speed
-        draft.change(ego=ego)
+        builder.change(ego=ego)
     for slot in slots:
         try:
-            add_mover(draft, name("vehicle"), slot.pose, _SIZE, slot.speed, FOLLOW)
+            builder.add_vehicle(name("vehicle"), slot.pose, _SIZE, slot.speed, FOLLOW)
         except ConfigError:
             continue  # no space: density is a matter of chance
 

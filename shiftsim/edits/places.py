@@ -1,19 +1,16 @@
 """Places beside the recorded path of the ego, so that one edit fits many scenarios."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from shiftsim.edits.spec import At
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import wrap_angle
-from shiftsim.kernels import BoolArray, FloatArray, kernel
+from shiftsim.kernels import FloatArray
 from shiftsim.world.map import VectorMap
+from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import center_poses
-
-if TYPE_CHECKING:
-    from shiftsim.world.scenario import Scenario
 
 _SPACING = 0.2  # m, of the vertices of the path; nearer ones say nothing of its heading
 _BEYOND = 300.0  # m, how far the path goes on along the lanes
@@ -40,7 +37,7 @@ class EgoPath:
         return np.array([x, y, wrap_angle(heading + at.turn)])
 
 
-def ego_path(scenario: "Scenario") -> EgoPath:
+def ego_path(scenario: Scenario) -> EgoPath:
     """The path that places of a scenario are counted along."""
     now = int(scenario.iteration_rows[0])
     centers = center_poses(scenario.ego[:, :3])
@@ -65,20 +62,14 @@ def ego_path(scenario: "Scenario") -> EgoPath:
 
 def _spaced(xy: FloatArray) -> FloatArray:
     """The first of the points (N, 2), and those that are far enough from the one before."""
-    kept = np.zeros(len(xy), np.bool_)
-    _mark_spaced(np.ascontiguousarray(xy), kept)
-    return xy[kept]
-
-
-@kernel
-def _mark_spaced(xy: FloatArray, kept: BoolArray) -> None:
-    kept[0], last = True, 0
+    chosen = [0]
     for index in range(1, len(xy)):
-        if np.hypot(xy[index, 0] - xy[last, 0], xy[index, 1] - xy[last, 1]) >= _SPACING:
-            kept[index], last = True, index
+        if np.hypot(*(xy[index] - xy[chosen[-1]])) >= _SPACING:
+            chosen.append(index)
+    return xy[chosen]
 
 
-def _lanes_ahead(scenario: "Scenario", path: FloatArray) -> FloatArray:
+def _lanes_ahead(scenario: Scenario, path: FloatArray) -> FloatArray:
     """(K, 2) centre lines from the end of a path on, along the route where there is a choice."""
     road, end = scenario.map, path[-1]
     step = path[-1] - path[-2]

@@ -8,15 +8,15 @@ import numpy as np
 import shapely
 from shapely.ops import split
 
-from shiftsim.edits.draft import ScenarioBuilder
+from shiftsim.edits.builder import ScenarioBuilder, poses_along
 from shiftsim.edits.spec import Reroute
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import wrap_angle
-from shiftsim.geometry.polylines import vertex_headings
+from shiftsim.geometry.polylines import arc_lengths, vertex_headings
 from shiftsim.kernels import FloatArray
+from shiftsim.world.events import TerminationCondition
 from shiftsim.world.lanes import find_start, pose_on_line
-from shiftsim.world.map import NONE, VectorMap
-from shiftsim.world.script import TerminationCondition
+from shiftsim.world.map import VectorMap
 from shiftsim.world.state import NUM_STATE, VX, center_poses, rear_poses
 
 TURNS = {"left": math.pi / 2.0, "straight": 0.0, "right": -math.pi / 2.0}  # rad
@@ -26,25 +26,25 @@ _MAX_DEPTH = 200  # lanes of a route
 _MIN_LENGTH = 5.0  # m
 
 
-def reroute(draft: ScenarioBuilder, wanted: Reroute, *, ends: bool) -> None:
+def reroute(builder: ScenarioBuilder, wanted: Reroute, *, ends: bool) -> None:
     """Change route, goal and expert; the expert drives evenly along the lanes of the new route.
 
     Raises:
         ConfigError: There is no such route.
     """
-    road, now = draft.scenario.map, draft.now
-    center = center_poses(draft.scenario.ego[now : now + 1, :3])[0]
+    road, now = builder.scenario.map, builder.now
+    center = center_poses(builder.scenario.ego[now : now + 1, :3])[0]
     start = find_start(road, center)
     if start is None:
         raise ConfigError("reroute: the ego is on no lane at the start")
     first = int(road.block_of[start.edge])
-    times = draft.scenario.iteration_times
+    times = builder.scenario.iteration_times
     seconds = float(times[-1] - times[0]) * 1e-6
     if wanted.goal:
         goal_edge = edge_at(road, *wanted.goal)
         lanes = plan_lanes(road, first, goal_edge, set(range(len(road.edges))), _MAX_DEPTH)
     else:
-        blocks = _blocks(road, wanted, first, max(3, len(draft.scenario.route)))
+        blocks = _blocks(road, wanted, first, max(3, len(builder.scenario.route)))
         goal_edge = int(road.block_edges.at(blocks[-1])[-1])
         within = {int(edge) for block in blocks for edge in road.block_edges.at(block)}
         lanes = plan_lanes(road, first, goal_edge, within, len(blocks))
@@ -60,9 +60,11 @@ def reroute(draft: ScenarioBuilder, wanted: Reroute, *, ends: bool) -> None:
     if total < _MIN_LENGTH:
         raise ConfigError(f"reroute: the goal is {total:.1f} m ahead, at least 5 m are needed")
     ids = [road.blocks.ids[block] for block in dict.fromkeys(road.block_of[lanes].tolist())]
-    draft.change(ego=_drive(draft, line, total), route=tuple(ids), mission_goal=goal)
+    builder.change(ego=_drive(builder, line, total), route=tuple(ids), mission_goal=goal)
     if ends:
-        draft.finish = TerminationCondition(line, total - TOLERANCE, int(road.block_of[lanes[-1]]))
+        builder.termination = TerminationCondition(
+            line, total - TOLERANCE, int(road.block_of[lanes[-1]])
+        )
 
 
 def _blocks(road: VectorMap, wanted: Reroute, first: int, count: int) -> list[int]:
@@ -79,20 +81,16 @@ def _blocks(road: VectorMap, wanted: Reroute, first: int, count: int) -> list[in
     return blocks[blocks.index(first) :]
 
 
-def _drive(draft: ScenarioBuilder, line: FloatArray, total: float) -> FloatArray:
+def _drive(builder: ScenarioBuilder, line: FloatArray, total: float) -> FloatArray:
     """(R, 11) ego states that go evenly along a path (K, 2) in the window, and stand at its end."""
-    scenario, now = draft.scenario, draft.now
-    ego, seconds = np.array(scenario.ego), draft.seconds
+    scenario, now = builder.scenario, builder.now
+    ego, seconds = np.array(scenario.ego), builder.seconds
     duration = seconds[scenario.iteration_rows[-1]]
     after = np.arange(now + 1, len(ego))
     along = np.minimum(seconds[after] / duration, 1.0) * total
-    steps = np.diff(line, axis=0)
-    progress = np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
-    segment = np.clip(np.searchsorted(progress, along, side="right") - 1, 0, len(steps) - 1)
-    x, y = (np.interp(along, progress, line[:, column]) for column in (0, 1))
-    headings = np.arctan2(steps[segment, 1], steps[segment, 0])
+    poses = poses_along(line, arc_lengths(line, np.array([0, len(line)])), along)
     ego[after] = np.zeros((len(after), NUM_STATE))
-    ego[after, :3] = rear_poses(np.column_stack([x, y, headings]))
+    ego[after, :3] = rear_poses(poses)
     ego[after, VX] = np.where(along < total, total / duration, 0.0)
     return ego
 
@@ -108,12 +106,8 @@ def edge_at(road: VectorMap, x: float, y: float) -> int:
         raise ConfigError(f"goal ({x:.1f}, {y:.1f}) is on {len(edges)} lanes or connectors")
     if edges:
         return edges[0]
-    bounds = [(road.edges.shape(lane).distance(shapely.Point(x, y)), lane) for lane in _lanes(road)]
-    return min(bounds)[1]
-
-
-def _lanes(road: VectorMap) -> range:
-    return range(road.num_lanes)
+    point = shapely.Point(x, y)
+    return min(range(road.num_lanes), key=lambda lane: road.edges.shape(lane).distance(point))
 
 
 def by_command(road: VectorMap, first: int, command: str, count: int) -> list[int]:
@@ -139,51 +133,69 @@ def _end_heading(road: VectorMap, block: int) -> float:
 
 
 def plan_lanes(
-    road: VectorMap, first: int, goal: int, candidates: set[int], depth: int
+    road: VectorMap,
+    first: int,
+    goal: int,
+    candidates: set[int],
+    depth: int,
+    *,
+    keeps_oddities: bool = False,
 ) -> list[int]:
     """Lanes from a roadblock to an edge, without a lane change where there is such a way.
 
     The last change of lane, where one is needed, is within the roadblock of the goal. Empty where
-    there is no way.
+    there is no way, and with interPlan's oddities where there is none from the last lane tried:
+    nuPlan rule 711.
     """
-    found: list[int] = []
+    lanes: list[int] = []
+    found = False
     for start in road.block_edges.at(first).tolist():
-        plan, has_change = _search(road, start, goal, candidates, depth)
-        if plan and not has_change:
-            return plan
-        found = plan or found
-    return found
+        plan, found, has_change = _search(road, start, goal, candidates, depth, keeps_oddities)
+        lanes = plan if found else lanes
+        if found and not has_change:
+            break
+    return [] if keeps_oddities and not found else lanes
 
 
 def _search(
-    road: VectorMap, start: int, goal: int, candidates: set[int], depth: int
-) -> tuple[list[int], bool]:
-    """Breadth first from an edge to the goal, else to the edge beside it that comes nearest."""
-    parents, queue = {start: NONE}, deque([(start, 1)])
-    block, best, beside = int(road.block_of[goal]), math.inf, NONE
+    road: VectorMap, start: int, goal: int, candidates: set[int], depth: int, keeps_oddities: bool
+) -> tuple[list[int], bool, bool]:
+    """Breadth first from an edge to the goal, else to the edge beside it that comes nearest.
+
+    nuPlan rule 711: interPlan visits an edge as often as it is reached, and an edge that is queued
+    after a hit beside the goal takes its place.
+
+    Returns:
+        The edges, whether the goal was found, and whether with a change of lane at the end.
+    """
+    end = (start, 1)  # an edge, and how many edges lead to it
+    parents: dict[tuple[int, int], tuple[int, int] | None] = {end: None}
+    queue, seen = deque([end]), {start}
+    block, nearest, found, has_change = int(road.block_of[goal]), math.inf, False, False
     while queue:
-        edge, level = queue.popleft()
+        edge, level = at = queue.popleft()
+        if level > depth:
+            break
         if edge == goal:
-            return _trace(parents, edge), False
-        if int(road.block_of[edge]) == block:
+            end, found, has_change = at, True, False
+            break
+        is_beside = int(road.block_of[edge]) == block
+        if is_beside and not (keeps_oddities and road.is_connector(goal)):
             gap = abs(int(road.lane_index[goal]) - int(road.lane_index[edge]))
-            if gap < best:
-                best, beside = gap, edge
-        if level < depth:
-            for after in road.outgoing.at(edge).tolist():
-                if after in candidates and after not in parents:
-                    parents[after] = edge
-                    queue.append((after, level + 1))
-    if beside == NONE:
-        return [], False
-    return [*_trace(parents, beside)[:-1], goal], True
-
-
-def _trace(parents: dict[int, int], edge: int) -> list[int]:
-    path = [edge]
-    while parents[path[-1]] != NONE:
-        path.append(parents[path[-1]])
-    return path[::-1]
+            if gap < nearest:
+                nearest, end, found, has_change = gap, (goal, level), True, True
+                if keeps_oddities or end not in parents:
+                    parents[end] = parents[at]
+        for after in road.outgoing.at(edge).tolist():
+            if after in candidates and (keeps_oddities or after not in seen):
+                seen.add(after)
+                queue.append((after, level + 1))
+                parents[after, level + 1] = at
+                end = (after, level + 1) if keeps_oddities else end
+    path = [end]
+    while (before := parents[path[-1]]) is not None:
+        path.append(before)
+    return [edge for edge, _ in path[::-1]], found, has_change
 
 
 def cut_by_time(road: VectorMap, lanes: Sequence[int], seconds: float) -> list[int]:

@@ -7,7 +7,7 @@ recorded driver, and how hard it is to avoid.
 import random
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,10 +16,8 @@ from shiftsim.edits.places import ego_path
 from shiftsim.edits.spec import At, make_edit
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import wrap_angle
+from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import center_poses
-
-if TYPE_CHECKING:
-    from shiftsim.world.scenario import Scenario
 
 HARDEST = 4.0  # m/s^2, braking that must suffice where PDM-Closed does not avoid it
 GRADES = {"easy": 1.0, "medium": 2.0, "hard": HARDEST}  # m/s^2, with which braking avoids it
@@ -33,8 +31,8 @@ def sample_edits(
     count: int,
     seed: int,
     scenarios: Sequence[str],
-    read: "Callable[[str], Scenario]",
-    grade: "Callable[[Scenario], str]",
+    read: Callable[[str], Scenario],
+    grade: Callable[[Scenario], str],
     *,
     even: bool = False,
 ) -> Iterator[dict[str, Any]]:
@@ -87,7 +85,7 @@ def graded(scenario_type: str) -> tuple[str, str]:
 Tables = dict[str, Any]
 
 
-def _jaywalker(scenario: "Scenario", draws: random.Random) -> Tables | None:
+def _jaywalker(scenario: Scenario, draws: random.Random) -> Tables | None:
     """A pedestrian crosses before the ego; it sets off when the ego is near."""
     ahead, within = draws.uniform(15.0, 60.0), draws.uniform(10.0, 40.0)
     side, aside, pace = draws.choice((-1.0, 1.0)), draws.uniform(*_SIDE), draws.uniform(0.8, 2.5)
@@ -102,7 +100,7 @@ def _jaywalker(scenario: "Scenario", draws: random.Random) -> Tables | None:
     return {"walk": [walk]}
 
 
-def _parked(scenario: "Scenario", draws: random.Random) -> Tables | None:
+def _parked(scenario: Scenario, draws: random.Random) -> Tables | None:
     """A vehicle stands in the lane, more or less aside."""
     ahead, left = draws.uniform(15.0, 70.0), draws.uniform(-2.0, 1.0)
     if ahead > _driven(scenario):
@@ -112,7 +110,7 @@ def _parked(scenario: "Scenario", draws: random.Random) -> Tables | None:
     return {"spawn": [spawn]}
 
 
-def _works(scenario: "Scenario", draws: random.Random) -> Tables | None:
+def _works(scenario: Scenario, draws: random.Random) -> Tables | None:
     """The lane is closed by cones."""
     ahead, length = draws.uniform(20.0, 70.0), draws.uniform(4.0, 16.0)
     if ahead > _driven(scenario):
@@ -121,7 +119,7 @@ def _works(scenario: "Scenario", draws: random.Random) -> Tables | None:
     return {"block_lane": [block]}
 
 
-KINDS: dict[str, Callable[["Scenario", random.Random], Tables | None]] = {
+KINDS: dict[str, Callable[[Scenario, random.Random], Tables | None]] = {
     "jaywalker": _jaywalker,
     "parked": _parked,
     "works": _works,
@@ -132,13 +130,13 @@ def _rounded(value: float) -> float:
     return round(value, 2)
 
 
-def _driven(scenario: "Scenario") -> float:
+def _driven(scenario: Scenario) -> float:
     """How far the recorded ego gets [m]."""
     steps = np.diff(center_poses(scenario.expert[:, :3])[:, :2], axis=0)
     return float(np.hypot(*steps.T).sum())
 
 
-def _is_straight(scenario: "Scenario", ahead: float) -> bool:
+def _is_straight(scenario: Scenario, ahead: float) -> bool:
     path = ego_path(scenario)
     turn = path.pose(At(ahead + 5.0))[2] - path.pose(At(ahead - 5.0))[2]
     return abs(float(wrap_angle(turn))) < _TURNING

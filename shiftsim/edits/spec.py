@@ -219,6 +219,11 @@ class Edit:
         return tuple(out)
 
 
+def edited_id(token: str, edit: Edit) -> str:
+    """Id of the scenario that an edit makes of a recorded one; never parsed back."""
+    return f"{token}-{edit.name}"
+
+
 def digest_of(content: Any) -> str:
     """Digest of JSON values; the order of keys does not matter."""
     text = json.dumps(content, sort_keys=True, default=str)

@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.geometry.boxes import box_corners
+from shiftsim.geometry.boxes import STOPPED_SPEED, box_corners
 from shiftsim.geometry.polylines import project_on_polyline
 from shiftsim.geometry.rings import point_segment_distance
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.metrics.collision import BOX_SIZE, STOPPED_SPEED, collide, flat_tracks, set_box
+from shiftsim.metrics.collision import BOX_SIZE, collide, flat_tracks, set_box
 from shiftsim.metrics.comfort import MIN_SAMPLES, comfort_signals, within_bounds
 from shiftsim.metrics.result import NUPLAN
 from shiftsim.planners.routes.graph import deviation

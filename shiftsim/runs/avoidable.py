@@ -31,8 +31,8 @@ def grade(scenario: Scenario) -> str:
     hardest where PDM-Closed hits nothing, though such braking does. It is in the way where a driver
     who does not react hits something that the edit made.
     """
-    made = set(scenario.script.tokens if scenario.script else ())
-    if not hits(scenario, Braking(scenario, 0.0)) & made:
+    edited = set(scenario.script.tokens if scenario.script else ())
+    if not hits(scenario, Braking(scenario, 0.0)) & edited:
         return ""
     *easier, hardest = GRADES
     if hits(scenario, Braking(scenario, HARDEST)):
@@ -134,6 +134,6 @@ class Braking:
 
 def _pedestrians_of(scenario: Scenario) -> np.ndarray:
     """(N,) tracks that are pedestrians which an edit made."""
-    made = set(scenario.script.tokens if scenario.script else ())
-    of_edit = np.array([token in made for token in scenario.tracks.tokens], np.bool_)
+    edited = set(scenario.script.tokens if scenario.script else ())
+    of_edit = np.array([token in edited for token in scenario.tracks.tokens], np.bool_)
     return of_edit & (scenario.tracks.kinds == AgentKind.PEDESTRIAN)

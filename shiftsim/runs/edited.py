@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from shiftsim.data.store.reading import ScenarioStore
-from shiftsim.edits.apply import apply_edit, edited_id
-from shiftsim.edits.interplan.build import apply_code
-from shiftsim.edits.spec import PROFILES, Edit, digest_of, make_edit
+from shiftsim.edits.apply import apply_edit
+from shiftsim.edits.spec import PROFILES, Edit, digest_of, edited_id, make_edit
 from shiftsim.errors import ConfigError, DataError, beginning, nearest
 from shiftsim.files import read_toml
+from shiftsim.metrics.interplan import driven_lanes
 from shiftsim.world.scenario import Scenario
 
 FOLDER = "edits"  # below that of a store
@@ -191,8 +191,7 @@ class EditedStore(ScenarioStore):
             ConfigError: The edit cannot be applied.
         """
         recorded = super().read(self.base(token), plausible=plausible)
-        edit = self.edited[token].edit
-        return apply_code(recorded, edit) if edit.code else apply_edit(recorded, edit)
+        return apply_edit(recorded, self.edited[token].edit, driven_lanes)
 
 
 def describe(edited: Mapping[str, Edited]) -> dict[str, Any]:

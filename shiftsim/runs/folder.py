@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 
-from shiftsim.data.store.tables import TableWriter
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.files import atomic_write, safe_join, write_text
 from shiftsim.runs.journal import Journal
@@ -164,10 +164,10 @@ class RunWriter:
         return open_run(self.path)
 
     @contextmanager
-    def _table(self, name: str) -> Iterator[TableWriter]:
+    def _table(self, name: str) -> Iterator[pq.ParquetWriter]:
         with (
             atomic_write(self.path / f"{name}.parquet") as partial,
-            TableWriter(partial, TABLES[name], **_WRITE_OPTIONS) as table,
+            pq.ParquetWriter(partial, TABLES[name], **_WRITE_OPTIONS) as table,
         ):
             yield table
 

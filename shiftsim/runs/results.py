@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from shiftsim.sim.log import SimulationLog
     from shiftsim.world.scenario import Scenario
 
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 JOURNAL = "unfinished.sqlite"  # of a run under way
 _MANIFEST = {  # what is read of it, and its type
     **dict.fromkeys(("state", "split", "store"), str),
@@ -164,7 +164,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     if version != FORMAT_VERSION:
         raise DataError(
             f"{str(path)!r} has format {version!r}, this version reads {FORMAT_VERSION}",
-            hint="make the run again with this version of shiftsim",
+            hint=f"python tools/upgrade.py {folder}, or make the run again",
         )
     counts = {"counts.ok": int, "counts.expected": int} if manifest["state"] == "finished" else {}
     for key, kind in {**_MANIFEST, **counts}.items():

@@ -188,7 +188,7 @@ class TaskRunner:
             scores=scores,
             metrics=metrics,
             rollout=encoded,
-            warning=rollout.doubt,
+            warning=rollout.warning,
         )
 
     def _setting(self, task: Task) -> Setting:

@@ -13,12 +13,12 @@ CASES = [
     ),
     (
         "convert dsc3d x --store y",
-        "shiftsim.data.readers.deepplan.convert.convert_dsc3d",
+        "shiftsim.data.readers.dsc3d.open_site",
         "start again, with: shiftsim convert dsc3d x --store y",
     ),
     (
         "convert av2 x --store y",
-        "shiftsim.data.readers.open_data.scenes.convert_scenes",
+        "shiftsim.data.readers.convert.convert",
         "start again, with: shiftsim convert av2 x --store y",
     ),
     (

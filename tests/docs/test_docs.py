@@ -38,7 +38,7 @@ from track_files import table_of, write_tracks
 import shiftsim
 from shiftsim.benchmarks import load_track
 from shiftsim.data.demo import store as synthetic
-from shiftsim.data.readers.dsc3d.recording import open_site
+from shiftsim.data.readers.dsc3d import open_site
 from shiftsim.data.store import map as store_map
 from shiftsim.data.store import schema
 from shiftsim.metrics import MULTIPLIERS, PROFILES, SHORT_NAMES, WEIGHTS
@@ -55,7 +55,7 @@ NEEDS = {  # of extras and of the dependency group `docs`
     **dict.fromkeys(("README", "learned_planners"), ("torch", "safetensors")),
     "nuplan_results": ("msgpack",),
     "training": ("gymnasium", "torch", "safetensors"),
-    "run_folder": ("duckdb", "pandas", "polars"),
+    **dict.fromkeys(("run_folder", "store_format"), ("duckdb", "pandas", "polars")),
     **dict.fromkeys(("quickstart", "seeing", "state_drift"), ("matplotlib",)),
 }
 UNITS = {
@@ -98,7 +98,6 @@ def material(tmp_path_factory: pytest.TempPathFactory) -> Path:
     golden = REPOSITORY / "tests" / "golden" / "nuplan_format"
     for name in ("logs", "maps"):
         shutil.copytree(golden / name, folder / "nuplan" / name)
-    shutil.copytree(REPOSITORY / "shiftsim" / "verify" / "reference", folder / "reference")
     _write_results(folder, golden.parent)
     if importlib.util.find_spec("torch"):
         from checkpoint_files import state_of, write_published
@@ -286,7 +285,9 @@ def _described(table: pa.Schema) -> list[list[str]]:
     out = []
     for column in table:
         is_list = pa.types.is_list(column.type)
-        name = TYPES[column.type.value_type if is_list else column.type]
+        kind = column.type.value_type if is_list else column.type
+        is_row = pa.types.is_fixed_size_list(kind)
+        name = f"{kind.list_size} {TYPES[kind.value_type]}" if is_row else TYPES[kind]
         out.append([column.name, f"list of {name}" if is_list else name, _unit(column.name)])
     return out
 
@@ -294,6 +295,7 @@ def _described(table: pa.Schema) -> list[list[str]]:
 STORE_TABLES = {
     "### scenarios.parquet": schema.SCENARIOS,
     "### frames.parquet": schema.FRAMES,
+    "### lights.parquet": schema.LIGHTS,
     "### tracks.parquet": schema.TRACKS,
     "### ego-NAME.parquet": schema.EGO,
 }
@@ -320,7 +322,7 @@ def test_verdicts_of_the_filter_are_described() -> None:
 
 
 def test_columns_of_a_map_are_those_of_the_file() -> None:
-    rows = table_below(DOCS / "store_format.md", "### maps/CITY.parquet")
+    rows = table_below(DOCS / "store_format.md", "### maps/CITY.arrow")
     found = [
         ["".join(parts), kind]
         for columns, kind, *_ in rows

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import shapely
 from episodes import expert_account, replay, totals
+from parity_cases import Scenes
 from rollouts import WORLDS, load_world
 
 from shiftsim.data.demo.store import demo_store
@@ -11,7 +12,6 @@ from shiftsim.data.store.reading import open_store
 from shiftsim.env.driving import DrivingEnv
 from shiftsim.metrics import measure
 from shiftsim.sim.log import as_recorded
-from shiftsim.verify.files import Scenes
 from shiftsim.verify.worlds import read_world
 from shiftsim.world.state import PACIFICA, center_poses
 

@@ -24,9 +24,9 @@ from shiftsim.metrics.interplan import (
 )
 from shiftsim.metrics.route import EdgeLists
 from shiftsim.sim.log import as_recorded
+from shiftsim.world.events import RolloutEvents
 from shiftsim.world.layers import make_lists
 from shiftsim.world.map import NONE
-from shiftsim.world.script import RolloutEvents
 
 PERFECT = dict.fromkeys((*MULTIPLIERS, *WEIGHTS, "lane_changes_to_goal"), 1.0)
 

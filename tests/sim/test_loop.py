@@ -12,7 +12,7 @@ from shiftsim.sim import loop
 from shiftsim.sim.dynamics.bicycle import command_and_step
 from shiftsim.sim.loop import DEFAULT, Rollout, simulate, simulate_together
 from shiftsim.sim.noise import NoiseModel
-from shiftsim.world.script import RolloutEvents, TerminationCondition
+from shiftsim.world.events import RolloutEvents, TerminationCondition
 from shiftsim.world.state import NUM_STATE, VX, Command, Trajectory, X
 
 
@@ -300,7 +300,7 @@ def test_only_the_first_plan_is_doubted(strange):
 
     rollout = Rollout(cruise_scenario(iterations=5), Elsewhere())
     loop.drive(rollout)
-    assert ("42 m away" in rollout.doubt) == (strange == 0)
+    assert ("42 m away" in rollout.warning) == (strange == 0)
 
 
 def test_a_doubt_is_told_where_the_user_calls():
@@ -318,7 +318,7 @@ def test_a_doubt_is_told_where_the_user_calls():
 @pytest.mark.parametrize(("progress", "samples"), [(20.0, 12), (20.5, 13), (500.0, 19)])
 def test_a_rollout_ends_one_sample_after_the_ego_has_reached_the_finish(progress, samples):
     finish = TerminationCondition(np.array([[0.0, 0.0], [600.0, 0.0]]), progress)
-    script = RolloutEvents("a", "b", "c", (), (), np.zeros(0, np.int64), finish=finish)
+    script = RolloutEvents("a", "b", "c", (), (), np.zeros(0, np.int64), termination=finish)
     scenario = replace(cruise_scenario(iterations=20), script=script)
     log = simulate(scenario, Recorder(), controller="perfect")
     assert len(log.ego) == samples  # 0.8 m each, from 11.461 m on

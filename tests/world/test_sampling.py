@@ -8,7 +8,7 @@ import pytest
 from worlds import cruise_scenario
 
 from shiftsim.edits.apply import apply_edit
-from shiftsim.edits.draft import EGO_SIZE
+from shiftsim.edits.builder import EGO_SIZE
 from shiftsim.edits.sampling import GRADES, KINDS, graded, sample_edits
 from shiftsim.edits.spec import make_edit
 from shiftsim.errors import ConfigError

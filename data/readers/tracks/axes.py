@@ -2,17 +2,16 @@
 
 import numpy as np
 
-from shiftsim.data.readers.dsc3d.motion import track_medians
+from shiftsim.data.readers.motion import contradiction, fitted_velocities, track_medians
 from shiftsim.data.readers.tracks.columns import UNITS
-from shiftsim.data.readers.tracks.evidence import (
+from shiftsim.data.readers.tracks.map_fit import Fit
+from shiftsim.data.readers.tracks.statistics import (
     FAST,
     LEAST_CONTRADICTING,
     MAX_CONTRADICTING,
     Diagnostics,
-    Motion,
+    TrackStatistics,
 )
-from shiftsim.data.readers.tracks.fit import Fit
-from shiftsim.data.readers.tracks.motion import contradiction, fitted_velocities
 from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.kernels import FloatArray, IntArray
 
@@ -22,15 +21,15 @@ _TURNING, _LEAST_TURN = 0.1, 0.5  # rad/s; rad over a track
 _REFERENCE = (-0.15, 0.45)  # of the length, of the point that turns without sliding
 
 
-def check_headings(motion: Motion, fit: Fit, out: Diagnostics) -> None:
-    """Whether headings are the directions of motion."""
-    rows = motion.rows(FAST)
-    if motion.table.headings is None or not len(rows):
+def check_headings(stats: TrackStatistics, fit: Fit, out: Diagnostics) -> None:
+    """Whether headings are the directions of stats."""
+    rows = stats.rows(FAST)
+    if stats.table.headings is None or not len(rows):
         return
-    column = motion.table.columns.found["heading"]
-    way = fit.turned(motion.derived[rows])
+    column = stats.table.columns.found["heading"]
+    way = fit.turned(stats.derived[rows])
     along = np.arctan2(way[:, 1], way[:, 0])
-    heading = motion.table.headings[rows]
+    heading = stats.table.headings[rows]
     given = np.pi / 2 - heading if column.unit == "compass" else heading
     degrees = np.deg2rad(given) if column.unit == "rad" else given
     leave_out = "leave the column out, and the direction of motion is taken: heading = ''"
@@ -54,7 +53,7 @@ def check_headings(motion: Motion, fit: Fit, out: Diagnostics) -> None:
     if errors[""] > _MAX_HEADING:
         best = min(errors, key=lambda name: errors[name])
         fits = best and errors[best] < _MAX_HEADING
-        out.say(
+        out.error(
             f"headings differ from the direction of motion by {errors['']:.2f} rad in the middle of"
             f" {len(rows)} rows, at most {_MAX_HEADING:g} rad",
             best if fits else f"no other unit or axis fits; {leave_out}",
@@ -63,22 +62,22 @@ def check_headings(motion: Motion, fit: Fit, out: Diagnostics) -> None:
     backwards = float((np.abs(wrap_angles(heading - along)) > np.pi / 2).mean())
     out.figures["backwards_share"] = backwards
     if backwards > _MAX_BACKWARDS:
-        out.say(
+        out.error(
             f"in {backwards:.0%} of the rows the heading points against the motion, at most"
             f" {_MAX_BACKWARDS:.0%}",
             f"some objects are turned by half a turn; {leave_out}",
         )
 
 
-def check_velocities(motion: Motion, fit: Fit, out: Diagnostics) -> None:
+def check_velocities(stats: TrackStatistics, fit: Fit, out: Diagnostics) -> None:
     """Whether velocities are those of the positions."""
-    stored, table = motion.table.velocities, motion.table
-    rows = motion.rows(FAST)
+    stored, table = stats.table.velocities, stats.table
+    rows = stats.rows(FAST)
     if stored is None or not len(rows):
         return
     moving = np.unique(table.track[rows])
-    derived = fit.turned(motion.derived)
-    wrong = contradiction(stored, derived, motion.time, table.track)[0][moving]
+    derived = fit.turned(stats.derived)
+    wrong = contradiction(stored, derived, stats.time, table.track)[0][moving]
     out.figures["contradicting_share"] = float(wrong.mean())
     rows = rows[np.isfinite(stored[rows]).all(axis=1)]
     rows = rows[np.isin(table.track[rows], moving[wrong])]
@@ -124,27 +123,27 @@ def check_velocities(motion: Motion, fit: Fit, out: Diagnostics) -> None:
         remedy = (
             f"--hz looks too {'small' if ratio > 1 else 'large'} by {ratio:.3g}; or {leave_out}"
         )
-    out.say(
+    out.error(
         f"velocities ({', '.join(names)}) contradict the positions in {wrong.mean():.0%} of the"
         f" moving vehicles: the speeds are {ratio:.3g} times those of the positions",
         remedy,
     )
 
 
-def check_reference(motion: Motion, out: Diagnostics) -> None:
+def check_reference(stats: TrackStatistics, out: Diagnostics) -> None:
     """Which point of a vehicle the positions are: it slides sideways in turns, unless at the axle.
 
     A point d ahead of the rear axle moves sideways with d times the yaw rate.
     """
-    table = motion.table
+    table = stats.table
     if table.headings is None or table.sizes is None or table.columns.reference:
         return
     number = len(table.track_ids)
-    fast = motion.is_vehicle & (motion.speed > FAST)
+    fast = stats.is_vehicle & (stats.speed > FAST)
     rows = np.flatnonzero(fast)
     turns = _turns(table.track, table.headings, rows)
     turned = np.bincount(table.track[rows], np.abs(turns), number)
-    rows = np.flatnonzero(motion.is_vehicle & (turned > _LEAST_TURN)[table.track])
+    rows = np.flatnonzero(stats.is_vehicle & (turned > _LEAST_TURN)[table.track])
     if not len(rows):
         return
     track, fast = table.track[rows], fast[rows]
@@ -152,13 +151,13 @@ def check_reference(motion: Motion, out: Diagnostics) -> None:
         [np.cumsum(_turns(table.track, table.headings, rows)), np.zeros(len(rows))]
     )
     numbers = np.unique(track, return_inverse=True)[1]
-    rate = fitted_velocities(angle, motion.time[rows], numbers, motion.period)[:, 0]
+    rate = fitted_velocities(angle, stats.time[rows], numbers, stats.period)[:, 0]
     cos, sin = np.cos(table.headings[rows]), np.sin(table.headings[rows])
-    sideways = motion.derived[rows, 1] * cos - motion.derived[rows, 0] * sin
+    sideways = stats.derived[rows, 1] * cos - stats.derived[rows, 0] * sin
     used = fast & (np.abs(rate) > _TURNING)
     weight = np.bincount(track[used], rate[used] ** 2, number)
     moment = np.bincount(track[used], (sideways * rate)[used], number)
-    turn = np.bincount(track[used], np.abs(rate[used]) * motion.period, number)
+    turn = np.bincount(track[used], np.abs(rate[used]) * stats.period, number)
     length = track_medians(table.sizes[:, 0], table.track)
     enough = (turn > _LEAST_TURN) & (length > 0)
     if enough.sum() < 3:
@@ -169,7 +168,7 @@ def check_reference(motion: Motion, out: Diagnostics) -> None:
     if low <= place <= high:
         return
     name = "front" if place > high else "rear"
-    out.say(
+    out.error(
         f"in turns the positions move like a point {place:+.2f} lengths ahead of the rear axle; the"
         f" middle of a box is at {low:+.2f} … {high:+.2f}",
         f"they look like the {name} of the vehicles: reference = {name!r} in a TOML file; if they"

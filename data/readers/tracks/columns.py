@@ -1,4 +1,4 @@
-"""Which column of a file is what, and in which unit: recognised by name, or said in a TOML file.
+"""Which column of a file is what, and in which unit: recognised by name, or named in a TOML file.
 
 A column of ours has a name (`ROLES`), the names that others give it, and a quantity, whose unit the
 name may end in: `x_m`, `heading_deg`, `timestamp_ms`, `v [km/h]`.
@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.data.readers.dsc3d.recording import CATEGORIES, normalise_category
+from shiftsim.data.readers.codes import KINDS, normalise_category
 from shiftsim.errors import ConfigError, ConversionError, nearest, one_of
-from shiftsim.world.state import AgentKind
 
 TIME, FRAME, POSITION, HEADING, SIZE, VELOCITY = (
     "time",
@@ -58,18 +57,6 @@ _SPELLINGS = {"m/s": "mps", "km/h": "kmh", "kph": "kmh", "kmph": "kmh", "sec": "
 _SPELLINGS |= {"µs": "us", "feet": "ft", "degrees": "deg", "degree": "deg", "radians": "rad"}
 _SPELLINGS |= {"cm/s": "cmps", "ft/s": "ftps", "meters": "m", "metres": "m"}
 
-# names of categories beside those of DSC3D
-KINDS = {
-    **CATEGORIES,
-    **dict.fromkeys("truck_bus lorry automobile taxi hgv suv".split(), AgentKind.VEHICLE),
-    **dict.fromkeys("ped walker passer_by".split(), AgentKind.PEDESTRIAN),
-    **dict.fromkeys("motorcyclist motorbike bike rider tricycle".split(), AgentKind.BICYCLE),
-    **{kind.name.lower(): kind for kind in AgentKind},
-    "cone": AgentKind.TRAFFIC_CONE,
-    "static": AgentKind.GENERIC_OBJECT,
-    "unknown": AgentKind.GENERIC_OBJECT,
-}
-
 
 @dataclass(frozen=True)
 class Column:
@@ -93,7 +80,7 @@ class Columns:
     kinds: Mapping[str, str] = field(default_factory=dict)  # a known category by theirs
     hz: float | None = None  # frames per second, where time is given in frames
     shift: tuple[float, float] = (0.0, 0.0)  # added to x and y [m]
-    reference: str = ""  # `front`, `rear` or `center`, where the user has said it
+    reference: str = ""  # `front`, `rear` or `center`, where the user gives it
 
     @property
     def names(self) -> list[str]:
@@ -101,14 +88,14 @@ class Columns:
         return list(dict.fromkeys(c.name for c in self.found.values() if c.name))
 
 
-def recognise(names: Sequence[str], said: Mapping[str, Any], where: str) -> Columns:
-    """What each column is; what is `said` in the TOML file goes before what names tell.
+def recognise(names: Sequence[str], overrides: Mapping[str, Any], where: str) -> Columns:
+    """What each column is; the `overrides` of the TOML file go before what names tell.
 
     Raises:
         ConfigError: The TOML file names something that does not exist.
         ConversionError: A column that is needed is missing, or there twice.
     """
-    for key in said:
+    for key in overrides:
         one_of("setting", key, ("columns", "units", "kinds", "hz", "shift_m", "reference"))
     by_name: dict[str, list[tuple[str, str]]] = {}
     for name in names:
@@ -124,9 +111,9 @@ def recognise(names: Sequence[str], said: Mapping[str, Any], where: str) -> Colu
                 break
     if "xcenter" in by_name and "tracklifetime" in by_name:  # levelXdata: no units in names
         found = {r: replace(c, unit="deg") if r == "heading" else c for r, c in found.items()}
-    found |= _said_columns(said.get("columns", {}), found, names, where)
+    found |= _named_columns(overrides.get("columns", {}), found, names, where)
     found = {role: column for role, column in found.items() if column.name or column.constant}
-    for quantity, unit in _table(said, "units").items():
+    for quantity, unit in _table(overrides, "units").items():
         one_of("unit of", quantity, tuple(UNITS))
         unit = one_of(f"unit of {quantity}", _SPELLINGS.get(unit, unit), UNITS[quantity])
         for role in [r for r in found if _ROLES[r][0] == quantity]:
@@ -138,19 +125,21 @@ def recognise(names: Sequence[str], said: Mapping[str, Any], where: str) -> Colu
                 f"{where} has {names.count(column.name)} columns {column.name!r}",
                 "give each a name of its own",
             )
-    shift = said.get("shift_m", (0.0, 0.0))
+    shift = overrides.get("shift_m", (0.0, 0.0))
     if len(shift) != 2 or not all(isinstance(v, int | float) for v in shift):
         raise ConfigError(f"shift_m is {shift!r}", "shift_m = [x, y] in metres")
-    hz = said.get("hz", 1.0)
+    hz = overrides.get("hz", 1.0)
     if not isinstance(hz, int | float) or not 0.0 < hz < np.inf:
         raise ConfigError(f"hz is {hz!r}", "hz = 25, or --hz 25")
-    reference = said.get("reference", "")
+    reference = overrides.get("reference", "")
     if reference:
         one_of("reference", reference, ("center", "front", "rear"))
-    kinds = {normalise_category(k): normalise_category(v) for k, v in _table(said, "kinds").items()}
+    kinds = {
+        normalise_category(k): normalise_category(v) for k, v in _table(overrides, "kinds").items()
+    }
     for known_kind in kinds.values():
         one_of("kind", known_kind, KINDS)
-    return Columns(found, kinds, said.get("hz"), (float(shift[0]), float(shift[1])), reference)
+    return Columns(found, kinds, overrides.get("hz"), (float(shift[0]), float(shift[1])), reference)
 
 
 def _split_unit(name: str) -> tuple[str, str]:
@@ -163,11 +152,11 @@ def _split_unit(name: str) -> tuple[str, str]:
     return re.sub(r"[^a-z0-9]", "", name.lower()), ""
 
 
-def _said_columns(
-    said: Mapping[str, str], found: Mapping[str, Column], names: Sequence[str], where: str
+def _named_columns(
+    overrides: Mapping[str, str], found: Mapping[str, Column], names: Sequence[str], where: str
 ) -> dict[str, Column]:
     out = {}
-    for role, text in said.items():
+    for role, text in overrides.items():
         one_of("column", role, ROLES)
         usual = _USUAL.get(_ROLES[role][0], "")
         if text.startswith("="):
@@ -211,8 +200,8 @@ def _require_columns(found: Mapping[str, Column], names: Sequence[str], where: s
         )
 
 
-def _table(said: Mapping[str, Any], key: str) -> dict[str, str]:
-    value = said.get(key, {})
+def _table(overrides: Mapping[str, Any], key: str) -> dict[str, str]:
+    value = overrides.get(key, {})
     if not isinstance(value, dict) or not all(isinstance(v, str) for v in value.values()):
         raise ConfigError(f"{key} is {value!r}", f"[{key}] with lines NAME = 'TEXT'")
     return value

@@ -58,11 +58,11 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         self.device = resolve_device(device)
 
     def begin(self) -> None:
-        """Make the maps that are laid out."""
-        self._maps = PerMap(_lay_out)
+        """Make the cache of prepared maps."""
+        self._maps = PerMap(_prepare_roads)
 
     def reset(self, scene: SceneInfo) -> None:
-        """Lay out the map and forget the last action; the route is corrected at the first step."""
+        """Prepare the map and forget the last action; the route is corrected at the first step."""
         self._scene = scene
         self._roads, self._scratch = self._maps(scene.map)
         self._on_route: BoolArray | None = None
@@ -96,7 +96,7 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         parts = (np.stack(part) for part in zip(*features, strict=True))
         pictures, measured = (on_device(part, self.device) for part in parts)
         with torch.inference_mode():
-            each = [network.act(pictures, measured) for network in self.networks]
+            each = [network(pictures, measured).action for network in self.networks]
             return list(torch.stack(each).mean(dim=0).cpu().numpy())
 
     def decode(self, output: Action, observation: Observation) -> state.Command:
@@ -172,7 +172,7 @@ def command_of(action: Action, ego: FloatArray) -> state.Command:
     return state.Command(min(max(acceleration, -MAX_BRAKING), MAX_ACCELERATION), steering_rate)
 
 
-def _lay_out(road: VectorMap) -> tuple[Roads, view.Scratch]:
+def _prepare_roads(road: VectorMap) -> tuple[Roads, view.Scratch]:
     roads = make_roads(road)
     return roads, view.make_scratch(roads)
 

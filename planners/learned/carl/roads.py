@@ -45,7 +45,7 @@ class Roads(NamedTuple):
 
 
 def make_roads(road: VectorMap) -> Roads:
-    """Lay out a map."""
+    """What of a map is drawn."""
     areas = _joined([road.blocks.polygons, road.car_parks.polygons, road.intersections.polygons])
     num_blocks, num_areas = len(road.blocks), len(road.blocks) + len(road.car_parks)
     drivable = np.arange(num_areas)

@@ -28,6 +28,8 @@ START_SQUARE = 1.0  # m, half side of the square that is searched for the start 
 
 # one-hot position of each LightStatus; nuPlan rule 332: yellow counts as unknown
 _LIGHT_COLUMN = np.array([kernels.GREEN, kernels.UNKNOWN, kernels.RED, kernels.UNKNOWN])
+# likewise of cone, barrier, sign and generic object
+_OBJECT_COLUMN = np.array([8, 7, 6, 9])
 _RANKED = (LightStatus.GREEN, LightStatus.RED)
 
 Single = NDArray[np.float32]
@@ -151,7 +153,6 @@ def _first_rows(array: Any, rows: IntArray) -> Any:
 def agent_features(tracks: Tracks, anchor: FloatArray) -> tuple[Single, Single, IntArray]:
     """Agents (32, 21, 11), static objects (5, 10), and which tracks the agents are."""
     agents = np.zeros((kernels.AGENTS, kernels.SAMPLES, kernels.AGENT_COLUMNS), np.float32)
-    objects = np.zeros((kernels.OBJECTS, kernels.OBJECT_COLUMNS), np.float32)
     kinds, valid = _plain(tracks.kinds), _plain(tracks.valid)
     poses, sizes = _plain(tracks.poses), _plain(tracks.sizes)
     present, now = valid[-1], poses[-1]
@@ -159,8 +160,22 @@ def agent_features(tracks: Tracks, anchor: FloatArray) -> tuple[Single, Single, 
     velocities = _plain(tracks.velocities)
     kernels.fill_agents(chosen, valid, poses, velocities, sizes, kinds, anchor, agents)
     static = _by_distance(present & (kinds >= kernels.CONE), now, anchor)[: kernels.OBJECTS]
-    kernels.fill_objects(static, now, sizes[-1], kinds, anchor, objects)
-    return agents, objects, chosen
+    return agents, _object_rows(now[static], sizes[-1, static], kinds[static], anchor), chosen
+
+
+def _object_rows(
+    poses: FloatArray, sizes: FloatArray, kinds: IntArray, anchor: FloatArray
+) -> Single:
+    """(5, 10) static objects, at most as many, in the frame of the rear axle (3,)."""
+    out = np.zeros((kernels.OBJECTS, kernels.OBJECT_COLUMNS), np.float32)
+    rows, local = out[: len(poses)], poses - anchor
+    cos, sin = np.cos(anchor[2]), np.sin(anchor[2])
+    rows[:, 0] = cos * local[:, 0] + sin * local[:, 1]
+    rows[:, 1] = cos * local[:, 1] - sin * local[:, 0]
+    rows[:, 2], rows[:, 3] = np.cos(local[:, 2]), np.sin(local[:, 2])
+    rows[:, 4:6] = sizes[:, ::-1]
+    rows[np.arange(len(rows)), _OBJECT_COLUMN[kinds - kernels.CONE]] = 1.0
+    return out
 
 
 def _choose_agents(

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.geometry.polylines import point_on_polyline
 from shiftsim.geometry.rings import segments_intersect
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.planners.learned.map_features import resample
 from shiftsim.world.layers import Polygons, Polylines, distance_to, meets_convex
 
 POINTS = 20  # of a lane
@@ -28,61 +28,32 @@ class LaneLines(NamedTuple):
     blocks: IntArray  # (E,) block of each edge, -1 where unknown
 
 
-@kernel
 def resample_lanes(lines: Polylines, left: Polylines, right: Polylines) -> FloatArray:
     """Centre lines and boundaries at equally spaced arc lengths, as rows of `LaneLines`.
 
     A boundary that runs the other way is turned round; one that is missing or of one point is taken
     for the centre line.
     """
-    count = len(lines.ptr) - 1
-    out = np.zeros((count, POINTS, 8))
-    side = np.empty((POINTS, 2))
-    for edge in range(count):
-        row = out[edge]
-        _resample(lines, edge, row)
-        for point in range(POINTS - 1):
-            row[point, 2] = row[point + 1, 0] - row[point, 0]
-            row[point, 3] = row[point + 1, 1] - row[point, 1]
-        for which in range(2):
-            boundary = left if which == 0 else right
-            if boundary.ptr[edge + 1] - boundary.ptr[edge] < 2:
-                continue
-            _resample(boundary, edge, side)
-            x, y = row[0, 0], row[0, 1]
-            turned = np.hypot(side[-1, 0] - x, side[-1, 1] - y) < np.hypot(
-                side[0, 0] - x, side[0, 1] - y
-            )
-            for point in range(POINTS):
-                source = POINTS - 1 - point if turned else point
-                row[point, 4 + 2 * which] = side[source, 0] - row[point, 0]
-                row[point, 5 + 2 * which] = side[source, 1] - row[point, 1]
-    return out
+    rows = np.zeros((len(lines.ptr) - 1, POINTS, 8))
+    center, side = np.empty((len(rows), POINTS, 2)), np.empty((len(rows), POINTS, 2))
+    resample(lines, lines, center)
+    rows[..., :2] = center
+    rows[:, :-1, 2:4] = np.diff(center, axis=1)
+    for column, boundary in ((4, left), (6, right)):
+        resample(boundary, lines, side)
+        apart = np.hypot(*np.moveaxis(side[:, [0, -1]] - center[:, :1], -1, 0))
+        turned = apart[:, 1] < apart[:, 0]
+        side[turned] = side[turned, ::-1]
+        rows[..., column : column + 2] = side - center
+    return rows
 
 
-@kernel
-def _resample(lines: Polylines, line: int, out: FloatArray) -> None:
-    """Points of one line at equally spaced arc lengths, into the first columns of `out`."""
-    start, stop = lines.ptr[line], lines.ptr[line + 1]
-    if stop == start:
-        return
-    length = lines.arc[stop - 1]
-    for point in range(POINTS):
-        at = length * point / (POINTS - 1)
-        x, y = point_on_polyline(lines.xy, lines.arc, start, stop, at)
-        out[point, 0], out[point, 1] = x, y
-
-
-@kernel
 def line_bounds(lines: Polylines) -> FloatArray:
     """(M, 4) min x, min y, max x, max y of each line; of an empty one nothing is within [m]."""
-    out = np.empty((len(lines.ptr) - 1, 4))
-    for line in range(len(out)):
-        out[line, :2], out[line, 2:] = np.inf, -np.inf
-        for vertex in range(lines.ptr[line], lines.ptr[line + 1]):
-            for axis in range(2):
-                out[line, axis] = min(out[line, axis], lines.xy[vertex, axis])
-                out[line, 2 + axis] = max(out[line, 2 + axis], lines.xy[vertex, axis])
+    out = np.tile([np.inf, np.inf, -np.inf, -np.inf], (len(lines.ptr) - 1, 1))
+    line_of = np.repeat(np.arange(len(out)), np.diff(lines.ptr))
+    np.minimum.at(out[:, :2], line_of, lines.xy)
+    np.maximum.at(out[:, 2:], line_of, lines.xy)
     return out
 
 
@@ -226,29 +197,3 @@ def fill_agents(
             row[4], row[5] = cos * x + sin * y, cos * y - sin * x
             row[6], row[7] = sizes[known, track, 1], sizes[known, track, 0]
             row[8 + kinds[track]] = 1.0
-
-
-@kernel
-def fill_objects(
-    tracks: IntArray,
-    poses: FloatArray,
-    sizes: FloatArray,
-    kinds: IntArray,
-    anchor: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Write static objects in the ego frame into `out`, float32 (OBJECTS, OBJECT_COLUMNS).
-
-    The other arguments are as above, of the last sample.
-    """
-    cos, sin = np.cos(anchor[2]), np.sin(anchor[2])
-    for index, track in enumerate(tracks):
-        row = out[index]
-        x, y = poses[track, 0] - anchor[0], poses[track, 1] - anchor[1]
-        turn = poses[track, 2] - anchor[2]
-        row[0], row[1] = cos * x + sin * y, cos * y - sin * x
-        row[2], row[3] = np.cos(turn), np.sin(turn)
-        row[4], row[5] = sizes[track, 1], sizes[track, 0]
-        kind = kinds[track]
-        column = 6 if kind == SIGN else (7 if kind == BARRIER else (8 if kind == CONE else 9))
-        row[column] = 1.0

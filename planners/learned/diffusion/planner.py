@@ -19,11 +19,11 @@ from shiftsim.planners.learned.diffusion.features import (
 )
 from shiftsim.planners.learned.features import (
     NO_ROUTE,
+    plan_of_poses,
     poses_of,
     short_history,
     stack_scenes,
 )
-from shiftsim.planners.learned.plan_states import plan_of_poses
 from shiftsim.planners.per_map import PerMap
 from shiftsim.sim.noise import keyed_generator
 from shiftsim.sim.planner import Observation, SceneInfo

@@ -56,7 +56,7 @@ class RouteLanes(NamedTuple):
     paths: dict[tuple[int, ...], LanePath]  # made so far, by their lanes
 
 
-def map_areas(road: VectorMap) -> MapAreas:
+def areas_of_map(road: VectorMap) -> MapAreas:
     """Areas of all lanes, connectors and car parks of a map."""
     limits = np.full(len(road.edges) + len(road.car_parks), FALLBACK_LIMIT)
     known = np.nan_to_num(road.speed_limits, nan=0.0)
@@ -64,7 +64,7 @@ def map_areas(road: VectorMap) -> MapAreas:
     return MapAreas(make_areas(road, []), limits)
 
 
-def route_lanes(road: VectorMap, made: MapAreas, blocks: Sequence[int]) -> RouteLanes:
+def route_lanes(road: VectorMap, map_areas: MapAreas, blocks: Sequence[int]) -> RouteLanes:
     """Lanes of a corrected route."""
     unique = list(dict.fromkeys(blocks))
     has_block = np.zeros(len(road.blocks), np.bool_)
@@ -72,9 +72,9 @@ def route_lanes(road: VectorMap, made: MapAreas, blocks: Sequence[int]) -> Route
     is_on = (road.block_of != NONE) & has_block[road.block_of]
     lanes = np.flatnonzero(is_on)
     starts = np.concatenate([lanes[lanes >= road.num_lanes], lanes[lanes < road.num_lanes]])
-    on_route = np.isin(made.areas.lane, lanes)
-    areas = made.areas._replace(on_route=on_route)
-    return RouteLanes(unique, starts, has_block, is_on, areas, made.limits, {})
+    on_route = np.isin(map_areas.areas.lane, lanes)
+    areas = map_areas.areas._replace(on_route=on_route)
+    return RouteLanes(unique, starts, has_block, is_on, areas, map_areas.limits, {})
 
 
 def drivable_near(road: VectorMap, route: RouteLanes, x: float, y: float) -> Drivable:
@@ -138,22 +138,16 @@ def _paths_from(
 
 def _distinct(lines: list[FloatArray]) -> list[FloatArray]:
     """The lines without those that run where an earlier one does."""
-    kept = [True] * len(lines)
-    for i, first in enumerate(lines):
-        for j in range(i + 1, len(lines)):
-            # nuPlan rule 247: a removed line still removes others
-            if kept[j] and _runs_along(first, lines[j]):
-                kept[j] = False
-    return [line for line, keep in zip(lines, kept, strict=True) if keep]
-
-
-@kernel
-def _runs_along(first: FloatArray, second: FloatArray) -> bool:
-    for row in range(min(len(first), len(second))):
-        dx, dy = first[row, 0] - second[row, 0], first[row, 1] - second[row, 1]
-        if abs(dx) + abs(dy) >= SAME_LINE:
-            return False
-    return True
+    distinct = []
+    for index, line in enumerate(lines):
+        for earlier in lines[:index]:  # nuPlan rule 247: a removed line still removes others
+            count = min(len(earlier), len(line))
+            apart = np.abs(earlier[:count, :2] - line[:count, :2])
+            if (apart[:, 0] + apart[:, 1] < SAME_LINE).all():
+                break
+        else:
+            distinct.append(line)
+    return distinct
 
 
 @kernel
@@ -204,24 +198,21 @@ class LineFeatures(NamedTuple):
 
 def line_features(lines: Sequence[FloatArray], rear: FloatArray) -> LineFeatures:
     """Every fourth point of each line, in the frame of the rear axle (3,)."""
-    made = LineFeatures(
-        np.zeros((len(lines), NUM_POINTS, 2), np.float32),
-        np.zeros((len(lines), NUM_POINTS, 2), np.float32),
-        np.zeros((len(lines), NUM_POINTS), np.float32),
-        np.zeros((len(lines), NUM_POINTS), np.bool_),
-    )
     points = np.zeros((len(lines), NUM_POINTS, 5))
+    valid = np.zeros((len(lines), NUM_POINTS), np.bool_)
     for row, line in enumerate(lines):
         sampled = line[::STRIDE][: NUM_POINTS + 1]
         count = len(sampled) - 1
         points[row, :count, :2] = sampled[:-1, :2]
         points[row, :count, 2:4] = np.diff(sampled[:, :2], axis=0)
         points[row, :count, 4] = sampled[:-1, 2]
-        made.valid_mask[row, :count] = True
+        valid[row, :count] = True
     cos, sin = np.cos(rear[2]), np.sin(rear[2])
     turn = np.array([[cos, -sin], [sin, cos]])
     # nuPlan rule 248: padding is moved as well
-    made.position[:] = (points[..., :2] - rear[:2]) @ turn
-    made.vector[:] = points[..., 2:4] @ turn
-    made.orientation[:] = points[..., 4] - rear[2]
-    return made
+    position, vector = (points[..., :2] - rear[:2]) @ turn, points[..., 2:4] @ turn
+    orientation = points[..., 4] - rear[2]
+    single = np.float32
+    return LineFeatures(
+        position.astype(single), vector.astype(single), orientation.astype(single), valid
+    )

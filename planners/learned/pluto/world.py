@@ -46,7 +46,7 @@ class World(NamedTuple):
     """Everything a proposal can hit."""
 
     # static objects, then agents, at 0, 0.1, … 4 s; what touches the ego now is ignored
-    others: Obstacles
+    obstacles: Obstacles
     lights: IntArray  # connectors of the route whose light is red
 
 
@@ -102,7 +102,7 @@ def make_world(
     centers = np.ascontiguousarray(poses[..., :2])
     boxes = np.empty((*poses.shape[:2], 4, 2))
     _place(poses, sizes, boxes)
-    others = Obstacles(
+    obstacles = Obstacles(
         boxes=boxes,
         centers=centers,
         centroids=centers,
@@ -111,7 +111,7 @@ def make_world(
         is_agent=np.arange(len(sizes)) >= count,
         ignored=touches_boxes(footprint, boxes[0]),
     )
-    return World(others, lights)
+    return World(obstacles, lights)
 
 
 @kernel

@@ -14,21 +14,17 @@ from typing import Any
 import numpy as np
 import shapely
 
-from shiftsim.edits.apply import edited_id
+from shiftsim.edits.builder import EGO_SIZE, ScenarioBuilder, begin
 from shiftsim.edits.density import blocks_at, draw_slots
-from shiftsim.edits.draft import EGO_SIZE, ScenarioBuilder, begin
 from shiftsim.edits.interplan import codes
-from shiftsim.edits.interplan.path import Plan, make_plan
-from shiftsim.edits.spec import LEVELS, MANNERS, Edit
-from shiftsim.errors import ConfigError, ShiftsimError
+from shiftsim.edits.interplan.path import DrivenLanes, Plan, make_plan
+from shiftsim.edits.spec import LEVELS, MANNERS, Edit, edited_id
+from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import boxes_to_corners, wrap_angle
 from shiftsim.kernels import FloatArray
-from shiftsim.sim.traffic.scripted import PEDESTRIAN_SIZE
-from shiftsim.world.lanes import find_start, nearest_heading, poses_on_edge, start_on
-from shiftsim.world.map import VectorMap
-from shiftsim.world.scenario import Scenario
-from shiftsim.world.script import (
+from shiftsim.world.events import (
     CAUTIOUS,
+    CROSSING_SIZE,
     FOLLOW,
     LOGGED,
     STOPPED,
@@ -36,15 +32,19 @@ from shiftsim.world.script import (
     RolloutEvents,
     TerminationCondition,
 )
+from shiftsim.world.lanes import find_start, nearest_heading, poses_on_edge, start_on
+from shiftsim.world.map import VectorMap
+from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import VX, VY, AgentKind, center_poses, rear_poses
 
 BUS = np.array([7.455735206604004, 2.0785977840423584])  # length, width [m]
-PEDESTRIAN = np.array(PEDESTRIAN_SIZE)
+PEDESTRIAN = np.array(CROSSING_SIZE)
 CONE = np.array([0.5, 0.5])
 CORRIDOR_S = 2  # s, how far ahead of new vehicles others must not be
 HISTORY = 23  # samples before iteration 0
 _JITTER = 0.1  # m, standard deviation of their places
 _STEP = 0.1  # s
+NO_EDGE = -1
 SORTS = {
     "approaching_construction_zone": "construction_zone",
     "avoid_crashed_cars": "stopped_vehicle",
@@ -81,21 +81,9 @@ class Built:
     past: FloatArray = field(repr=False)  # (23, V, 3) poses of the vehicles before iteration 0
 
 
-def apply_code(scenario: Scenario, edit: Edit) -> Scenario:
-    """The scenario that an edit with a code makes of a recorded one.
-
-    Raises:
-        ConfigError: interPlan fails there, too; the message names scenario, edit and reason.
-    """
-    try:
-        built = build(scenario, edit.code, edit.details)
-    except ShiftsimError as error:
-        text = f"edit {edit.name!r} of scenario {scenario.token!r}: {error.message}"
-        raise ConfigError(text, error.hint) from error
-    return assemble(scenario, built, edit)
-
-
-def build(scenario: Scenario, code: str, details: Mapping[str, Any]) -> Built:
+def build(
+    scenario: Scenario, code: str, details: Mapping[str, Any], driven_lanes: DrivenLanes
+) -> Built:
     """What a code makes of a recorded scenario; `details` are those of its token."""
     changes = codes.changes_of(code, details)
     road, row = scenario.map, int(scenario.iteration_rows[0])
@@ -104,18 +92,18 @@ def build(scenario: Scenario, code: str, details: Mapping[str, Any]) -> Built:
     at = road.lanes_at(center[0], center[1]) or road.connectors_at(center[0], center[1])
     ego_edge = at[0] if at else NO_EDGE
     kind = codes.scenario_type(changes, details)
-    vehicles, speed, cast = _logged(scenario), None, _Cast(scenario, changes, details, ego_edge)
+    vehicles, speed, agents = _logged(scenario), None, _Agents(scenario, changes, details, ego_edge)
     if codes.edits_agents(changes):
-        vehicles, speed = cast.fill(), cast.ego_speed
+        vehicles, speed = agents.fill(), agents.ego_speed
     initial = logged.copy()
     if speed:  # nuPlan rule 706: a speed of 0 changes nothing
         initial[VX] = speed
-    plan = make_plan(scenario, changes, details, initial)
-    if codes.edits_agents(changes) and not vehicles and not cast.cones:
-        cast.fill()  # interPlan takes an empty list for one that was not made yet
-        vehicles = tuple(cast.vehicles)
+    plan = make_plan(scenario, changes, details, initial, driven_lanes)
+    if codes.edits_agents(changes) and not vehicles and not agents.cones:
+        agents.fill()  # interPlan takes an empty list for one that was not made yet
+        vehicles = tuple(agents.vehicles)
     # nuPlan rule 709: interPlan seeds what it draws only where it changes agents
-    draws = cast.draws if codes.edits_agents(changes) else random.Random(0)
+    draws = agents.draws if codes.edits_agents(changes) else random.Random(0)
     past = _past(road, vehicles, draws)
     return Built(
         changes,
@@ -125,13 +113,10 @@ def build(scenario: Scenario, code: str, details: Mapping[str, Any]) -> Built:
         ego_edge,
         plan,
         tuple(vehicles),
-        tuple(cast.cones),
-        tuple(cast.pedestrians),
+        tuple(agents.cones),
+        tuple(agents.pedestrians),
         past,
     )
-
-
-NO_EDGE = -1
 
 
 def _logged(scenario: Scenario) -> tuple[Vehicle, ...]:
@@ -148,7 +133,7 @@ def _logged(scenario: Scenario) -> tuple[Vehicle, ...]:
     )
 
 
-class _Cast:
+class _Agents:
     """The vehicles, cones and pedestrians that a code puts into a scenario."""
 
     def __init__(
@@ -172,7 +157,7 @@ class _Cast:
         self.vehicles: list[Vehicle] = []
         self.bodies: list[Vehicle] = []
         self.areas: dict[int, shapely.Geometry] = {}
-        self.held: list[Vehicle] = []
+        self.spawned: list[Vehicle] = []
         self.cones: list[tuple[str, FloatArray]] = []
         self.pedestrians: list[Crossing] = []
 
@@ -257,7 +242,7 @@ class _Cast:
         velocity = self.ego[VX : VY + 1].copy() if speed else np.zeros(2)
         new = Vehicle(token, pose, own_size if size is None else size, velocity, behavior)
         area = self.areas[id(new)] = corridor(new)
-        self.held.append(new)  # ids are of objects that live
+        self.spawned.append(new)  # ids are of objects that live
         areas = [self.areas[id(other)] for other in self.vehicles]
         met = list(compress(self.vehicles, shapely.intersects(area, areas).tolist()))
         if met:
@@ -276,24 +261,16 @@ class _Cast:
 
 def corridor(vehicle: Vehicle) -> shapely.Geometry:
     """Where a vehicle will be within 2 s at its velocity, as wide as it is."""
-    line = straight_path(vehicle.pose, vehicle.size[0], vehicle.velocity, CORRIDOR_S)
-    return shapely.buffer(
-        shapely.LineString(line), vehicle.size[1] / 2.0, cap_style="flat", quad_segs=16
-    )
-
-
-def straight_path(
-    pose: FloatArray, length: float, velocity: FloatArray, seconds: float
-) -> FloatArray:
-    """(4, 2) from the rear of a box to its front after some seconds; velocity in its frame."""
-    x, y, heading = pose
+    x, y, heading = vehicle.pose
     cos, sin = np.cos(heading), np.sin(heading)
-    vx, vy = velocity[0] * cos - velocity[1] * sin, velocity[0] * sin + velocity[1] * cos
-    times = np.array([0.0, seconds])  # interPlan has points between, on the same straight line
-    half = length / 2.0
+    ahead, left = vehicle.velocity  # in the frame of the vehicle
+    vx, vy = ahead * cos - left * sin, ahead * sin + left * cos
+    times = np.array([0.0, CORRIDOR_S])  # interPlan has points between, on the same straight line
+    half = vehicle.size[0] / 2.0
     rear = (x + half * np.cos(heading + np.pi), y + half * np.sin(heading + np.pi))
     front = np.column_stack([x + times * vx + half * cos, y + times * vy + half * sin])
-    return np.concatenate([[rear, (x, y)], front])
+    line = shapely.LineString(np.concatenate([[rear, (x, y)], front]))
+    return shapely.buffer(line, vehicle.size[1] / 2.0, cap_style="flat", quad_segs=16)
 
 
 def _past(road: VectorMap, vehicles: tuple[Vehicle, ...], draws: random.Random) -> FloatArray:
@@ -342,23 +319,23 @@ def _segment(road: VectorMap, vehicle: Vehicle) -> tuple[int, float] | None:
 
 def assemble(scenario: Scenario, built: Built, edit: Edit) -> Scenario:
     """The scenario of what a code has made."""
-    draft = begin(scenario)
-    tracks, now = draft.tracks, draft.now
+    builder = begin(scenario)
+    tracks, now = builder.tracks, builder.now
     if codes.edits_agents(built.changes):
-        draft.keep(np.zeros(tracks.num_tracks, np.bool_))
+        builder.keep(np.zeros(tracks.num_tracks, np.bool_))
     else:
-        draft.keep(tracks.kinds != AgentKind.VEHICLE)
-    _add_vehicles(draft, built)
+        builder.keep(tracks.kinds != AgentKind.VEHICLE)
+    _add_vehicles(builder, built)
     for token, pose in built.cones:
-        draft.add(token, AgentKind.TRAFFIC_CONE, CONE, draft.still(pose))
+        builder.add(token, AgentKind.TRAFFIC_CONE, CONE, builder.still(pose))
     rows = len(scenario.time_us)
-    for walker in built.pedestrians:
+    for crossing in built.pedestrians:
         absent = np.zeros(rows, np.bool_)
-        draft.add(
-            walker.token,
+        builder.add(
+            crossing.token,
             AgentKind.PEDESTRIAN,
             PEDESTRIAN,
-            draft.still(walker.start),
+            builder.still(crossing.start),
             valid=absent,
         )
     plan = built.plan
@@ -367,33 +344,35 @@ def assemble(scenario: Scenario, built: Built, edit: Edit) -> Scenario:
         ego[scenario.iteration_rows[1:]] = built.initial
         ego[scenario.iteration_rows[1:], :3] = rear_poses(plan.centers[1:])
     ego[now] = built.initial
-    places = {token: i for i, token in enumerate(draft.tracks.tokens)}
+    places = {token: i for i, token in enumerate(builder.tracks.tokens)}
     stopped = [v.pose[:2] for v in built.vehicles if v.behavior == STOPPED]
     sorts = SORTS.get(built.scenario_type, "")
     obstacles = {
         "construction_zone": [pose[:2] for _, pose in built.cones],
         "stopped_vehicle": stopped,
-        "jaywalking_pedestrian": [walker.end for walker in built.pedestrians],
+        "jaywalking_pedestrian": [crossing.end for crossing in built.pedestrians],
     }.get(sorts, [])
+    letter = built.changes.get("observation", "")
+    policy = codes.POLICIES.get(letter, edit.agents or MANNERS[0])
     script = RolloutEvents(
         base=scenario.token,
         name=edit.name,
         digest=edit.digest,
         words=edit.words,
-        tokens=tuple(draft.touched),
-        behaviors=draft.behaviors,
-        manner=MANNERS.index(_manner(built, edit)),
+        tokens=tuple(builder.touched),
+        behaviors=builder.behaviors,
+        yielding=MANNERS.index(policy),
         crossings=tuple(replace(w, track=places[w.token]) for w in built.pedestrians),
-        finish=TerminationCondition(plan.line[:, :2], plan.end),
+        termination=TerminationCondition(plan.line[:, :2], plan.end),
         profile="interplan",
         sorts=sorts,
         obstacles=np.array(obstacles).reshape(-1, 2),
     )
     return replace(
-        draft.scenario,
+        builder.scenario,
         token=edited_id(scenario.token, edit),
         scenario_type=built.scenario_type,
-        tracks=draft.tracks,
+        tracks=builder.tracks,
         ego=ego,
         route=plan.route,
         mission_goal=plan.goal,
@@ -401,23 +380,16 @@ def assemble(scenario: Scenario, built: Built, edit: Edit) -> Scenario:
     )
 
 
-def _manner(built: Built, edit: Edit) -> str:
-    letters = {"a": "assertive", "c": "cautious", "m": "mixed"}
-    return letters.get(built.changes.get("observation", ""), edit.agents or MANNERS[0])
-
-
-_NUMBERS = ("size", "velocity")
-
-
-def _add_vehicles(draft: ScenarioBuilder, built: Built) -> None:
+def _add_vehicles(builder: ScenarioBuilder, built: Built) -> None:
     """The vehicles at iteration 0, and before it where they were with noise."""
-    scenario, now = draft.scenario, draft.now
+    scenario, now = builder.scenario, builder.now
     rows = now - scenario.row_step * np.arange(HISTORY, 0, -1)
     known = rows >= 0
     if not built.vehicles:
         return
     tokens, behaviors = zip(*((v.token, v.behavior) for v in built.vehicles), strict=True)
-    sizes, velocities = (np.array([getattr(v, n) for v in built.vehicles]) for n in _NUMBERS)
+    sizes = np.array([vehicle.size for vehicle in built.vehicles])
+    velocities = np.array([vehicle.velocity for vehicle in built.vehicles])
     shape = (len(scenario.time_us), len(tokens))
     poses = np.empty((*shape, 3))
     poses[:] = [vehicle.pose for vehicle in built.vehicles]
@@ -427,4 +399,4 @@ def _add_vehicles(draft: ScenarioBuilder, built: Built) -> None:
     valid[rows[known]] = True
     valid[now:, np.array(behaviors) == STOPPED] = True
     moves = np.broadcast_to(velocities, (*shape, 2))
-    draft.add_all(tokens, AgentKind.VEHICLE, sizes, poses, valid, moves, behaviors=behaviors)
+    builder.add_all(tokens, AgentKind.VEHICLE, sizes, poses, valid, moves, behaviors=behaviors)

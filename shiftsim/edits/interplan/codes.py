@@ -5,10 +5,8 @@ Letters are a (share of vehicles kept), d (density), g (goal), o (manner of the 
 """
 
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any
 
-from shiftsim.data.nuplan.filter import read_yaml
 from shiftsim.edits.spec import MANNERS
 from shiftsim.errors import ConfigError
 
@@ -21,7 +19,7 @@ LETTERS = {
 }
 DENSITIES = {"l": "low", "m": "medium", "h": "high"}
 COMMANDS = {"l": "left", "r": "right", "s": "straight"}
-_MANNERS = {"a": "assertive", "c": "cautious", "m": "mixed"}
+POLICIES = {"a": "assertive", "c": "cautious", "m": "mixed"}
 _EDITS_AGENTS = ("density", "amount_of_agents", "special_scenario")
 DETAILS = "modification_details_dictionary"
 
@@ -137,25 +135,26 @@ def manners_in_force(names: Iterable[str], details: Mapping[str, Any]) -> dict[s
     for token, codes in sorted(group_names(names).items()):
         for code in codes:
             changes = changes_of(code, details.get(token) or {})
-            mode = _MANNERS.get(changes.get("observation", ""), mode)
+            mode = POLICIES.get(changes.get("observation", ""), mode)
             out[f"{token}-{code}"] = mode
     return out
 
 
-def import_names(names: Path, modifications: Path, window: float = 30.0) -> dict[str, Any]:
+def import_names(
+    names: Mapping[str, Any], modifications: Mapping[str, Any], window: float = 30.0
+) -> dict[str, Any]:
     """The table of an `edits.toml` for a list of interPlan's names and its modifications.
 
-    Both are the files of interPlan's repository, which are not part of this package. The `window`
-    is the duration of the scenarios [s], 0 for the recorded one.
+    Both are what the files of interPlan's repository hold, which are not part of this package. The
+    `window` is the duration of the scenarios [s], 0 for the recorded one.
 
     Raises:
-        ConfigError: A file cannot be read, or a code is wrong.
+        ConfigError: They do not hold it, or a code is wrong.
     """
-    listed = read_yaml(names).get("scenario_tokens")
-    details = read_yaml(modifications).get(DETAILS)
+    listed, details = names.get("scenario_tokens"), modifications.get(DETAILS)
     if not isinstance(listed, list) or not isinstance(details, dict):
         raise ConfigError(
-            f"{str(names)!r} lists no scenario_tokens, or {str(modifications)!r} has no {DETAILS}",
+            f"the first file lists no scenario_tokens, or the second one has no {DETAILS}",
             hint="name interPlan's filter first, then its interPlan_modifications.yaml",
         )
     details = {str(token): found or {} for token, found in details.items()}

@@ -1,29 +1,34 @@
 """Route, lanes, goal and expert of a scenario of interPlan."""
 
-from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import shapely
 
-from shiftsim.edits.draft import EGO_SIZE
+from shiftsim.edits.builder import EGO_SIZE
 from shiftsim.edits.interplan.codes import COMMANDS
-from shiftsim.edits.route import TOLERANCE, by_command, cut_by_time, edge_at, plan_line
+from shiftsim.edits.route import (
+    TOLERANCE,
+    by_command,
+    cut_by_time,
+    edge_at,
+    plan_lanes,
+    plan_line,
+)
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.polylines import vertex_headings
 from shiftsim.kernels import FloatArray
-from shiftsim.metrics.interplan import simplified
-from shiftsim.metrics.route import driven_route
 from shiftsim.world.lanes import nearest_heading, start_on
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import center_poses
 
 _NEAR = 300.0  # m, how far from the ego lanes of a route may be
-_FAR = 10000  # lanes
+# lanes that box centres (K, 3) were on, in turn: metrics.interplan.driven_lanes
+DrivenLanes: TypeAlias = Callable[[VectorMap, FloatArray], list[int]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +48,7 @@ def make_plan(
     changes: Mapping[str, Any],
     details: Mapping[str, Any],
     initial: FloatArray,
+    driven_lanes: DrivenLanes,
 ) -> Plan:
     """Route, lanes, goal and expert; the ego starts in the state `initial` (11,).
 
@@ -53,7 +59,9 @@ def make_plan(
     expert = center_poses(scenario.expert[:, :3])
     letter = changes.get("goal")
     if letter is None:
-        lanes = _driven_lanes(road, expert)
+        lanes = driven_lanes(road, expert)
+        if not lanes:
+            raise ConfigError("the expert is on no lane")
         line = plan_line(road, lanes, center)
         goal = scenario.expert[-1, :3].copy()
         return Plan(scenario.route, tuple(lanes), goal, line, expert, _end(line, goal))
@@ -93,14 +101,6 @@ def _end(line: FloatArray, goal: FloatArray) -> float:
     return float(shapely.line_locate_point(path, shapely.Point(goal[:2]))) - TOLERANCE
 
 
-def _driven_lanes(road: VectorMap, centers: FloatArray) -> list[int]:
-    """The first edge of each stretch that the expert drove, as nuPlan simplifies a route."""
-    lanes = [edges[0] for edges in simplified(driven_route(road, centers))]
-    if not lanes:
-        raise ConfigError("the expert is on no lane")
-    return lanes
-
-
 def _first_block(road: VectorMap, center: FloatArray) -> int:
     x, y = float(center[0]), float(center[1])
     is_lane = bool(road.lanes_at(x, y))
@@ -116,7 +116,7 @@ def _first_block(road: VectorMap, center: FloatArray) -> int:
 def _by_command(road: VectorMap, blocks: list[int]) -> list[int]:
     within = {int(edge) for block in blocks for edge in road.block_edges.at(block)}
     goal = int(road.block_edges.at(blocks[-1])[-1])
-    return _plan(road, blocks[0], goal, within, len(blocks))
+    return _plan_lanes(road, blocks[0], goal, within, len(blocks))
 
 
 def _to_goal(road: VectorMap, center: FloatArray, first: int, goal: int) -> list[int]:
@@ -124,64 +124,11 @@ def _to_goal(road: VectorMap, center: FloatArray, first: int, goal: int) -> list
     within = {int(edge) for block in near for edge in road.block_edges.at(block)}
     if goal not in within:
         raise ConfigError("the goal is too far away")
-    return _plan(road, first, goal, within, len(near))
+    return _plan_lanes(road, first, goal, within, len(near))
 
 
-def _plan(road: VectorMap, first: int, goal: int, within: set[int], depth: int) -> list[int]:
-    lanes: list[int] = []
-    found = False
-    for start in road.block_edges.at(first).tolist():
-        plan, found, has_change = _search(road, start, goal, within, depth)
-        if found:
-            lanes = plan
-            if not has_change:
-                break
-        elif not lanes:
-            unsuccessful = plan
-    # nuPlan rule 711: the last lane tried decides
-    if not found:
+def _plan_lanes(road: VectorMap, first: int, goal: int, within: set[int], depth: int) -> list[int]:
+    lanes = plan_lanes(road, first, goal, within, depth, keeps_oddities=True)
+    if not lanes:
         raise ConfigError("no lanes lead to the goal from the last lane beside the ego")
-    return lanes or unsuccessful
-
-
-def _search(
-    road: VectorMap, start: int, goal: int, within: set[int], depth: int
-) -> tuple[list[int], bool, bool]:
-    """Lanes from one to another, whether there is such a way, and whether it changes lane at last.
-
-    nuPlan rule 711: an edge that is queued after a hit beside the goal takes its place.
-    """
-    queue: deque[int | None] = deque([start, None])
-    parents: dict[tuple[int, int], int | None] = {(start, 1): None}
-    level, end, end_level = 1, start, 1
-    nearest, found, has_change = _FAR, False, False
-    block = int(road.block_of[goal])
-    while queue:
-        edge = queue.popleft()
-        if level > depth:
-            break
-        if edge is None:
-            level += 1
-            queue.append(None)
-            if queue[0] is None:
-                break
-            continue
-        if edge == goal:
-            end, end_level, found, has_change = edge, level, True, False
-            break
-        if int(road.block_of[edge]) == block and not road.is_connector(goal):
-            gap = abs(int(road.lane_index[goal]) - int(road.lane_index[edge]))
-            if gap < nearest:
-                nearest = gap
-                parents[goal, level] = parents[edge, level]
-                end, end_level, found, has_change = goal, level, True, True
-        for after in road.outgoing.at(edge).tolist():
-            if after in within:
-                queue.append(after)
-                parents[after, level + 1] = edge
-                end, end_level = after, level + 1
-    path = [end]
-    while (before := parents[end, end_level]) is not None:
-        path.append(before)
-        end, end_level = before, end_level - 1
-    return path[::-1], found, has_change
+    return lanes

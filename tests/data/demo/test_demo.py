@@ -7,8 +7,9 @@ from shiftsim.benchmarks import known_sets
 from shiftsim.data.demo.paths import STEP
 from shiftsim.data.demo.store import bench_scene, convert_demo, demo_store, write_demo
 from shiftsim.data.demo.towns import avenue_town, parking_town
-from shiftsim.data.readers.deepplan.windows import overlap_partners
-from shiftsim.data.readers.dsc3d.recording import open_site, read_recording
+from shiftsim.data.readers.annotations import read_recording
+from shiftsim.data.readers.dsc3d import open_site
+from shiftsim.data.readers.windows import overlap_partners
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.metrics import compute_metrics
 from shiftsim.planners.registry import load_planner

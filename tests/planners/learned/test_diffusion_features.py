@@ -221,9 +221,9 @@ def test_lanes_that_share_their_nearest_vertex_come_by_area_then_as_listed():
     assert kernels.nearest_lanes(np.arange(4), areas, lines, 0.0, 0.0, 2).tolist() == [1, 3]
 
 
-def test_kernels_are_plain_python_too():
+def test_the_bounds_of_a_line_are_those_of_its_vertices():
     line = make_polylines([np.array([[0.0, 0], [10, 0]])])
-    assert kernels.line_bounds.py_func(line).tolist() == [[0, 0, 10, 0]]
+    assert kernels.line_bounds(line).tolist() == [[0, 0, 10, 0]]
 
 
 def test_in_a_city_seventy_lanes_are_seen():

@@ -11,7 +11,7 @@ from worlds import cruise_scenario, standing_tracks, straight_road
 
 import shiftsim
 from shiftsim.data.demo import files as demo_files
-from shiftsim.data.readers.deepplan.convert import convert_dsc3d
+from shiftsim.data.readers.dsc3d import convert_dsc3d
 from shiftsim.data.store.reading import open_store
 from shiftsim.metrics import compute_metrics
 from shiftsim.planners.contract import check_planner

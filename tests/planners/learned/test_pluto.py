@@ -16,9 +16,8 @@ from shiftsim.world.state import HEADING, VX, AgentKind, LightStatus, TrafficLig
 
 torch = pytest.importorskip("torch")
 
-from shiftsim.planners.learned.pluto.inputs import stack  # noqa: E402  # needs torch
-from shiftsim.planners.learned.pluto.network import Inputs, build_network  # noqa: E402  # needs torch
-from shiftsim.planners.learned.pluto.planner import NO_LINE, Pluto  # noqa: E402  # needs torch
+from shiftsim.planners.learned.pluto.network import build_network  # noqa: E402  # needs torch
+from shiftsim.planners.learned.pluto.planner import NO_LINE, Pluto, make_batch  # noqa: E402
 
 pytestmark = pytest.mark.learned
 
@@ -122,7 +121,7 @@ def test_official_masks_of_a_batch_matter_only_where_numbers_of_lines_differ(rou
         network.load_state_dict(rough.network.state_dict())
         network.eval()
     alike, unlike = (
-        [network(Inputs(*stack(batch, "cpu"))).trajectory for network in (official, ours)]
+        [network(make_batch(batch, "cpu")).trajectory for network in (official, ours)]
         for batch in ([two, two], [two, one])
     )
     assert torch.equal(*alike)

@@ -9,7 +9,7 @@ from worlds import cruise_scenario, moved, standing_tracks, straight_road
 from shiftsim.errors import CheckpointError, ConfigError, TrafficError
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import simulate
-from shiftsim.sim.traffic import following
+from shiftsim.sim.traffic import lanes as following
 from shiftsim.sim.traffic.learned import features, network
 from shiftsim.sim.traffic.learned.model import LearnedTraffic
 from shiftsim.sim.traffic.mixed import Mixed

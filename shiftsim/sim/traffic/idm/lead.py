@@ -1,37 +1,22 @@
-"""Whom an agent follows: whoever is nearest in the corridor ahead, which its path makes."""
+"""Whom an agent follows: whoever is nearest in the corridor ahead, which its path makes.
 
-from typing import NamedTuple
+The corridor is the path ahead, buffered by half the width of the agent with flat ends.
+"""
 
 import numpy as np
 
-from shiftsim.geometry.polylines import RUN, bound_runs, runs_of
+from shiftsim.geometry.rings import ring_segment_distance
 from shiftsim.kernels import FloatArray, kernel
 from shiftsim.sim.traffic.idm.buffer import buffer_curve
-from shiftsim.sim.traffic.idm.courtesy import ignores_ego_ahead
-from shiftsim.sim.traffic.idm.paths import look_ahead
+from shiftsim.sim.traffic.idm.gaps import bound_ring, ring_gap
+from shiftsim.sim.traffic.idm.paths import cut_path
 from shiftsim.sim.traffic.idm.scene import PROGRESS, Footprints, Scene, Scratch
-from shiftsim.sim.traffic.idm.shapes import (
-    MEETING,
-    OUTER,
-    UNSURE,
-    last_near_run,
-    ring_gap,
-    touches_corridor,
-)
-from shiftsim.sim.traffic.lights import RED
+from shiftsim.sim.traffic.idm.yielding import ignores_ego_ahead
+from shiftsim.sim.traffic.lanes import RED
 
 FREE, OFF_PATH = -1, -2  # instead of a footprint: nobody ahead; outside of the own corridor
-_TIE, _TINY = 1e-12, 1e-300  # gaps are looked for a little beyond the best, to see ties
-_MARGIN = 1.1  # corridors lie within this many half widths of their line
-
-
-class Corridor(NamedTuple):
-    """The path ahead of an agent, which is buffered by half its width with flat ends."""
-
-    line: FloatArray  # (K, 2) vertices, those before the agent included [m]
-    runs: FloatArray  # (R, 4) bounds of its runs of segments [m]
-    first: int  # the vertex at which the agent is
-    half_width: float  # of the buffer [m]
+_OUTER = 1.02  # corridors lie within this many half widths of their line
+_TOUCH = 1e-3  # m, gaps below this are looked at closely
 
 
 @kernel
@@ -43,141 +28,107 @@ def find_lead(scene: Scene, agent: int) -> tuple[int, float]:
         footprints [m].
     """
     fleet, footprints, scratch = scene.fleet, scene.footprints, scene.scratch
-    look_ahead(fleet, agent)
-    size = fleet.path_size[agent]
-    line, runs = fleet.line[agent, :size], fleet.runs[agent, : runs_of(size)]
-    corridor = Corridor(line, runs, fleet.first[agent], 0.5 * fleet.size[agent, 1])
-    path_end = fleet.path[agent, size - 1, PROGRESS]
-    if not fleet.progress[agent] < path_end and not _in_corridor(
-        footprints, agent, corridor, scratch
-    ):
+    path, size, progress = fleet.path[agent], fleet.path_size[agent], fleet.progress[agent]
+    path_end, half_width = path[size - 1, PROGRESS], 0.5 * fleet.size[agent, 1]
+    line = scratch.line[: cut_path(path, size, progress, path_end, scratch.line)]
+    scratch.outline_size[0] = -1
+    if not progress < path_end and not _in_corridor(footprints, agent, line, half_width, scratch):
         return OFF_PATH, 0.0  # nuPlan rule 128
-    hidden, ahead = FREE, len(scene.agents) + 1
-    if footprints.present[ahead] and _in_corridor(footprints, ahead, corridor, scratch):
-        hidden = ahead if ignores_ego_ahead(scene, agent) else FREE
-    found = _list_near(footprints, agent, corridor, scratch)
-    best, lead = np.inf, FREE
-    for _ in range(found):
-        nearest = 0
-        for index in range(1, found):
-            apart, least = scratch.apart[index], scratch.apart[nearest]
-            if apart < least or (apart == least and scratch.near[index] < scratch.near[nearest]):
-                nearest = index
-        if scratch.apart[nearest] > best:
-            break
-        scratch.apart[nearest] = np.inf
-        other = scratch.near[nearest]
-        if other == hidden or (best == 0.0 and other > lead):
+    ignored, ahead = FREE, len(scene.agents) + 1
+    if (
+        footprints.present[ahead]
+        and _in_corridor(footprints, ahead, line, half_width, scratch)
+        and ignores_ego_ahead(scene, agent)
+    ):
+        ignored = ahead
+    reach, area = _OUTER * half_width, np.array([np.inf, np.inf, -np.inf, -np.inf])
+    bound_ring(line, area)
+    best, lead, own = np.inf, FREE, footprints.bounds[agent]
+    for other in range(len(footprints.present)):
+        bounds = footprints.bounds[other]
+        is_near = (
+            footprints.present[other]
+            & (bounds[0] <= area[2] + reach)
+            & (bounds[1] <= area[3] + reach)
+            & (bounds[2] >= area[0] - reach)
+            & (bounds[3] >= area[1] - reach)
+        )
+        if not is_near or other == agent or other == ignored:
             continue
-        is_first = lead == FREE  # then what is ahead is the cheaper question
-        if is_first and not _in_corridor(footprints, other, corridor, scratch):
-            continue
-        gap = _gap(footprints, agent, other, best * (1.0 + _TIE) + _TINY)
-        closer = gap < best or (gap == best and other < lead)
-        if is_first or (closer and _in_corridor(footprints, other, corridor, scratch)):
-            best, lead = gap, other
-    gap = _stop_gap(scene, agent, corridor, best)
-    return (len(footprints.present), gap) if gap < best else (lead, best)
-
-
-@kernel
-def _stop_gap(scene: Scene, agent: int, corridor: Corridor, limit: float) -> float:
-    """Distance from an agent's footprint to the red stop lines of its route, at most `limit`."""
-    fleet, graph, scratch = scene.fleet, scene.graph, scene.scratch
-    stops, stop_lines = graph.stops, graph.stop_lines
-    best = limit
+        apart_x = max(own[0] - bounds[2], bounds[0] - own[2])
+        apart_y = max(own[1] - bounds[3], bounds[1] - own[3])
+        if max(apart_x, apart_y) < best and _in_corridor(
+            footprints, other, line, half_width, scratch
+        ):
+            gap = best
+            if other < len(footprints.curve) and footprints.curve_size[other]:
+                curve = footprints.curve[other, : footprints.curve_size[other]]
+                gap = _gap_to(footprints, agent, curve, gap)
+            gap = _gap_to(footprints, agent, footprints.box[other], gap)
+            if gap < best:
+                best, lead = gap, other
+    graph = scene.graph
     for segment in range(fleet.route_size[agent]):
         edge = fleet.route[agent, segment]
         if not graph.lights[edge] & RED:
             continue
-        for entry in range(stop_lines.ptr[edge], stop_lines.ptr[edge + 1]):
-            stop = stop_lines.items[entry]
-            shell = stops.poly_ptr[stop]
-            ring = stops.xy[stops.ring_ptr[shell] : stops.ring_ptr[shell + 1]]
-            if _meets(corridor, ring, stops.bounds[stop], scratch):
-                best = _ring_gap(scene.footprints, agent, ring, best)
-    return best
+        for entry in range(graph.stop_lines.ptr[edge], graph.stop_lines.ptr[edge + 1]):
+            stop = graph.stop_lines.items[entry]
+            shell = graph.stops.poly_ptr[stop]
+            ring = graph.stops.xy[graph.stops.ring_ptr[shell] : graph.stops.ring_ptr[shell + 1]]
+            if _touches_corridor(line, half_width, ring, graph.stops.bounds[stop], scratch):
+                gap = _gap_to(footprints, agent, ring, best)
+                if gap < best:
+                    best, lead = gap, len(footprints.present)
+    return lead, best
 
 
 @kernel
-def _list_near(footprints: Footprints, agent: int, corridor: Corridor, scratch: Scratch) -> int:
-    """List footprints whose bounds come near the corridor, in `scratch.near`; returns how many.
-
-    `scratch.apart` gets lower bounds of their gaps to the agent.
-    """
-    bounds, runs, margin = footprints.bounds, corridor.runs, _MARGIN * corridor.half_width
-    low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
-    begin = corridor.first // RUN
-    for run in range(begin, len(runs)):
-        low_x, low_y = min(low_x, runs[run, 0]), min(low_y, runs[run, 1])
-        high_x, high_y = max(high_x, runs[run, 2]), max(high_y, runs[run, 3])
-    low_x, low_y, high_x, high_y = low_x - margin, low_y - margin, high_x + margin, high_y + margin
-    found = 0
-    for other in range(len(bounds)):
-        # one branch: which of the five fails cannot be foreseen
-        is_near = (
-            footprints.present[other]
-            & (bounds[other, 0] <= high_x)
-            & (bounds[other, 1] <= high_y)
-            & (bounds[other, 2] >= low_x)
-            & (bounds[other, 3] >= low_y)
-        )
-        if is_near and other != agent and last_near_run(runs, begin, margin, bounds[other]) >= 0:
-            apart_x = max(bounds[agent, 0] - bounds[other, 2], bounds[other, 0] - bounds[agent, 2])
-            apart_y = max(bounds[agent, 1] - bounds[other, 3], bounds[other, 1] - bounds[agent, 3])
-            scratch.near[found] = other
-            scratch.apart[found] = max(apart_x, apart_y)
-            found += 1
-    return found
-
-
-@kernel
-def _in_corridor(footprints: Footprints, other: int, corridor: Corridor, scratch: Scratch) -> bool:
-    """Whether a footprint meets a corridor."""
+def _in_corridor(
+    footprints: Footprints, other: int, line: FloatArray, half_width: float, scratch: Scratch
+) -> bool:
+    """Whether a footprint meets the corridor of a line."""
     bounds = footprints.bounds[other]
-    if _meets(corridor, footprints.box[other], bounds, scratch):
+    if _touches_corridor(line, half_width, footprints.box[other], bounds, scratch):
         return True
     if other >= len(footprints.curve) or footprints.curve_size[other] == 0:
         return False
     curve = footprints.curve[other, : footprints.curve_size[other]]
-    return _meets(corridor, curve, bounds, scratch)
+    return _touches_corridor(line, half_width, curve, bounds, scratch)
 
 
 @kernel
-def _meets(corridor: Corridor, ring: FloatArray, bounds: FloatArray, scratch: Scratch) -> bool:
-    """Whether a ring with the given bounds (4,) meets a corridor."""
-    first, half_width = corridor.first, corridor.half_width
-    found = touches_corridor(corridor.line, corridor.runs, first, half_width, ring, bounds)
-    if found != UNSURE:
-        return found == MEETING
-    # of the exact corridor only what comes up to the ring is needed, and a run to spare
-    line = corridor.line[first:]
-    runs = scratch.runs[: runs_of(len(line))]
-    bound_runs(line, runs)
-    last = max(last_near_run(runs, 0, half_width * OUTER, bounds), 0)
-    near = min((last + 2) * RUN + 1, len(line))
-    outline = buffer_curve(line[:near], half_width, scratch.keep, scratch.outline)
-    return ring_gap(ring, scratch.outline[:outline], 1e-3) == 0.0
+def _touches_corridor(
+    line: FloatArray, half_width: float, ring: FloatArray, bounds: FloatArray, scratch: Scratch
+) -> bool:
+    """Whether a ring with the given bounds (4,) meets the corridor of a line (K, 2)."""
+    # a buffer lies within 2 % of its distance: round joins are segmented, shallow vertices left out
+    reach, nearest, starts_outside = _OUTER * half_width, np.inf, False
+    for vertex in range(1, len(line)):
+        a, b = line[vertex - 1], line[vertex]
+        if (
+            min(a[0], b[0]) <= bounds[2] + reach
+            and max(a[0], b[0]) >= bounds[0] - reach
+            and min(a[1], b[1]) <= bounds[3] + reach
+            and max(a[1], b[1]) >= bounds[1] - reach
+        ):
+            gap = ring_segment_distance(ring, a, b, reach, starts_outside)
+            if gap == 0.0:
+                return True
+            nearest, starts_outside = min(nearest, gap), True
+    if nearest == np.inf:
+        return False
+    if scratch.outline_size[0] < 0:
+        scratch.outline_size[0] = buffer_curve(line, half_width, scratch.outline)
+    return ring_gap(ring, scratch.outline[: scratch.outline_size[0]], _TOUCH) == 0.0
 
 
 @kernel
-def _gap(footprints: Footprints, agent: int, other: int, limit: float) -> float:
-    """Distance between the footprint of an agent and another one, at most `limit` [m]."""
-    best = limit
-    if other < len(footprints.curve) and footprints.curve_size[other]:
-        curve = footprints.curve[other, : footprints.curve_size[other]]
-        best = _ring_gap(footprints, agent, curve, best)
-    if best > 0.0:
-        best = _ring_gap(footprints, agent, footprints.box[other], best)
-    return best
-
-
-@kernel
-def _ring_gap(footprints: Footprints, agent: int, ring: FloatArray, limit: float) -> float:
+def _gap_to(footprints: Footprints, agent: int, ring: FloatArray, limit: float) -> float:
     """Distance from an agent's footprint to a ring, at most `limit` [m]."""
-    best = limit
+    gap = limit
     if footprints.curve_size[agent]:
-        best = ring_gap(footprints.curve[agent, : footprints.curve_size[agent]], ring, best)
-    if best > 0.0:
-        best = ring_gap(footprints.box[agent], ring, best)
-    return best
+        gap = ring_gap(footprints.curve[agent, : footprints.curve_size[agent]], ring, gap)
+    if gap > 0.0:
+        gap = ring_gap(footprints.box[agent], ring, gap)
+    return gap

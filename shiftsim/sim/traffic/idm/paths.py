@@ -9,9 +9,10 @@ unwrapped along the path and wrapped when a pose is read.
 import numpy as np
 
 from shiftsim.geometry.boxes import box_corners, wrap_angle
-from shiftsim.geometry.polylines import bound_runs, interpolate, runs_of, vertex_heading
+from shiftsim.geometry.polylines import interpolate, vertex_heading
 from shiftsim.kernels import FloatArray, kernel
 from shiftsim.sim.traffic.idm.buffer import buffer_curve
+from shiftsim.sim.traffic.idm.gaps import bound_ring
 from shiftsim.sim.traffic.idm.scene import (
     HEADING,
     MAX_ROUTE,
@@ -22,8 +23,7 @@ from shiftsim.sim.traffic.idm.scene import (
     LaneGraph,
     Scene,
 )
-from shiftsim.sim.traffic.idm.shapes import bound_ring
-from shiftsim.sim.traffic.lights import GREEN, RED
+from shiftsim.sim.traffic.lanes import GREEN, RED
 from shiftsim.world.lanes import initial_curvature
 from shiftsim.world.layers import Polylines
 
@@ -156,8 +156,12 @@ def extend_route(fleet: Fleet, agent: int, graph: LaneGraph, parameters: IdmPara
         raw = append_baseline(graph.baselines, chosen, path, raw)
         fleet.path_size[agent] = finish_path(path, raw)
         fleet.progress[agent] = 0.0
-        _remember(fleet, agent, chosen)
-        fleet.first[agent] = -1
+        route, last = fleet.route[agent], fleet.route_size[agent]
+        if last == MAX_ROUTE:  # the oldest edge is dropped
+            route[:-1] = route[1:].copy()
+            last -= 1
+        route[last] = chosen
+        fleet.route_size[agent] = last + 1
 
 
 @kernel
@@ -183,18 +187,6 @@ def _drop_driven(path: FloatArray, size: int, progress: float) -> int:
 
 
 @kernel
-def _remember(fleet: Fleet, agent: int, edge: int) -> None:
-    """Append an edge to the route of an agent, and drop the oldest one where it is full."""
-    route, size = fleet.route[agent], fleet.route_size[agent]
-    if size == MAX_ROUTE:
-        for index in range(MAX_ROUTE - 1):
-            route[index] = route[index + 1]
-        size -= 1
-    route[size] = edge
-    fleet.route_size[agent] = size + 1
-
-
-@kernel
 def set_box(
     footprints: Footprints,
     index: int,
@@ -213,27 +205,7 @@ def set_box(
 
 
 @kernel
-def look_ahead(fleet: Fleet, agent: int) -> None:
-    """Make the `line` of an agent begin where it is; agents do not drive backwards."""
-    path, size, line = fleet.path[agent], fleet.path_size[agent], fleet.line[agent]
-    if fleet.first[agent] < 0:
-        for vertex in range(size - 1):
-            line[vertex, 0], line[vertex, 1] = path[vertex, 0], path[vertex, 1]
-        end = point_on_path(path, size, path[size - 1, PROGRESS])
-        line[size - 1, 0], line[size - 1, 1] = end
-        bound_runs(line[:size], fleet.runs[agent, : runs_of(size)])
-    progress = clamp_progress(path, size, fleet.progress[agent])
-    after = first_after(path, size, progress)
-    fleet.first[agent] = min(after, size - 1) - 1
-    if after < size:
-        line[after - 1, 0], line[after - 1, 1] = _point_before(path, after, progress)
-        return
-    for vertex in range(size - 2, size):  # nuPlan rule 127: at its end two vertices are left
-        line[vertex, 0], line[vertex, 1] = path[vertex, 0], path[vertex, 1]
-
-
-@kernel
-def _cut(path: FloatArray, size: int, start: float, stop: float, line: FloatArray) -> int:
+def cut_path(path: FloatArray, size: int, start: float, stop: float, line: FloatArray) -> int:
     """Write a path between two progresses, clamped to it, into `line` (K, 2); returns its size."""
     first, last = clamp_progress(path, size, start), clamp_progress(path, size, stop)
     after = first_after(path, size, first)
@@ -255,9 +227,9 @@ def _cut(path: FloatArray, size: int, start: float, stop: float, line: FloatArra
 
 
 @kernel
-def move_agent(scene: Scene, agent: int) -> int:
-    """Pose and footprint of an agent from its progress; returns -1 where a curve is too long."""
-    fleet, footprints, scratch = scene.fleet, scene.footprints, scene.scratch
+def move_agent(scene: Scene, agent: int) -> None:
+    """Pose and footprint of an agent from its progress."""
+    fleet, footprints, line = scene.fleet, scene.footprints, scene.scratch.line
     path, size = fleet.path[agent], fleet.path_size[agent]
     progress = fleet.progress[agent]
     x, y, heading = pose_on_path(path, size, clamp_progress(path, size, progress))
@@ -265,9 +237,7 @@ def move_agent(scene: Scene, agent: int) -> int:
     length, width = fleet.size[agent, 0], fleet.size[agent, 1]
     set_box(footprints, agent, x, y, heading, length, width)
     front = progress + 0.5 * length + fleet.speed[agent] * scene.parameters.headway
-    points = _cut(path, size, progress - 0.5 * length, front, scratch.line)
+    points = cut_path(path, size, progress - 0.5 * length, front, line)
     curve = footprints.curve[agent]
-    made = buffer_curve(scratch.line[:points], 0.5 * width, scratch.keep, curve)
-    footprints.curve_size[agent] = max(made, 0)
+    footprints.curve_size[agent] = buffer_curve(line[:points], 0.5 * width, curve)
     bound_ring(curve[: footprints.curve_size[agent]], footprints.bounds[agent])
-    return made

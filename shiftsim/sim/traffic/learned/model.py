@@ -14,7 +14,7 @@ from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.sim.traffic import Move
-from shiftsim.sim.traffic.following import NO_LANE, Lanes, lanes_of
+from shiftsim.sim.traffic.lanes import NO_LANE, RED, Lanes, lanes_of, light_flags
 from shiftsim.sim.traffic.learned.features import (
     NUM_FEATURES,
     Motion,
@@ -22,7 +22,6 @@ from shiftsim.sim.traffic.learned.features import (
     observe_agents,
 )
 from shiftsim.sim.traffic.learned.network import WEIGHTS, controls, digest, load_weights
-from shiftsim.sim.traffic.lights import RED, light_flags
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import (
     LAST_AGENT_KIND,
