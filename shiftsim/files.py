@@ -2,8 +2,7 @@
 
 Nothing else in the project looks at environment variables for folders, and no file is ever seen
 half written: `atomic_write` is the one way to replace one. What a file that may be anybody's names
-is looked for inside its folder only, with `safe_join`. `sources` says what a module of ours is made
-of, so that caches and runs notice when it changes.
+is looked for inside its folder only, with `safe_join`.
 """
 
 import json
@@ -12,7 +11,7 @@ import re
 import sys
 import tomllib
 import traceback
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import import_module
@@ -220,18 +219,6 @@ def load_attribute(what: str, name: str, hint: str) -> Any:
         return getattr(import_named(module), attribute)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"{what} {name!r} cannot be imported: {error}", hint) from error
-
-
-def sources(paths: Iterable[Path]) -> dict[str, bytes]:
-    """Modules of ours, below `PACKAGE`, and all that they import: their text by path."""
-    waiting = [path.relative_to(PACKAGE).as_posix() for path in paths]
-    found = dict[str, bytes]()
-    while waiting:
-        name = waiting.pop()
-        if name not in found:
-            found[name], imported = read_module(name)
-            waiting += imported
-    return found
 
 
 @cache

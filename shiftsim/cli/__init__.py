@@ -29,7 +29,6 @@ from shiftsim.runs.config import RunConfig, parse_argument
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress.")]
-Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
 
 
 def new_app(help: str = "", **settings: Any) -> typer.Typer:
@@ -279,6 +278,7 @@ app = new_app(
 @app.callback(invoke_without_command=True)
 def _options(
     version: bool = typer.Option(False, "--version", help="Print the version and leave."),
+    debug: bool = typer.Option(False, "--debug", help="With any command: show tracebacks."),
 ) -> None:
     """Closed-loop evaluation of driving planners with nuPlan's semantics."""
     if version:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from shiftsim import cli
-from shiftsim.cli import Debug, Json, Quiet, plural, say, say_json, show, stdout_to_stderr
+from shiftsim.cli import Json, Quiet, plural, say, say_json, show, stdout_to_stderr
 from shiftsim.cli.run import DryRun, Live, progress_of, say_dry_run, say_provenance
 
 if TYPE_CHECKING:
@@ -64,7 +64,6 @@ def bench(
     live: Live = False,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Run a benchmark track with all its traffic modes, noises and seeds, and report it.
 
@@ -184,7 +183,7 @@ def _pictures(groups: "Sequence[Group]", allow_partial: bool) -> "list[Figure]":
         return []
 
 
-def data(as_json: Json = False, debug: Debug = False) -> None:
+def data(as_json: Json = False) -> None:
     """Stores, maps, splits and checkpoints that are there, and what each benchmark row lacks."""
     from shiftsim.benchmarks.inventory import list_available_data
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from shiftsim.cli import Advance, Debug, Json, Quiet, progress_bar, say, show
+from shiftsim.cli import Advance, Json, Quiet, progress_bar, say, show
 
 _DATA = 2
 
@@ -27,7 +27,6 @@ def verify(
     require_all: Annotated[
         bool, typer.Option("--require-all", help="Exit with 3 if anything is not covered.")
     ] = False,
-    debug: Debug = False,
 ) -> None:
     """Compare results of your own from nuPlan with what shiftsim computes.
 
@@ -69,7 +68,6 @@ def doctor(
     ] = False,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Versions, cores and memory, and whether the kernels compute what they should."""
     kernels = None

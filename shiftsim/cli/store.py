@@ -7,7 +7,6 @@ import typer
 
 from shiftsim import cli
 from shiftsim.cli import (
-    Debug,
     Json,
     Quiet,
     new_app,
@@ -38,7 +37,6 @@ Store = Annotated[
 def check(
     store: Store,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Validate a store: files, units, motion, maps and routes; lists every problem.
 
@@ -102,7 +100,6 @@ def filter_scenarios(
     settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Drive every scenario as recorded; drop those with a collision, off the road or standing.
 
@@ -190,7 +187,6 @@ def make_split(
     *,
     settings: cli.Settings,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Write a list of scenarios that --split takes, the same however often it is written.
 
@@ -222,7 +218,6 @@ def export_to_nuplan(
     settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Write scenarios as nuPlan logs (.db) and maps (map.gpkg), one log per scenario.
 
@@ -280,7 +275,6 @@ def show_stats(
     settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Scenarios, agents, speeds, lengths and interactions, per city and in all."""
     from shiftsim.data.store.statistics import store_stats

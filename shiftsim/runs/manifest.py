@@ -15,14 +15,21 @@ from typing import Any, Literal, TypeAlias
 
 from shiftsim._version import __version__
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.files import PACKAGE, sources
+from shiftsim.files import PACKAGE
 from shiftsim.runs.config import RunConfig
 from shiftsim.runs.journal import has_entries
 from shiftsim.runs.results import FORMAT_VERSION, JOURNAL, read_manifest
 
 _PACKAGES = ("numpy", "numba", "scipy", "shapely", "pyarrow", "torch")
-# what computes a result: a task, and everything that may be named by a setting
-_ROOTS = ("runs/task.py", "planners/**/*.py", "sim/traffic/**/*.py")
+# what computes a result, and everything that may be named by a setting
+_SOURCES = (
+    "kernels.py",
+    "data/store/*.py",
+    *(
+        f"{name}/**/*.py"
+        for name in "compat edits geometry metrics planners runs sim world".split()
+    ),
+)
 
 State: TypeAlias = Literal["new", "unfinished", "failed", "complete"]
 _NAMES = {"tokens": "scenarios", "review": "reviews"}  # in messages
@@ -72,9 +79,9 @@ def now() -> str:
 def code_digest() -> str:
     """Digest of all sources that results depend on: two versions of them are not mixed."""
     digest = hashlib.blake2b(digest_size=8)
-    roots = [path for pattern in _ROOTS for path in PACKAGE.glob(pattern)]
-    for name, source in sorted(sources(roots).items()):
-        digest.update(f"{name}\n".encode() + source)
+    for path in sorted(path for pattern in _SOURCES for path in PACKAGE.glob(pattern)):
+        name = path.relative_to(PACKAGE).as_posix()
+        digest.update(f"{name}\n".encode() + path.read_bytes())
     return digest.hexdigest()
 
 
