@@ -121,7 +121,7 @@ class Diagnosis:
         ]
 
 
-def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
+def examine(advance: Advance = lambda *progress: None) -> Diagnosis:
     """Examine this installation; compiles the kernels that are not in the cache yet."""
     from shiftsim.kernels import CACHE_FOLDER
     from shiftsim.runs.config import default_workers
