@@ -10,7 +10,7 @@ from time import process_time
 import numpy as np
 import pytest
 
-from shiftsim.data.demo.store import bench_scene
+from shiftsim.benchmarks.speed.city import bench_scene
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.writing import StoreWriter

@@ -43,7 +43,7 @@ def compile_kernels(
         ShiftsimError: A run failed.
     """
     from shiftsim.api import run
-    from shiftsim.data.demo.store import demo_store
+    from shiftsim.data.synthetic.store import demo_store
 
     began, before = perf_counter(), len(machine_code())
     runs = [*_runs()]

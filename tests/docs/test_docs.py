@@ -37,10 +37,10 @@ from track_files import table_of, write_tracks
 
 import shiftsim
 from shiftsim.benchmarks import load_track
-from shiftsim.data.demo import store as synthetic
 from shiftsim.data.readers.dsc3d.recording import open_site
 from shiftsim.data.store import map as store_map
 from shiftsim.data.store import schema
+from shiftsim.data.synthetic import store as synthetic
 from shiftsim.metrics import MULTIPLIERS, PROFILES, SHORT_NAMES, WEIGHTS
 from shiftsim.planners.registry import PLANNERS
 from shiftsim.report.words import LONG

@@ -8,12 +8,12 @@ import shapely
 from nuplan_trips import SCENES, round_trip
 from stores import write_toy_store
 
-from shiftsim.data.demo.store import demo_store
 from shiftsim.data.nuplan.convert import convert_nuplan
 from shiftsim.data.nuplan.export import export_nuplan
 from shiftsim.data.nuplan.export_log import quaternions_of
 from shiftsim.data.nuplan.log import yaw_of
 from shiftsim.data.store.reading import open_store
+from shiftsim.data.synthetic.store import demo_store
 from shiftsim.metrics import compute_metrics
 from shiftsim.planners.idm import Idm
 from shiftsim.planners.pdm.planner import PdmClosed

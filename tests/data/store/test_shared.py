@@ -9,7 +9,7 @@ import numpy as np
 import places
 import pytest
 
-from shiftsim.data.demo.store import bench_scene
+from shiftsim.benchmarks.speed.city import bench_scene
 from shiftsim.data.nuplan.map import read_map
 from shiftsim.data.store import shared
 from shiftsim.data.store.map import read_map_file, write_map

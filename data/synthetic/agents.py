@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from math import cos, hypot, pi, sin
 
-from shiftsim.data.demo.paths import Path, Walk, Zone
+from shiftsim.data.synthetic.paths import Path, Walk, Zone
 
 WALKING = 1.35  # m/s
 _SPARE = 0.9  # m, aimed at before the place to wait

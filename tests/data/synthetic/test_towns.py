@@ -6,20 +6,19 @@ import numpy as np
 import pytest
 import shapely
 
-from shiftsim.data.demo.agents import SIZES
-from shiftsim.data.demo.lights import Lights
-from shiftsim.data.demo.paths import arc_at
-from shiftsim.data.demo.scenes import demo_sites
-from shiftsim.data.demo.traffic import DT
 from shiftsim.data.maps.opendrive.map import build_road_map
 from shiftsim.data.maps.opendrive.reading import read_opendrive
 from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.data.store.writing import StoreWriter
-from shiftsim.data.towns import recordings as towns_recordings
-from shiftsim.data.towns.layouts import KINDS, random_place
-from shiftsim.data.towns.people import random_traffic
-from shiftsim.data.towns.store import write_towns
+from shiftsim.data.synthetic import recordings as town_recordings
+from shiftsim.data.synthetic.agents import SIZES
+from shiftsim.data.synthetic.layouts import KINDS, random_place
+from shiftsim.data.synthetic.lights import Lights
+from shiftsim.data.synthetic.paths import arc_at
+from shiftsim.data.synthetic.population import random_traffic
+from shiftsim.data.synthetic.store import town_specs, write_towns
+from shiftsim.data.synthetic.traffic import DT
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.runs.filter import FilterConfig, judge_scenario
@@ -66,7 +65,7 @@ def test_two_towns_give_many_scenarios_that_pass_the_filter(store):
 
 def test_every_route_has_the_two_blocks_that_planners_need(store, tmp_path, monkeypatch):
     assert min(len(store.window(token).route) for token in store.tokens) >= 2
-    monkeypatch.setattr(towns_recordings, "_MIN_BLOCKS", 3)
+    monkeypatch.setattr(town_recordings, "_MIN_BLOCKS", 3)
     few = write_towns(tmp_path / "few", towns=1, seed=5, spread=ONE_PROCESS)
     here = [x for x in map(store.window, store.tokens) if x.log_name.startswith("town-5-001")]
     assert set(few.tokens) == {window.token for window in here if len(window.route) >= 3}
@@ -102,8 +101,8 @@ def test_a_store_that_is_there_is_kept_and_another_one_refused(store, tmp_path):
 
 
 def test_a_worker_that_dies_is_named_and_leaves_nothing(tmp_path):
-    def dying(make, names):
-        yield type("Outcome", (), {"task": names[0], "result": None, "death": "killed"})
+    def dying(make, specs):
+        yield type("Outcome", (), {"task": specs[0], "result": None, "death": "killed"})
 
     with pytest.raises(DataError, match="town 'town-5-001': killed"):
         write_towns(tmp_path / "store", towns=1, seed=5, spread=dying)
@@ -111,17 +110,17 @@ def test_a_worker_that_dies_is_named_and_leaves_nothing(tmp_path):
 
 
 def test_a_town_with_too_few_scenarios_is_drawn_again(tmp_path, monkeypatch):
-    tries = []
+    attempts = []
 
-    def make(name, rng, source, store):
-        tries.append(rng.random())
+    def convert(source, store, spec, place):
+        attempts.append((source / "map/map.xodr").read_text())
         store.mkdir()
         (store / "here").touch()
-        return 0 if len(tries) < 3 else 6
+        return 0 if len(attempts) < 3 else 6
 
-    monkeypatch.setattr(towns_recordings, "_make", make)
-    towns_recordings.MakeTown(tmp_path)("town-5-001")
-    assert len(set(tries)) == 3
+    monkeypatch.setattr(town_recordings, "_convert", convert)
+    town_recordings.make_town(tmp_path, town_specs(1, 5)[0])
+    assert len(set(attempts)) == 3
     assert (tmp_path / "town-5-001" / "here").is_file()
 
 
@@ -156,13 +155,6 @@ def test_the_map_of_every_kind_passes_the_checks_of_the_reader(kind, tmp_path):
     assert report.warnings == {}
     lit = {road.edges.ids[k] for k in np.flatnonzero(road.has_traffic_lights)}
     assert bool(lit) == bool(place.lights)
-
-
-def test_streets_of_the_demo_are_among_no_random_town():
-    shapes = {tuple(s.pieces) for site in demo_sites() for s in site.town().streets.values()}
-    for kind in ("junction", "street", "parking"):
-        place, _ = _place(kind)
-        assert not shapes & {tuple(s.pieces) for s in place.town.streets.values()}
 
 
 def test_towns_differ_in_arms_lanes_and_limits():

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from shiftsim.data.demo.network import Street
-from shiftsim.data.demo.roads import Piece, bend, line
+from shiftsim.data.synthetic.roads import Piece, bend, line
+from shiftsim.data.synthetic.town import Street
 from shiftsim.kernels import FloatArray
 
 AT_JUNCTION = ((3.0, 7.0),)  # m along a street, crosswalk at a junction

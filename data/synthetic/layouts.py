@@ -10,12 +10,9 @@ from functools import partial
 
 import numpy as np
 
-from shiftsim.data.demo.lights import Lights
-from shiftsim.data.demo.network import Street, Town, build_town
-from shiftsim.data.demo.roads import arc, connect, line
-from shiftsim.data.demo.walks import add_bays, add_walks
-from shiftsim.data.towns.lights import random_lights
-from shiftsim.data.towns.streets import (
+from shiftsim.data.synthetic.lights import Lights, random_lights
+from shiftsim.data.synthetic.roads import arc, connect, line
+from shiftsim.data.synthetic.streets import (
     WIDE,
     are_apart,
     directions,
@@ -29,6 +26,7 @@ from shiftsim.data.towns.streets import (
     with_crossings,
     with_obstacles,
 )
+from shiftsim.data.synthetic.town import Street, Town, build_town
 
 _TRIES = 300
 # km/h, of main roads by lanes per direction
@@ -53,8 +51,6 @@ def random_place(kind: str, name: str, rng: np.random.Generator) -> Place:
     else:
         raise AssertionError(f"no town of kind {kind!r} in {_TRIES} tries")
     town = build_town(name, tuple(streets))
-    add_walks(town)
-    add_bays(town)
     lit = sorted({x for street in streets if street.has_lights for x in street.junctions} - {0})
     return Place(town, tuple(random_lights(town, junction, rng) for junction in lit))
 

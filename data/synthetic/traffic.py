@@ -12,10 +12,10 @@ from math import cos, inf, sin, sqrt
 
 import numpy as np
 
-from shiftsim.data.demo.agents import WALKING, Driver, Walker, goes_first, has_room, must_queue
-from shiftsim.data.demo.lights import Lights
-from shiftsim.data.demo.network import Town
-from shiftsim.data.demo.paths import STEP, Zone, arc_at
+from shiftsim.data.synthetic.agents import WALKING, Driver, Walker, goes_first, has_room, must_queue
+from shiftsim.data.synthetic.lights import Lights
+from shiftsim.data.synthetic.paths import STEP, Zone, arc_at
+from shiftsim.data.synthetic.town import Town
 from shiftsim.kernels import FloatArray
 
 DT = 0.08  # s, 12.5 Hz

@@ -75,7 +75,7 @@ class Walk(_Line):
     across: float = np.inf  # where the other side is reached [m]
 
 
-def make_path(parts: Sequence[FloatArray], limits_kmh: Sequence[float]) -> Path:
+def path_along(parts: Sequence[FloatArray], limits_kmh: Sequence[float]) -> Path:
     """A path along lane centres (n, 2) [m], with comfortable speeds and no zones yet."""
     points = resample(np.concatenate(parts), _SMOOTHING)
     arc = STEP * np.arange(len(points))
