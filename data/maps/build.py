@@ -15,11 +15,12 @@ from shiftsim.data.maps.builder import (
     ShapedLane,
     block_pairs,
 )
-from shiftsim.data.maps.graph import Connector, build_graph
+from shiftsim.data.maps.graph import build_graph
 from shiftsim.data.maps.opendrive.areas import drivable_tiles, linked_groups, merge_areas
 from shiftsim.data.maps.opendrive.overlaps import subtract_overlaps
 from shiftsim.data.maps.opendrive.shapes import BASELINE_STEP, bend_ends, lane_polygon
 from shiftsim.data.maps.segments import MapSource, Part, baseline, joined_borders
+from shiftsim.data.maps.topology import Connector
 from shiftsim.data.polygons import shared_areas
 from shiftsim.errors import MapError
 from shiftsim.kernels import FloatArray, IntArray
@@ -85,8 +86,8 @@ class _Maker:
             drivable_areas=parts.areas(self._drivable()),
         )
         ids = [*parts.lane_ids, *parts.connector_ids]
-        runs = [lane.parts for lane in graph.lanes]
-        runs += [connector.parts for connector in graph.connectors]
+        runs = [lane.segments for lane in graph.lanes]
+        runs += [connector.segments for connector in graph.connectors]
         origins = {i: tuple(p.piece.id for p in run) for i, run in zip(ids, runs, strict=True)}
         lit = zip(parts.connector_ids, self.lights, strict=True)
         lights = {i: name for i, name in lit if name is not None}
@@ -94,7 +95,7 @@ class _Maker:
 
     def _lanes(self) -> list[ShapedLane]:
         lanes = self.graph.lanes
-        borders = [joined_borders(lane.parts) for lane in lanes]
+        borders = [joined_borders(lane.segments) for lane in lanes]
         polygons = [lane_polygon(*pair) for pair in borders]
         polygons, overlaps = subtract_overlaps(polygons, [p.area for p in polygons], set())
         if overlaps:
@@ -102,9 +103,9 @@ class _Maker:
         return [
             ShapedLane(
                 *borders[number],
-                baseline(lane.parts),
+                baseline(lane.segments),
                 polygons[number],
-                _limit(lane.parts),
+                _limit(lane.segments),
                 lane.block,
                 lane.index,
                 is_beside=True,
@@ -116,9 +117,9 @@ class _Maker:
         """All connectors; `lines` are the baselines of the lanes."""
         out = []
         for connector, light in zip(self.graph.connectors, self.lights, strict=True):
-            borders = joined_borders(connector.parts)
+            borders = joined_borders(connector.segments)
             before, after = lines[connector.source], lines[connector.target]
-            line = bend_ends(baseline(connector.parts, before[-1], after[0]), before, after)
+            line = bend_ends(baseline(connector.segments, before[-1], after[0]), before, after)
             stops: Sequence[int] = ()
             if light is not None:
                 approach = before[-int(_APPROACH / BASELINE_STEP) :]
@@ -129,7 +130,7 @@ class _Maker:
                     *borders,
                     line,
                     lane_polygon(*borders),
-                    _limit(connector.parts),
+                    _limit(connector.segments),
                     connector.source,
                     connector.target,
                     has_light=light is not None,
@@ -138,15 +139,15 @@ class _Maker:
             )
         return out
 
-    def _light(self, connector: Connector) -> str | None:
+    def _light(self, connector: Connector[Part]) -> str | None:
         """The light of a connector: of its own pieces, else of the lane that leads to it."""
-        source = self.graph.lanes[connector.source].parts[-1].piece
-        own = [part.piece for part in connector.parts if not connector.is_seam]
+        source = self.graph.lanes[connector.source].segments[-1].piece
+        own = [part.piece for part in connector.segments if connector.junctions]
         return next((piece.light for piece in (*own, source) if piece.light is not None), None)
 
-    def _stops(self, connector: Connector, way: shapely.LineString) -> list[int]:
+    def _stops(self, connector: Connector[Part], way: shapely.LineString) -> list[int]:
         """Stop polygons where the lane before a connector ends."""
-        piece = self.graph.lanes[connector.source].parts[-1].piece.id
+        piece = self.graph.lanes[connector.source].segments[-1].piece.id
         return [
             number
             for number, area in enumerate(self.source.stop_areas)
@@ -164,7 +165,7 @@ class _Maker:
         """Kind of the intersection of some connectors."""
         if any(self.lights[i] is not None for i in numbers):
             return LIGHT_KIND
-        return PASS_THROUGH if all(self.graph.connectors[i].is_seam for i in numbers) else 0
+        return PASS_THROUGH if not any(self.graph.connectors[i].junctions for i in numbers) else 0
 
     def _drivable(self) -> list[shapely.Polygon]:
         """The drivable areas; what the pieces cover, for a source without."""

@@ -1,27 +1,21 @@
-"""From lane pieces to lanes, roadblocks and connectors of the map: topology only.
+"""From lane pieces to lanes, roadblocks and connectors of the map: which of them are which."""
 
-A *group* holds pieces beside each other. Groups that follow each other one piece to one piece are
-joined to a roadblock; each chain of pieces in it is a lane. Every other link becomes a connector:
-along the connector pieces between two lanes, elsewhere over a short seam cut from the lane before.
-"""
-
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 import shapely
 
-from shiftsim.data.maps.opendrive.graph import MAX_GAP, SEAM_LENGTH, SEAM_SHARE
-from shiftsim.data.maps.segments import LanePiece, Part, split_parts
+from shiftsim.data.maps.segments import LanePiece, Part
+from shiftsim.data.maps.topology import MAX_GAP, LaneGraph, Topology
 from shiftsim.data.polygons import shared_areas
 from shiftsim.errors import MapError
 
 _MIN_OVERLAP, _OVERLAP_SHARE = 1.0, 0.1  # m², and share of the smaller piece: forks and merges
-_RIM_LENGTH, _RIM_SHARE = 1.0, 0.25  # m, and share of a connector that becomes a lane at the rim
+# m, and share of a connector at the boundary of the map, that becomes a lane
+_OUTER_LENGTH, _OUTER_SHARE = 1.0, 0.25
 _MAX_CHAIN = 8  # pieces along one connector
-_MAX_STEPS = 2_000  # in the search for ways from one lane through connectors
 _START, _WHOLE, _END = range(3)  # which part of a piece
 
 
@@ -32,35 +26,7 @@ class _Node(NamedTuple):
     place: int = _WHOLE
 
 
-@dataclass
-class Lane:
-    """A lane of the map; `index` counts from the left within its roadblock."""
-
-    parts: list[Part]  # in the direction of travel
-    block: int  # the roadblock it lies in
-    index: int
-
-
-@dataclass(frozen=True)
-class Connector:
-    """A lane connector of the map."""
-
-    parts: list[Part]  # in the direction of travel
-    source: int  # lane it comes from
-    target: int  # lane it leads to
-    is_seam: bool  # whether it only joins lanes that no connector piece joins
-
-
-@dataclass
-class LaneGraph:
-    """Lanes and connectors of the map."""
-
-    lanes: list[Lane] = field(default_factory=list)  # those of a roadblock follow each other
-    connectors: list[Connector] = field(default_factory=list)
-    dropped: list[LanePiece] = field(default_factory=list)  # connectors that lead nowhere
-
-
-def build_graph(pieces: Sequence[LanePiece], warnings: Counter[str]) -> LaneGraph:
+def build_graph(pieces: Sequence[LanePiece], warnings: Counter[str]) -> LaneGraph[Part]:
     """Lanes, roadblocks and connectors of some pieces; counts what was inferred or left out.
 
     Raises:
@@ -78,26 +44,29 @@ class _Builder:
             if min(len(piece.left), len(piece.right), len(piece.middle)) < 2:
                 what = f"lane {piece.id!r}: a border or its centre line has fewer than two vertices"
                 raise MapError(what, "leave the lane out, or repair the file")
-        self.warnings, self.graph = warnings, LaneGraph()
+        self.warnings = warnings
         self.pieces = [piece for piece in pieces if piece.polygon.area > 0 and piece.length > 0]
         self._count("lane without area, left out", len(pieces) - len(self.pieces))
         self.index = {piece.id: i for i, piece in enumerate(self.pieces)}
         self.is_connector = self._find_connectors()
         self.left = self._find_neighbors()
-        self.after: dict[_Node, list[_Node]] = defaultdict(list)
-        self.before: dict[_Node, list[_Node]] = defaultdict(list)
+        self.topology: Topology[_Node, Part] = Topology(self._is_lane, warnings)
 
     def _count(self, what: str, number: int) -> None:
         if number:
             self.warnings[what] += number
 
-    def build(self) -> LaneGraph:
+    def build(self) -> LaneGraph[Part]:
         self._link()
-        self._cut_rims()
-        self._build_lanes()
-        self._build_connectors()
-        self._cut_seams()
-        return self.graph
+        self._add_nodes()
+        self.topology.build_lanes(self._groups())
+        what = "connector that leads from no lane to no lane, left out"
+        self.topology.build_connectors(_MAX_CHAIN, lambda nodes: frozenset({"intersection"}), what)
+        self.topology.cut_connectors()
+        return self.topology.graph
+
+    def _is_lane(self, node: _Node) -> bool:
+        return node.place != _WHOLE or not self.is_connector[node.piece]
 
     def _find_connectors(self) -> list[bool]:
         """Which pieces are connectors: flagged ones, and forks and merges, which share area."""
@@ -138,43 +107,32 @@ class _Builder:
         self._count(far, int((gaps > MAX_GAP).sum()))
         for (a, b), gap in zip(pairs, gaps, strict=True):
             if gap <= MAX_GAP:
-                self._join(_Node(a), _Node(b))
+                self.topology.join(_Node(a), _Node(b))
 
-    def _join(self, source: _Node, target: _Node) -> None:
-        self.after[source].append(target)
-        self.before[target].append(source)
-
-    def _cut_rims(self) -> None:
-        """Connectors at the rim of the map begin and end with a lane (see `_part`)."""
-        self.nodes = []
-        for number, is_connector in enumerate(self.is_connector):
-            node = _Node(number)
-            start, end = _Node(number, _START), _Node(number, _END)
-            rims = [start] * (not self.before[node]) + [end] * (not self.after[node])
-            for rim in rims if is_connector else ():
-                self._join(*((rim, node) if rim == start else (node, rim)))
-                self.nodes.append(rim)
-            self.nodes.append(node)
-        self.known = set(self.nodes)
-
-    def _part(self, node: _Node) -> Part:
-        piece = self.pieces[node.piece]
-        rim = min(_RIM_LENGTH / piece.length, _RIM_SHARE)
-        begin = rim if _Node(node.piece, _START) in self.known else 0.0
-        end = 1.0 - rim if _Node(node.piece, _END) in self.known else 1.0
-        spans = {_START: (0.0, begin), _WHOLE: (begin, end), _END: (end, 1.0)}
-        return Part(piece, *spans[node.place])
-
-    def _is_lane(self, node: _Node) -> bool:
-        return node.place != _WHOLE or not self.is_connector[node.piece]
+    def _add_nodes(self) -> None:
+        """All pieces; connectors at the boundary of the map begin and end with a lane."""
+        topology = self.topology
+        for number, piece in enumerate(self.pieces):
+            start, node, end = (_Node(number, place) for place in (_START, _WHOLE, _END))
+            begins = self.is_connector[number] and not topology.before[node]
+            ends = self.is_connector[number] and not topology.after[node]
+            share = min(_OUTER_LENGTH / piece.length, _OUTER_SHARE)
+            first, last = share if begins else 0.0, 1.0 - share if ends else 1.0
+            if begins:
+                topology.join(start, node)
+                topology.segments[start] = Part(piece, 0.0, first)
+            if ends:
+                topology.join(node, end)
+                topology.segments[end] = Part(piece, last, 1.0)
+            topology.segments[node] = Part(piece, first, last)
 
     def _groups(self) -> list[list[_Node]]:
         """Lanes beside each other, leftmost first."""
-        lanes = [node for node in self.nodes if self._is_lane(node)]
+        lanes = [node for node in self.topology.segments if self._is_lane(node)]
         left = {}
         for node in lanes:
             beside = _Node(self.left[node.piece], node.place)
-            if beside in self.known and self._is_lane(beside):
+            if beside in self.topology.segments and self._is_lane(beside):
                 left[node] = beside
         right = {b: a for a, b in left.items()}
         groups: list[list[_Node]] = []
@@ -192,82 +150,3 @@ class _Builder:
                 at = right.get(at)
             groups.append(group)
         return sorted(groups, key=min)
-
-    def _build_lanes(self) -> None:
-        groups = self._groups()
-        self.group_of = {node: i for i, group in enumerate(groups) for node in group}
-        onward = {
-            i: following
-            for i, group in enumerate(groups)
-            if (following := self._continuation(group, groups)) is not None
-        }
-        self.first: dict[_Node, int] = {}  # lane that begins with a node
-        self.last: list[_Node] = []  # last node of each lane
-        has_previous, placed = set(onward.values()), set()
-        order = [i for i in range(len(groups)) if i not in has_previous]
-        for begin in [*order, *range(len(groups))]:
-            if begin in placed:
-                continue
-            chain = [begin]
-            placed.add(begin)
-            while (following := onward.get(chain[-1], begin)) not in placed:
-                chain.append(following)
-                placed.add(following)
-            block = self.graph.lanes[-1].block + 1 if self.graph.lanes else 0
-            for index, nodes in enumerate(zip(*(groups[i] for i in chain), strict=True)):
-                self.first[nodes[0]] = len(self.graph.lanes)
-                self.last.append(nodes[-1])
-                self.graph.lanes.append(Lane([self._part(node) for node in nodes], block, index))
-
-    def _continuation(self, group: list[_Node], groups: list[list[_Node]]) -> int | None:
-        """The group that continues a group lane by lane, or None."""
-        if any(len(self.after[node]) != 1 for node in group):
-            return None
-        targets = [self.after[node][0] for node in group]
-        if not self._is_lane(targets[0]):
-            return None
-        other = self.group_of[targets[0]]
-        follow = all(self.before[t] == [n] for n, t in zip(group, targets, strict=True))
-        return other if follow and groups[other] == targets and targets[0] != group[0] else None
-
-    def _build_connectors(self) -> None:
-        """One connector per way from a lane over connector pieces to a lane."""
-        used: set[_Node] = set()
-        for source, last in enumerate(self.last):
-            stack: list[tuple[_Node, ...]] = [(node,) for node in reversed(self.after[last])]
-            for _ in range(_MAX_STEPS):
-                if not stack:
-                    break
-                path = stack.pop()
-                if self._is_lane(path[-1]):
-                    if len(path) > 1:
-                        parts = [self._part(node) for node in path[:-1]]
-                        target = self.first[path[-1]]
-                        self.graph.connectors.append(Connector(parts, source, target, False))
-                        used.update(path)
-                elif len(path) <= _MAX_CHAIN:
-                    following = self.after[path[-1]]
-                    stack += [(*path, node) for node in reversed(following) if node not in path]
-            if stack:
-                self.warnings["too many ways through an intersection, the rest is left out"] += 1
-        lost = [n for n in self.nodes if not self._is_lane(n) and n not in used]
-        self._count("connector that leads from no lane to no lane, left out", len(lost))
-        self.graph.dropped += [self.pieces[node.piece] for node in lost]
-
-    def _cut_seams(self) -> None:
-        """Short connectors between lanes that follow each other (nuPlan rule 504)."""
-        lanes = self.graph.lanes
-        links: dict[int, list[tuple[int, int]]] = defaultdict(list)
-        for number, last in enumerate(self.last):
-            for node in self.after[last]:
-                if self._is_lane(node):
-                    links[lanes[number].block].append((number, self.first[node]))
-        lengths = [sum(part.length for part in lane.parts) for lane in lanes]
-        for pairs in links.values():
-            cut = min(SEAM_LENGTH, SEAM_SHARE * min(lengths[i] for pair in pairs for i in pair))
-            tails = {}
-            for number in dict.fromkeys(number for number, _ in pairs):
-                lanes[number].parts, tails[number] = split_parts(
-                    lanes[number].parts, lengths[number] - cut
-                )
-            self.graph.connectors += [Connector(tails[a], a, b, True) for a, b in pairs]

@@ -114,6 +114,11 @@ class Part:
         """Length of its centre line [m]."""
         return self.piece.length * (self.end - self.begin)
 
+    def split(self, at: float) -> tuple["Part", "Part"]:
+        """The parts before and after a distance from its start [m]."""
+        share = self.begin + at / self.piece.length
+        return Part(self.piece, self.begin, share), Part(self.piece, share, self.end)
+
     def cut(self, line: FloatArray) -> FloatArray:
         """A line along the piece (K, 2), as far as it belongs to the part."""
         if (self.begin, self.end) == (0.0, 1.0):
@@ -121,20 +126,6 @@ class Part:
         shares = _shares(line)
         inside = shares[(shares > self.begin) & (shares < self.end)]
         return _at(line, shares, np.concatenate([[self.begin], inside, [self.end]]))
-
-
-def split_parts(parts: Sequence[Part], at: float) -> tuple[list[Part], list[Part]]:
-    """Cut parts that follow each other at a distance from their start [m]."""
-    head: list[Part] = []
-    for number, part in enumerate(parts):
-        if at >= part.length and number + 1 < len(parts):
-            head.append(part)
-            at -= part.length
-            continue
-        share = part.begin + at / part.piece.length
-        tail = [Part(part.piece, share, part.end), *parts[number + 1 :]]
-        return ([*head, Part(part.piece, part.begin, share)] if at > 0 else head), tail
-    return head, []
 
 
 def joined_borders(parts: Sequence[Part]) -> tuple[FloatArray, FloatArray]:

@@ -8,7 +8,7 @@ import shapely
 
 from shiftsim.data.maps.opendrive import records
 from shiftsim.data.maps.opendrive.curves import ReferenceLine
-from shiftsim.data.maps.opendrive.graph import ConnectorRun
+from shiftsim.data.maps.opendrive.graph import Connector
 from shiftsim.data.maps.opendrive.records import (
     OpenDrive,
     Outline,
@@ -40,7 +40,7 @@ class LaneAreas:
 
 
 def group_connectors(
-    connectors: Sequence[ConnectorRun],
+    connectors: Sequence[Connector],
     polygons: Sequence[shapely.Polygon],  # of the connectors
     blocks: Sequence[tuple[int, int]],  # their (from, to) roadblocks
     are_stacked: Callable[[int, int], bool],  # whether two of them lie on different levels

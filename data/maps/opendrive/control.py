@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 
 from shiftsim.data.maps.opendrive.areas import is_stop_line, rings_of
-from shiftsim.data.maps.opendrive.graph import LaneGraph, Piece
+from shiftsim.data.maps.opendrive.graph import Graph, LaneSegment
 from shiftsim.data.maps.opendrive.records import SPEED_UNITS, OpenDrive, Road, Signal
 from shiftsim.data.maps.opendrive.shapes import Shapes
 from shiftsim.data.polygons import largest_part
@@ -47,7 +47,7 @@ def signal_control(signal: Signal) -> str | None:
     return LIGHT if is_light else _SIGNS.get(signal.type)
 
 
-def connector_controls(od: OpenDrive, graph: LaneGraph) -> list[frozenset[str]]:
+def connector_controls(od: OpenDrive, graph: Graph) -> list[frozenset[str]]:
     """What governs each connector: signals on its own roads, or before it on its lane."""
     known = {
         signal.id: signal
@@ -57,8 +57,8 @@ def connector_controls(od: OpenDrive, graph: LaneGraph) -> list[frozenset[str]]:
     }
     controls = []
     for connector in graph.connectors:
-        last = graph.lanes[connector.source].pieces[-1]
-        places = [*((piece, np.inf) for piece in connector.pieces), (last, _APPROACH)]
+        last = graph.lanes[connector.source].segments[-1]
+        places = [*((piece, np.inf) for piece in connector.segments), (last, _APPROACH)]
         found = set[str | None]()
         for piece, reach in places if connector.junctions else ():
             side = "+" if piece.end >= piece.begin else "-"
@@ -75,7 +75,7 @@ def connector_controls(od: OpenDrive, graph: LaneGraph) -> list[frozenset[str]]:
 
 def stop_lines(
     od: OpenDrive,
-    graph: LaneGraph,
+    graph: Graph,
     shapes: Shapes,
     controls: Sequence[frozenset[str]],  # what governs each connector
     polygons: Sequence[shapely.Polygon],  # of the lanes
@@ -89,7 +89,7 @@ def stop_lines(
     tree = shapely.STRtree(np.array(drawn, dtype=object))
     lines = []
     for lane, found in sorted(by_lane.items()):
-        left, right = shapes.borders(graph.lanes[lane].pieces[-1])
+        left, right = shapes.borders(graph.lanes[lane].segments[-1])
         box = _end_box(left, right)
         near = tree.query(box.buffer(_NEAR_END), predicate="intersects").tolist()
         near = [i for i in near if polygons[lane].intersects(drawn[i])]
@@ -131,7 +131,7 @@ def _end_box(left: FloatArray, right: FloatArray) -> shapely.Polygon:
     return shapely.Polygon([left[-1], right[-1], right[-1] + back, left[-1] + back])
 
 
-def speed_limit(od: OpenDrive, pieces: Sequence[Piece], country: str) -> float | None:
+def speed_limit(od: OpenDrive, pieces: Sequence[LaneSegment], country: str) -> float | None:
     """The limit on most of a lane (nuPlan rule 507), the lower one on ties [m/s]; None for none."""
     lengths: dict[float, float] = defaultdict(float)
     for piece in pieces:
@@ -151,7 +151,7 @@ def speed_limit(od: OpenDrive, pieces: Sequence[Piece], country: str) -> float |
     return None if np.isinf(best) else best
 
 
-def _limit_at(road: Road, piece: Piece, s: float, country: str) -> float | None:
+def _limit_at(road: Road, piece: LaneSegment, s: float, country: str) -> float | None:
     section = road.sections[piece.key.section]
     own = [speed for speed in section.lanes[piece.key.lane].speeds if speed.s <= s - section.s]
     if own:
@@ -167,7 +167,7 @@ def _limit_at(road: Road, piece: Piece, s: float, country: str) -> float | None:
     return table.get(kinds[-1].type if kinds else "town", table["town"])
 
 
-def _signal_limit(road: Road, piece: Piece, s: float) -> float | None:
+def _signal_limit(road: Road, piece: LaneSegment, s: float) -> float | None:
     """Limit of the last sign that traffic has passed on this road."""
     forward = piece.end >= piece.begin
     passed = [

@@ -1,37 +1,36 @@
-"""From lanes of lane sections to lanes, roadblocks and connectors of the map: topology only.
+"""From lanes of lane sections to lanes, roadblocks and connectors of the map: which are which.
 
-A *group* holds the drivable lanes of one direction of one lane section. Groups that follow each
-other one lane to one lane are joined to a run, which becomes a roadblock. Every other link becomes
-a connector: through a junction along its connecting roads, elsewhere over a short seam cut from
-the lanes before it.
+A group holds the drivable lanes of one direction of one lane section; roads of junctions are
+connectors.
 """
 
 from collections import Counter, defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import TypeAlias
 
 import numpy as np
 import shapely
 
+from shiftsim.data.maps import topology
+from shiftsim.data.maps.opendrive import records
 from shiftsim.data.maps.opendrive.curves import ReferenceLine
 from shiftsim.data.maps.opendrive.lanes import LaneKey, lane_links, runs_forward, section_borders
-from shiftsim.data.maps.opendrive.records import DRIVABLE, Lane, OpenDrive
+from shiftsim.data.maps.opendrive.records import DRIVABLE, OpenDrive
+from shiftsim.data.maps.topology import MAX_GAP, Topology
 from shiftsim.kernels import FloatArray
 
 MIN_LENGTH = 0.1  # m, shorter lanes are linked through
 MIN_WIDTH = 0.5  # m, lanes never wider are linked through
-SEAM_LENGTH, SEAM_SHARE = 3.0, 0.25  # m, and share of the shorter lane
-MAX_GAP, INFER_GAP, SNAP_GAP = 2.0, 0.1, 0.05  # m
-_MAX_CHAIN = 64  # lanes along one connector
-_MAX_STEPS = 2_000  # in the search for ways from one lane through junctions
+INFER_GAP, SNAP_GAP = 0.1, 0.05  # m
+_MAX_CHAIN = 63  # lanes along one connector
 _Group: TypeAlias = tuple[str, int, bool]  # road, section, whether it runs along the road
 _CARS = frozenset(("all", "car", "autonomousTraffic", "motorVehicle"))
 
 
 @dataclass(frozen=True)
-class Piece:
+class LaneSegment:
     """Part of a lane: travel enters at `begin` and leaves at `end`, distances on its road [m]."""
 
     key: LaneKey
@@ -43,40 +42,18 @@ class Piece:
         """Length along the reference line [m]."""
         return abs(self.end - self.begin)
 
-
-@dataclass
-class LaneRun:
-    """A lane of the map: pieces in the direction of travel, and the roadblock it lies in.
-
-    `index` counts from the left within the roadblock.
-    """
-
-    pieces: list[Piece]
-    block: int
-    index: int
+    def split(self, at: float) -> tuple["LaneSegment", "LaneSegment"]:
+        """The parts before and after a distance from where travel enters [m]."""
+        place = float(self.begin + np.sign(self.end - self.begin) * at)
+        return replace(self, end=place), replace(self, begin=place)
 
 
-@dataclass
-class ConnectorRun:
-    """A lane connector: pieces in the direction of travel, from one lane to another."""
-
-    pieces: list[Piece]  # in the direction of travel
-    source: int  # lane it comes from
-    target: int  # lane it leads to
-    junctions: frozenset[str] = frozenset()  # openDRIVE junctions it lies in; empty for a seam
+Lane: TypeAlias = topology.Lane[LaneSegment]
+Connector: TypeAlias = topology.Connector[LaneSegment]
+Graph: TypeAlias = topology.LaneGraph[LaneSegment]
 
 
-@dataclass
-class LaneGraph:
-    """Lanes and connectors of the map."""
-
-    lanes: list[LaneRun] = field(default_factory=list)  # those of a roadblock follow each other
-    connectors: list[ConnectorRun] = field(default_factory=list)
-    # drivable lanes that are part of neither: short, narrow, or dead ends in junctions
-    dropped: list[Piece] = field(default_factory=list)
-
-
-def is_drivable(lane: Lane) -> bool:
+def is_drivable(lane: records.Lane) -> bool:
     """Whether cars may drive on a lane."""
     if lane.type not in DRIVABLE:
         return False
@@ -90,7 +67,7 @@ def road_order(road: str) -> tuple[int, int, str]:
     return (0, int(road), "") if road.isdecimal() else (1, 0, road)
 
 
-def build_lane_graph(od: OpenDrive, warnings: Counter[str]) -> LaneGraph:
+def build_lane_graph(od: OpenDrive, warnings: Counter[str]) -> Graph:
     """Lanes, roadblocks and connectors of a file; counts what was inferred or dropped."""
     return _Builder(od, warnings).build()
 
@@ -99,36 +76,38 @@ class _Builder:
     def __init__(self, od: OpenDrive, warnings: Counter[str]) -> None:
         self.od = od
         self.warnings = warnings
-        self.nodes: dict[LaneKey, Piece] = {}
-        self.gates: dict[LaneKey, tuple[FloatArray, FloatArray]] = {}  # first and last cross-line
-        self.after: dict[LaneKey, set[LaneKey]] = defaultdict(set)
-        self.before: dict[LaneKey, set[LaneKey]] = defaultdict(set)
-        self.graph = LaneGraph()
+        self.topology: Topology[LaneKey, LaneSegment] = Topology(self._is_lane, warnings)
+        self.nodes = self.topology.segments
+        self.after, self.before = self.topology.after, self.topology.before
+        # first and last cross-section of a lane, from its left to its right border
+        self.ends: dict[LaneKey, tuple[FloatArray, FloatArray]] = {}
 
-    def build(self) -> LaneGraph:
+    def build(self) -> Graph:
         narrow = self._collect_nodes()
         for source, target in lane_links(self.od, self.warnings):
             if source in self.nodes and target in self.nodes:
-                self._join(source, target)
+                self.topology.join(source, target)
         self._infer_links()
         for key in sorted(narrow):
             self._link_through(key)
         self._drop_wide_gaps()
-        self._build_lanes()
-        self._cut_seams()
-        self._build_connectors()
-        return self.graph
+        for links in self.after.values():
+            links.sort()
+        self.topology.build_lanes(self._groups())
+        self.topology.cut_connectors()
+        what = "connector without both ends, dropped"
+        self.topology.build_connectors(_MAX_CHAIN, self._junctions, what)
+        return self.topology.graph
 
-    def _join(self, source: LaneKey, target: LaneKey) -> None:
-        self.after[source].add(target)
-        self.before[target].add(source)
+    def _is_lane(self, key: LaneKey) -> bool:
+        return self.od.roads[key.road].junction is None
 
-    def _part(self, source: LaneKey, target: LaneKey) -> None:
-        self.after[source].discard(target)
-        self.before[target].discard(source)
+    def _junctions(self, keys: Sequence[LaneKey]) -> frozenset[str]:
+        found = (self.od.roads[key.road].junction for key in keys)
+        return frozenset(junction for junction in found if junction is not None)
 
     def _collect_nodes(self) -> list[LaneKey]:
-        """Fill nodes and gates; returns the lanes that are too short or too narrow to keep."""
+        """Fill nodes and their ends; returns the lanes that are too short or too narrow to keep."""
         unfit = []
         for road in self.od.roads.values():
             line = ReferenceLine(road.geometries)
@@ -143,10 +122,11 @@ class _Builder:
                     key = LaneKey(road.id, index, number)
                     inner, outer = borders.inner[number], borders.outer[number]
                     left, right = poses.offset(inner[[0, -1]]), poses.offset(outer[[0, -1]])
-                    gates = [np.stack([left[i], right[i]]) for i in (0, 1)]
+                    ends = [np.stack([left[i], right[i]]) for i in (0, 1)]
                     forward = runs_forward(road, index, number)
-                    self.nodes[key] = Piece(key, begin, end) if forward else Piece(key, end, begin)
-                    self.gates[key] = (gates[0], gates[1]) if forward else (gates[1], gates[0])
+                    travel = (begin, end) if forward else (end, begin)
+                    self.nodes[key] = LaneSegment(key, *travel)
+                    self.ends[key] = (ends[0], ends[1]) if forward else (ends[1], ends[0])
                     widest = float(np.abs(outer - inner).max())
                     if end - begin < MIN_LENGTH or widest < MIN_WIDTH:
                         unfit.append(key)
@@ -166,8 +146,8 @@ class _Builder:
             linked = self.after[source] or self.before[target]
             if linked or self._is_forward(onward) != is_forward:
                 continue
-            if np.abs(self.gates[source][1] - self.gates[target][0]).max() < INFER_GAP:
-                self._join(source, target)
+            if np.abs(self.ends[source][1] - self.ends[target][0]).max() < INFER_GAP:
+                self.topology.join(source, target)
                 inferred += 1
         if inferred:
             self.warnings["lane link missing between sections, inferred"] += inferred
@@ -179,13 +159,13 @@ class _Builder:
         """Take a lane out and join what lies before it to what follows (nuPlan rule 514)."""
         sources, targets = sorted(self.before[key]), sorted(self.after[key])
         for source in sources:
-            self._part(source, key)
+            self.topology.separate(source, key)
         for target in targets:
-            self._part(key, target)
+            self.topology.separate(key, target)
         for source, target in product(sources, targets):
             if source != target:
-                self._join(source, target)
-        self.graph.dropped.append(self.nodes.pop(key))
+                self.topology.join(source, target)
+        self.topology.graph.dropped.append(self.nodes.pop(key))
         what = "drivable lane shorter than 0.1 m or narrower than 0.5 m, linked through"
         self.warnings[what] += 1
 
@@ -193,127 +173,21 @@ class _Builder:
         pairs = [(a, b) for a in sorted(self.nodes) for b in sorted(self.after[a])]
         if not pairs:
             return
-        ends = shapely.linestrings(np.stack([self.gates[a][1] for a, _ in pairs]))
-        starts = shapely.linestrings(np.stack([self.gates[b][0] for _, b in pairs]))
+        ends = shapely.linestrings(np.stack([self.ends[a][1] for a, _ in pairs]))
+        starts = shapely.linestrings(np.stack([self.ends[b][0] for _, b in pairs]))
         for (a, b), gap in zip(pairs, shapely.distance(ends, starts), strict=True):
             if gap > MAX_GAP:
-                self._part(a, b)
+                self.topology.separate(a, b)
                 self.warnings[f"lane link over a gap of more than {MAX_GAP:g} m, dropped"] += 1
             elif gap > SNAP_GAP:
                 self.warnings[f"lane link over a gap of more than {SNAP_GAP:g} m"] += 1
 
-    def _in_junction(self, key: LaneKey) -> bool:
-        return self.od.roads[key.road].junction is not None
-
-    def _group_of(self, key: LaneKey) -> _Group:
-        return key.road, key.section, self._is_forward(key)
-
-    def _build_lanes(self) -> None:
+    def _groups(self) -> list[list[LaneKey]]:
+        """Lanes of one direction of one section, leftmost first, in the order of their roads."""
         groups: dict[_Group, list[LaneKey]] = defaultdict(list)
-        for key in self.nodes:
-            if not self._in_junction(key):
-                groups[self._group_of(key)].append(key)
-        for (_, _, forward), keys in groups.items():  # leftmost first, seen in travel direction
+        for key in filter(self._is_lane, self.nodes):
+            groups[key.road, key.section, self._is_forward(key)].append(key)
+        order = sorted(groups, key=lambda group: (road_order(group[0]), *group[1:]))
+        for (_, _, forward), keys in groups.items():  # seen in the direction of travel
             keys.sort(key=lambda key: -key.lane if forward else key.lane)
-        order = sorted(groups, key=lambda g: (road_order(g[0]), g[1], g[2]))
-        onward = {g: h for g in order if (h := self._continuation(groups[g], groups)) is not None}
-        has_previous = set(onward.values())
-        placed: set[_Group] = set()
-        block = 0
-        for first in [g for g in order if g not in has_previous] + order:
-            if first in placed:
-                continue
-            chain = [first]
-            placed.add(first)
-            while (g := onward.get(chain[-1])) is not None and g not in placed:
-                chain.append(g)
-                placed.add(g)
-            for index in range(len(groups[first])):
-                pieces = [self.nodes[groups[g][index]] for g in chain]
-                self.graph.lanes.append(LaneRun(pieces, block, index))
-            block += 1
-
-    def _continuation(
-        self, keys: list[LaneKey], groups: dict[_Group, list[LaneKey]]
-    ) -> _Group | None:
-        """The group that continues a group lane by lane, or None."""
-        if any(len(self.after[key]) != 1 for key in keys):
-            return None
-        targets = [next(iter(self.after[key])) for key in keys]
-        if self._in_junction(targets[0]):
-            return None
-        group = self._group_of(targets[0])
-        is_group = groups[group] == targets and group != self._group_of(keys[0])
-        follow = all(self.before[t] == {k} for k, t in zip(keys, targets, strict=True))
-        return group if is_group and follow else None
-
-    def _cut_seams(self) -> None:
-        """Short connectors between lanes that no junction joins (nuPlan rule 504)."""
-        lanes = self.graph.lanes
-        by_first = {lane.pieces[0].key: i for i, lane in enumerate(lanes)}
-        links: dict[int, list[tuple[int, int]]] = defaultdict(list)
-        for number, lane in enumerate(lanes):
-            for onward in sorted(self.after[lane.pieces[-1].key]):
-                if onward in by_first:
-                    links[lane.block].append((number, by_first[onward]))
-        lengths = [sum(piece.length for piece in lane.pieces) for lane in lanes]
-        for block in sorted(links):
-            shortest = min(lengths[i] for pair in links[block] for i in pair)
-            cut = min(SEAM_LENGTH, SEAM_SHARE * shortest)
-            tails = {}
-            for number in sorted({number for number, _ in links[block]}):
-                lanes[number].pieces, tails[number] = split_pieces(
-                    lanes[number].pieces, lengths[number] - cut
-                )
-            for number, target in links[block]:
-                self.graph.connectors.append(ConnectorRun(list(tails[number]), number, target))
-
-    def _build_connectors(self) -> None:
-        by_first = {lane.pieces[0].key: i for i, lane in enumerate(self.graph.lanes)}
-        used: set[LaneKey] = set()
-        last_keys = [lane.pieces[-1].key for lane in self.graph.lanes]
-        for source, last in enumerate(last_keys):
-            stack: list[tuple[LaneKey, ...]] = [
-                (target,) for target in sorted(self.after[last], reverse=True)
-            ]
-            steps = 0
-            while stack:
-                path = stack.pop()
-                steps += 1
-                if steps > _MAX_STEPS:
-                    self.warnings["junction with too many ways through, the rest is left out"] += 1
-                    break
-                if not self._in_junction(path[-1]):
-                    if len(path) > 1:
-                        self._add_connector(source, by_first[path[-1]], path[:-1])
-                        used.update(path)
-                    continue
-                if len(path) < _MAX_CHAIN:
-                    onward = sorted(self.after[path[-1]], reverse=True)
-                    stack += [(*path, target) for target in onward if target not in path]
-        for key in sorted(self.nodes):
-            if self._in_junction(key) and key not in used:
-                self.warnings["connector without both ends, dropped"] += 1
-                self.graph.dropped.append(self.nodes[key])
-
-    def _add_connector(self, source: int, target: int, path: Sequence[LaneKey]) -> None:
-        junctions = {self.od.roads[key.road].junction for key in path}
-        inside = frozenset(junction for junction in junctions if junction is not None)
-        pieces = [self.nodes[key] for key in path]
-        self.graph.connectors.append(ConnectorRun(pieces, source, target, inside))
-
-
-def split_pieces(pieces: list[Piece], at: float) -> tuple[list[Piece], list[Piece]]:
-    """Cut pieces at a distance from their start [m], measured along the reference lines."""
-    head: list[Piece] = []
-    for number, piece in enumerate(pieces):
-        if at >= piece.length and number + 1 < len(pieces):
-            head.append(piece)
-            at -= piece.length
-            continue
-        cut = piece.begin + np.sign(piece.end - piece.begin) * at
-        tail = [replace(piece, begin=float(cut)), *pieces[number + 1 :]]
-        if at > 0:
-            head.append(replace(piece, end=float(cut)))
-        return head, tail
-    return head, []
+        return [groups[group] for group in order]

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import chain
 from typing import TypeVar
 
@@ -18,25 +18,29 @@ from shiftsim.data.maps.builder import (
     ShapedLane,
     block_pairs,
 )
-from shiftsim.data.maps.opendrive import areas, control
-from shiftsim.data.maps.opendrive.check import check_map
+from shiftsim.data.maps.opendrive import areas, control, records
 from shiftsim.data.maps.opendrive.control import LIGHT, STOP, YIELD
-from shiftsim.data.maps.opendrive.graph import LaneGraph, Piece, build_lane_graph
-from shiftsim.data.maps.opendrive.lanes import LaneKey
+from shiftsim.data.maps.opendrive.curves import ReferenceLine, length_error
+from shiftsim.data.maps.opendrive.graph import Graph, LaneSegment, build_lane_graph
+from shiftsim.data.maps.opendrive.lanes import LaneKey, border_is_mirrored
 from shiftsim.data.maps.opendrive.overlaps import (
     Levels,
     cut_crossings,
     overlapping,
     subtract_overlaps,
 )
-from shiftsim.data.maps.opendrive.preparation import prepare
 from shiftsim.data.maps.opendrive.records import OpenDrive
 from shiftsim.data.maps.opendrive.shapes import Shapes, bend_ends, lane_polygon, widen
+from shiftsim.errors import MapError
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
 from shiftsim.world.map import VectorMap
+from shiftsim.world.ranges import MAP_EXTENT, require
 
 STOP_KINDS = {LIGHT: 2, STOP: 1, YIELD: 4}  # kinds of stop polygons
+GAP_NOTED, GAP_SERIOUS = 0.01, 0.5  # m
+MAX_LENGTH_ERROR = 3.0  # as a share; a cubic that far from its stated length is nonsense
+MAX_LANE_LENGTH = 3e6  # m, of all lanes together
 _Spec = TypeVar("_Spec", EdgeSpec, BlockSpec, AreaSpec)
 
 
@@ -56,8 +60,8 @@ class MapReport:
 
     warnings: dict[str, int]  # what was repaired, inferred or left out: count by kind
     origins: tuple[Origin, ...]  # pieces of OpenDRIVE lanes behind every lane and connector
-    checks: dict[str, bool] = field(default_factory=dict)  # self-checks: whether the map passes
-    figures: dict[str, float] = field(default_factory=dict)  # numbers behind the checks
+    # ids of pairs of lanes, and of roadblocks, that lie over each other on different levels
+    stacked: frozenset[tuple[str, str]] = frozenset()
 
 
 def build_road_map(
@@ -84,23 +88,91 @@ def build_road_map(
         MapError: The file has more road than one map can hold.
     """
     warnings = Counter(od.warnings)
-    placed = prepare(od, warnings)
+    placed = _prepare(od, warnings)
     graph = build_lane_graph(placed, warnings)
     return _Maker(placed, graph, warnings, country).build(name, np.array(offset), epsg)
 
 
-def _chains(graph: LaneGraph) -> list[list[Piece]]:
-    return [lane.pieces for lane in graph.lanes] + [c.pieces for c in graph.connectors]
+def _prepare(od: records.OpenDrive, warnings: Counter[str]) -> records.OpenDrive:
+    """The file in the frame of its header, without roads that cannot be drawn; counts them.
+
+    Raises:
+        MapError: The file has more road than one map can hold.
+    """
+    roads = {}
+    for name, road in od.roads.items():
+        errors = [length_error(geometry) for geometry in road.geometries]
+        if max(errors) > MAX_LENGTH_ERROR:
+            warnings["road left out: paramPoly3 far from its stated length"] += 1
+            continue
+        wrong = sum(error > 0 for error in errors)
+        if wrong:
+            warnings["paramPoly3 that is not as long as it says, stretched"] += wrong
+        _note_gaps(road, warnings)
+        _note_lanes(road, warnings)
+        roads[name] = _placed(road, od.offset) if od.offset else road
+    starts = [(g.x, g.y) for road in roads.values() for g in road.geometries]
+    extent = np.ptp(starts, axis=0).max() if starts else 0.0
+    require(MAP_EXTENT, "extent", extent, f"{od.source}: the roads'", error=MapError)
+    total = sum(
+        (road.section_end(index) - section.s) * len(section.lanes)
+        for road in roads.values()
+        for index, section in enumerate(road.sections)
+    )
+    if total > MAX_LANE_LENGTH:
+        raise MapError(
+            f"{od.source}: {total / 1000:.0f} km of lanes, more than {MAX_LANE_LENGTH / 1000:.0f}",
+            "cut the map into smaller files",
+        )
+    return replace(od, roads=roads, offset=None)
 
 
-def _shapes_of(od: OpenDrive, graph: LaneGraph) -> Shapes:
+def _placed(road: records.Road, offset: tuple[float, float, float, float]) -> records.Road:
+    """A road with the header's offset applied to its reference line."""
+    x, y, _, turn = offset
+    cos, sin = np.cos(turn), np.sin(turn)
+    geometries = tuple(
+        replace(
+            g,
+            x=float(x + cos * g.x - sin * g.y),
+            y=float(y + sin * g.x + cos * g.y),
+            heading=g.heading + turn,
+        )
+        for g in road.geometries
+    )
+    return replace(road, geometries=geometries)
+
+
+def _note_gaps(road: records.Road, warnings: Counter[str]) -> None:
+    gaps, _ = ReferenceLine(road.geometries).joints()
+    for low, high in ((GAP_NOTED, GAP_SERIOUS), (GAP_SERIOUS, np.inf)):
+        count = int(((gaps > low) & (gaps <= high)).sum())
+        if count:
+            warnings[f"gap of more than {low:g} m between geometries"] += count
+
+
+def _note_lanes(road: records.Road, warnings: Counter[str]) -> None:
+    known = records.DRIVABLE | records.PAVED | records.WALKED | records.SEAMS | records.UNUSED
+    for section in road.sections:
+        for lane in section.lanes.values():
+            if lane.type in ("tram", "rail"):
+                warnings["tram or rail lane left out"] += 1
+            elif lane.type not in known:
+                warnings["lane of unknown type left out"] += 1
+            if border_is_mirrored(lane):
+                warnings["border of a right lane given on the left, mirrored"] += 1
+
+
+def _chains(graph: Graph) -> list[list[LaneSegment]]:
+    return [lane.segments for lane in graph.lanes] + [c.segments for c in graph.connectors]
+
+
+def _shapes_of(od: OpenDrive, graph: Graph) -> Shapes:
     return Shapes(od, [*chain.from_iterable(_chains(graph)), *graph.dropped])
 
 
 class _Maker:
-    def __init__(
-        self, od: OpenDrive, graph: LaneGraph, warnings: Counter[str], country: str
-    ) -> None:
+    def __init__(self, od: OpenDrive, graph: Graph, warnings: Counter[str], country: str) -> None:
         self.od, self.warnings, self.country = od, warnings, country
         self.shapes = _shapes_of(od, graph)
         self.graph, crossings = cut_crossings(od, graph, self.shapes)
@@ -139,30 +211,29 @@ class _Maker:
         )
         levels = {(parts.lane_ids[i], parts.lane_ids[j]) for i, j in stacked}
         levels |= {(parts.block_ids[a], parts.block_ids[b]) for a, b in stacked_blocks}
-        checks, figures = check_map(vector_map, levels)
         origins = tuple(self._origins([*parts.lane_ids, *parts.connector_ids]))
-        return vector_map, MapReport(dict(self.warnings), origins, checks, figures)
+        return vector_map, MapReport(dict(self.warnings), origins, frozenset(levels))
 
     def _lanes(self) -> tuple[list[ShapedLane], set[tuple[int, int]]]:
         """All lanes, and the pairs of them that lie on different levels."""
         lanes = self.graph.lanes
-        borders = [self.shapes.joined_borders(lane.pieces) for lane in lanes]
+        borders = [self.shapes.joined_borders(lane.segments) for lane in lanes]
         polygons = [lane_polygon(*pair) for pair in borders]
-        levels = Levels(self.od, self.shapes, [lane.pieces for lane in lanes], polygons)
+        levels = Levels(self.od, self.shapes, [lane.segments for lane in lanes], polygons)
         stacked = {pair for pair in overlapping(polygons) if levels.are_stacked(*pair)}
-        lengths = [sum(piece.length for piece in lane.pieces) for lane in lanes]
+        lengths = [sum(piece.length for piece in lane.segments) for lane in lanes]
         polygons, overlaps = subtract_overlaps(polygons, lengths, stacked)
         if overlaps:
             self.warnings["overlap of two lanes, taken from the longer one"] += overlaps
         shaped = [
             ShapedLane(
                 *borders[number],
-                self.shapes.baseline(lane.pieces),
+                self.shapes.baseline(lane.segments),
                 polygons[number],
-                control.speed_limit(self.od, lane.pieces, self.country),
+                control.speed_limit(self.od, lane.segments, self.country),
                 lane.block,
                 lane.index,
-                number > 0 and _touch(lanes[number - 1].pieces[0], lane.pieces[0]),
+                number > 0 and _touch(lanes[number - 1].segments[0], lane.segments[0]),
             )
             for number, lane in enumerate(lanes)
         ]
@@ -174,12 +245,12 @@ class _Maker:
         """All connectors; `lines` are the baselines of the lanes."""
         lanes, out = self.graph.lanes, []
         for connector, controls in zip(self.graph.connectors, self.controls, strict=True):
-            left, right = self.shapes.joined_borders(connector.pieces)
-            before = self.shapes.widths(lanes[connector.source].pieces)[1]
-            after = self.shapes.widths(lanes[connector.target].pieces)[0]
+            left, right = self.shapes.joined_borders(connector.segments)
+            before = self.shapes.widths(lanes[connector.source].segments)[1]
+            after = self.shapes.widths(lanes[connector.target].segments)[0]
             left, right = widen(left, right, min(before, after))
             source, target = lines[connector.source], lines[connector.target]
-            line = self.shapes.baseline(connector.pieces, source[-1], target[0])
+            line = self.shapes.baseline(connector.segments, source[-1], target[0])
             here = [i for i, stop in enumerate(stops) if stop.lane == connector.source]
             out.append(
                 ShapedConnector(
@@ -187,7 +258,7 @@ class _Maker:
                     right,
                     bend_ends(line, source, target),
                     lane_polygon(left, right),
-                    control.speed_limit(self.od, connector.pieces, self.country),
+                    control.speed_limit(self.od, connector.segments, self.country),
                     connector.source,
                     connector.target,
                     has_light=bool(connector.junctions) and LIGHT in controls,
@@ -198,7 +269,7 @@ class _Maker:
 
     def _groups(self, polygons: Sequence[shapely.Polygon]) -> IntArray:
         connectors = self.graph.connectors
-        levels = Levels(self.od, self.shapes, [c.pieces for c in connectors], polygons)
+        levels = Levels(self.od, self.shapes, [c.segments for c in connectors], polygons)
         pairs = block_pairs(self.graph.lanes, connectors)
         return areas.group_connectors(connectors, polygons, pairs, levels.are_stacked)
 
@@ -235,7 +306,7 @@ class _Maker:
                 yield Origin(edge_id, piece.key, piece.begin, piece.end)
 
 
-def _touch(left: Piece, right: Piece) -> bool:
+def _touch(left: LaneSegment, right: LaneSegment) -> bool:
     """Whether no lane of another use lies between two lanes of one section."""
     one, other = left.key.lane, right.key.lane
     return abs(one - other) - (1 if one * other < 0 else 0) == 1

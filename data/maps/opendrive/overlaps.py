@@ -13,10 +13,11 @@ from itertools import pairwise
 import numpy as np
 import shapely
 
-from shiftsim.data.maps.opendrive.graph import ConnectorRun, LaneGraph, LaneRun, Piece, split_pieces
+from shiftsim.data.maps.opendrive.graph import Connector, Graph, Lane, LaneSegment
 from shiftsim.data.maps.opendrive.lanes import evaluate_cubics
 from shiftsim.data.maps.opendrive.records import OpenDrive
 from shiftsim.data.maps.opendrive.shapes import Shapes, lane_polygon
+from shiftsim.data.maps.topology import split_segments
 from shiftsim.data.polygons import largest_part, shared_areas
 from shiftsim.kernels import FloatArray
 
@@ -62,7 +63,7 @@ class Levels:
         self,
         od: OpenDrive,
         shapes: Shapes,
-        chains: Sequence[Sequence[Piece]],
+        chains: Sequence[Sequence[LaneSegment]],
         polygons: Sequence[shapely.Polygon],
     ) -> None:
         self._od, self._shapes, self._chains, self._polygons = od, shapes, chains, polygons
@@ -108,10 +109,10 @@ class Levels:
         return is_steep and not self.are_stacked(first, second)
 
 
-def cut_crossings(od: OpenDrive, graph: LaneGraph, shapes: Shapes) -> tuple[LaneGraph, int]:
+def cut_crossings(od: OpenDrive, graph: Graph, shapes: Shapes) -> tuple[Graph, int]:
     """The graph with intersections where lanes cross on one level, and how many pairs cross."""
-    polygons = [lane_polygon(*shapes.joined_borders(lane.pieces)) for lane in graph.lanes]
-    levels = Levels(od, shapes, [lane.pieces for lane in graph.lanes], polygons)
+    polygons = [lane_polygon(*shapes.joined_borders(lane.segments)) for lane in graph.lanes]
+    levels = Levels(od, shapes, [lane.segments for lane in graph.lanes], polygons)
     intervals: dict[int, list[tuple[float, float]]] = defaultdict(list)
     crossings = 0
     for pair in overlapping(polygons):
@@ -132,19 +133,19 @@ def cut_crossings(od: OpenDrive, graph: LaneGraph, shapes: Shapes) -> tuple[Lane
 class _Cutter:
     """Cuts roadblocks at intervals; what lies in the intervals becomes connectors."""
 
-    def __init__(self, graph: LaneGraph, intervals: dict[int, list[tuple[float, float]]]) -> None:
+    def __init__(self, graph: Graph, intervals: dict[int, list[tuple[float, float]]]) -> None:
         self.old, self.intervals = graph, intervals
         self.blocks: dict[tuple[int, int], int] = {}
-        self.lanes: list[LaneRun] = []
-        self.inner: list[ConnectorRun] = []
+        self.lanes: list[Lane] = []
+        self.inner: list[Connector] = []
         self.ends: dict[int, tuple[int, int]] = {}  # first and last new lane of an old one
-        self.lead: dict[int, list[Piece]] = {}  # pieces that go to the connectors before
-        self.trail: dict[int, list[Piece]] = {}
-        self.whole: dict[int, list[Piece]] = {}  # lanes that vanish into connectors
-        self.onward: dict[int, list[ConnectorRun]] = defaultdict(list)
+        self.lead: dict[int, list[LaneSegment]] = {}  # pieces that go to the connectors before
+        self.trail: dict[int, list[LaneSegment]] = {}
+        self.whole: dict[int, list[LaneSegment]] = {}  # lanes that vanish into connectors
+        self.onward: dict[int, list[Connector]] = defaultdict(list)
         self.dropped = list(graph.dropped)
 
-    def cut(self) -> LaneGraph:
+    def cut(self) -> Graph:
         """The graph after all cuts."""
         for number, lane in enumerate(self.old.lanes):
             self._cut_lane(number, lane)
@@ -155,10 +156,10 @@ class _Cutter:
             replace(c, source=place[c.source], target=place[c.target])
             for c in (*outer, *self.inner)
         ]
-        return LaneGraph([self.lanes[i] for i in order], connectors, self.dropped)
+        return Graph([self.lanes[i] for i in order], connectors, self.dropped)
 
-    def _cut_lane(self, number: int, lane: LaneRun) -> None:
-        length = sum(piece.length for piece in lane.pieces)
+    def _cut_lane(self, number: int, lane: Lane) -> None:
+        length = sum(piece.length for piece in lane.segments)
         spans = _merge(self.intervals.get(lane.block, []), length)
         stops = [0.0, *(stop for span in spans for stop in span), length]
         free = [
@@ -167,29 +168,29 @@ class _Cutter:
             if end > begin
         ]
         if not free:
-            self.whole[number] = lane.pieces
+            self.whole[number] = lane.segments
             return
         first = len(self.lanes)
         for part, begin, end in free:
             block = self.blocks.setdefault((lane.block, part), len(self.blocks))
-            pieces = _pieces_between(lane.pieces, begin, end) if spans else lane.pieces
-            self.lanes.append(LaneRun(pieces, block, lane.index))
+            pieces = _pieces_between(lane.segments, begin, end) if spans else lane.segments
+            self.lanes.append(Lane(pieces, block, lane.index))
         for k, ((_, _, begin), (part, end, _)) in enumerate(pairwise(free)):
             label = frozenset({f"crossing before part {part} of block {lane.block}"})
-            pieces = _pieces_between(lane.pieces, begin, end)
-            self.inner.append(ConnectorRun(pieces, first + k, first + k + 1, label))
+            pieces = _pieces_between(lane.segments, begin, end)
+            self.inner.append(Connector(pieces, first + k, first + k + 1, label))
         self.ends[number] = first, len(self.lanes) - 1
-        self.lead[number] = _pieces_between(lane.pieces, 0.0, free[0][1])
-        self.trail[number] = _pieces_between(lane.pieces, free[-1][2], length)
+        self.lead[number] = _pieces_between(lane.segments, 0.0, free[0][1])
+        self.trail[number] = _pieces_between(lane.segments, free[-1][2], length)
 
-    def _outer_connectors(self) -> list[ConnectorRun]:
+    def _outer_connectors(self) -> list[Connector]:
         """Connectors of the old graph, longer where lanes were cut at their ends."""
         for connector in self.old.connectors:
             self.onward[connector.source].append(connector)
-        out: list[ConnectorRun] = []
+        out: list[Connector] = []
         for connector in self.old.connectors:
             if connector.source not in self.whole:
-                pieces = [*self.trail[connector.source], *connector.pieces]
+                pieces = [*self.trail[connector.source], *connector.segments]
                 out += self._extend(connector, pieces, connector.junctions, ())
         sources, targets = {c.source for c in out}, {c.target for c in out}
         for number, (first, last) in self.ends.items():
@@ -201,23 +202,23 @@ class _Cutter:
 
     def _extend(
         self,
-        connector: ConnectorRun,
-        pieces: list[Piece],
+        connector: Connector,
+        pieces: list[LaneSegment],
         junctions: frozenset[str],
         passed: tuple[int, ...],
-    ) -> list[ConnectorRun]:
+    ) -> list[Connector]:
         """A connector up to the next lane that is left, through lanes that vanished."""
         target = passed[-1] if passed else connector.target
         if target not in self.whole:
             source = self.ends[connector.source][1]
             pieces = [*pieces, *self.lead[target]]
-            return [ConnectorRun(pieces, source, self.ends[target][0], junctions)]
+            return [Connector(pieces, source, self.ends[target][0], junctions)]
         found = []
         for following in self.onward[target]:
             if following.target not in passed and len(passed) < _MAX_VANISHED:
                 found += self._extend(
                     connector,
-                    [*pieces, *self.whole[target], *following.pieces],
+                    [*pieces, *self.whole[target], *following.segments],
                     junctions | following.junctions | {f"crossing over lane {target}"},
                     (*passed, following.target),
                 )
@@ -239,11 +240,11 @@ def _merge(spans: Sequence[tuple[float, float]], length: float) -> list[tuple[fl
     return merged
 
 
-def _pieces_between(pieces: list[Piece], begin: float, end: float) -> list[Piece]:
+def _pieces_between(pieces: list[LaneSegment], begin: float, end: float) -> list[LaneSegment]:
     if end <= begin:
         return []
-    _, tail = split_pieces(pieces, begin)
-    return split_pieces(tail, end - begin)[0]
+    _, tail = split_segments(pieces, begin)
+    return split_segments(tail, end - begin)[0]
 
 
 def subtract_overlaps(

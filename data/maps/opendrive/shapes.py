@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 
 from shiftsim.data.maps.opendrive.curves import ReferenceLine
-from shiftsim.data.maps.opendrive.graph import Piece
+from shiftsim.data.maps.opendrive.graph import LaneSegment
 from shiftsim.data.maps.opendrive.lanes import BEFORE_END, LaneKey, section_borders
 from shiftsim.data.maps.opendrive.records import OpenDrive, Road
 from shiftsim.data.polygons import largest_part
@@ -46,7 +46,7 @@ class SectionShape:
 class Shapes:
     """Samples the lanes of a file; sections are evaluated once."""
 
-    def __init__(self, od: OpenDrive, pieces: Iterable[Piece]) -> None:
+    def __init__(self, od: OpenDrive, pieces: Iterable[LaneSegment]) -> None:
         self._od = od
         self._lines = {road.id: ReferenceLine(road.geometries) for road in od.roads.values()}
         self._stops: dict[tuple[str, int], set[float]] = defaultdict(set)
@@ -66,7 +66,7 @@ class Shapes:
             self._sections[key] = _sample_section(*place, self._stops.get(key, set()))
         return self._sections[key]
 
-    def borders(self, piece: Piece) -> tuple[FloatArray, FloatArray]:
+    def borders(self, piece: LaneSegment) -> tuple[FloatArray, FloatArray]:
         """(K, 2) left and right border of a piece in the direction of travel [m]."""
         shape = self.section(piece.key.road, piece.key.section)
         low, high = min(piece.begin, piece.end), max(piece.begin, piece.end)
@@ -77,12 +77,12 @@ class Shapes:
             inner, outer = inner[::-1], outer[::-1]
         return (inner, outer) if (piece.key.lane < 0) == forward else (outer, inner)
 
-    def joined_borders(self, pieces: Sequence[Piece]) -> tuple[FloatArray, FloatArray]:
+    def joined_borders(self, pieces: Sequence[LaneSegment]) -> tuple[FloatArray, FloatArray]:
         """Borders of a chain of pieces; ends that nearly meet become one vertex."""
         left, right = zip(*map(self.borders, pieces), strict=True)
         return join_lines(left), join_lines(right)
 
-    def centers(self, piece: Piece, s: FloatArray) -> FloatArray:
+    def centers(self, piece: LaneSegment, s: FloatArray) -> FloatArray:
         """(K, 2) points midway between the borders at `s` (K,) [m]."""
         low, high = min(piece.begin, piece.end), max(piece.begin, piece.end)
         return self._middles(piece.key, np.clip(s, low, max(high - BEFORE_END, low)))
@@ -94,7 +94,7 @@ class Shapes:
 
     def baseline(
         self,
-        pieces: Sequence[Piece],  # in the direction of travel
+        pieces: Sequence[LaneSegment],  # in the direction of travel
         start: FloatArray | None = None,  # (2,) where it must begin, near its own start [m]
         end: FloatArray | None = None,  # (2,) where it must end [m]
     ) -> FloatArray:
@@ -111,7 +111,7 @@ class Shapes:
             shifts[-1] = (shifts[-1][0], end - firsts[-1][1])
         return divide(np.concatenate(list(map(self._shifted, pieces, shifts))))
 
-    def _without_steps(self, piece: Piece) -> list[Piece]:
+    def _without_steps(self, piece: LaneSegment) -> list[LaneSegment]:
         """The piece, cut where the middle of the lane jumps."""
         road = self._od.roads[piece.key.road]
         low, high = min(piece.begin, piece.end), max(piece.begin, piece.end)
@@ -125,7 +125,7 @@ class Shapes:
             stops.reverse()
         return [replace(piece, begin=a, end=b) for a, b in pairwise(stops)]
 
-    def _shifted(self, piece: Piece, shift: tuple[FloatArray, FloatArray]) -> FloatArray:
+    def _shifted(self, piece: LaneSegment, shift: tuple[FloatArray, FloatArray]) -> FloatArray:
         """Dense centre points of a piece, its two ends moved by `shift` (2,), (2,)."""
         share = np.linspace(0.0, 1.0, max(int(np.ceil(piece.length / _DENSE_STEP)), 2) + 1)
         points = self.centers(piece, piece.begin + share * (piece.end - piece.begin))
@@ -135,7 +135,7 @@ class Shapes:
         points += _ramp((1.0 - share) / reach)[:, None] * shift[1]
         return points
 
-    def widths(self, pieces: Sequence[Piece]) -> tuple[float, float]:
+    def widths(self, pieces: Sequence[LaneSegment]) -> tuple[float, float]:
         """Width at the start and at the end of a chain of pieces [m]."""
         out = []
         for piece, s in ((pieces[0], pieces[0].begin), (pieces[-1], pieces[-1].end)):

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from map_checks import check_map
 
 from shiftsim.data.maps.build import build_lane_map
-from shiftsim.data.maps.opendrive.check import check_map
 from shiftsim.data.maps.segments import LanePiece, MapSource
 from shiftsim.errors import MapError
 

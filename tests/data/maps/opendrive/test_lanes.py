@@ -164,7 +164,7 @@ def test_forgotten_link_between_sections_is_inferred():
     graph = build_lane_graph(
         parse(road(sections=section(lane(-1)) + section(lane(-1), s=50))), warnings
     )
-    assert [len(lane.pieces) for lane in graph.lanes] == [2]
+    assert [len(lane.segments) for lane in graph.lanes] == [2]
     assert warnings == {"lane link missing between sections, inferred": 1}
 
 
@@ -176,7 +176,7 @@ def test_section_without_length_is_linked_through():
     warnings: Counter[str] = Counter()
     graph = build_lane_graph(parse(road(sections=sections)), warnings)
     assert len(graph.lanes) == 1
-    assert sum(piece.length for piece in graph.lanes[0].pieces) == 100
+    assert sum(piece.length for piece in graph.lanes[0].segments) == 100
 
 
 def test_roads_that_do_not_meet_are_not_linked():
@@ -218,7 +218,7 @@ def test_ring_of_roads_ends_in_a_seam():
         for name, other, y, hdg in (("1", "2", 0.0, 0.0), ("2", "1", 20.0, np.pi))
     ]
     graph = build_lane_graph(parse(*parts), Counter())
-    assert [len(lane.pieces) for lane in graph.lanes] == [2]
+    assert [len(lane.segments) for lane in graph.lanes] == [2]
     assert [(c.source, c.target) for c in graph.connectors] == [(0, 0)]
 
 
@@ -242,4 +242,4 @@ def test_maze_of_lanes_in_a_junction_does_not_hang():
     build_lane_graph(
         parse(entry, *rooms, f'<junction id="5">{"".join(links)}</junction>'), warnings
     )
-    assert warnings["junction with too many ways through, the rest is left out"] == 1
+    assert warnings["intersection with too many ways through, the rest left out"] == 1

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import call
+from map_checks import check_map
 from open_data_files import (
     COMMANDS,
     LABELS,
@@ -21,7 +22,6 @@ from open_data_files import (
     write_py123d,
 )
 
-from shiftsim.data.maps.opendrive.check import check_map
 from shiftsim.data.readers.open_data.av2 import Av2Reader
 from shiftsim.data.readers.open_data.py123d import Py123dReader
 from shiftsim.data.readers.open_data.scenes import convert_scene, convert_scenes

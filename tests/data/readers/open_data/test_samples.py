@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from map_checks import check_map
 
 import shiftsim
-from shiftsim.data.maps.opendrive.check import check_map
 from shiftsim.data.readers.open_data.av2 import Av2Reader
 from shiftsim.data.readers.open_data.commonroad import CommonRoadReader
 from shiftsim.data.readers.open_data.scenes import convert_scene, convert_scenes
