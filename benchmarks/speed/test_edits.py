@@ -20,7 +20,7 @@ from shiftsim.verify.files import Scenes
 from shiftsim.verify.scenario_edits import WINDOW
 
 GOLDEN = Path(__file__).resolve().parents[2] / "tests" / "golden"
-TOKEN = "03b23cc64ccf44cb"
+TOKEN = "01f13ee575198fdf"
 EDITS = {
     "spawn": {"spawn": {"at": {"ahead_m": 45.0, "left_m": -5.0}, "behavior": "stopped"}},
     "walk": {"walk": {"from": {"ahead_m": 40, "left_m": -5}, "to": {"ahead_m": 40, "left_m": 5}}},

@@ -36,7 +36,7 @@ _DEMO = {
 }
 DEMO_TOWNS = tuple(
     TownSpec(name, kind, number, num_recordings=2, overlap_s=0.0, min_scenarios=6)
-    for number, (name, kind) in enumerate(_DEMO.items(), start=9001)
+    for number, (name, kind) in enumerate(_DEMO.items(), start=1)
 )
 
 

@@ -56,7 +56,7 @@ class Scenario:
 
     Example:
         ```python
-        scenario = shiftsim.open_store("demo")["03b23c"]
+        scenario = shiftsim.open_store("demo")["01f13e"]
         print(scenario.num_iterations, scenario.expert[:, :2], scenario.route)
         ```
     """
@@ -124,7 +124,7 @@ class Scenario:
 
         Example:
             ```python
-            scenario = shiftsim.open_store("demo")["03b23c"]
+            scenario = shiftsim.open_store("demo")["01f13e"]
             place = {"ahead_m": 30.0, "left_m": -3.0}
             parked = scenario.edited(spawn={"at": place, "behavior": "stopped"})
             print(parked.token, parked.script.words)
