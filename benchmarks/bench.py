@@ -17,16 +17,17 @@ from shiftsim.benchmarks import INTERPLAN_THRESHOLDS, Drawn, Track, load_track
 from shiftsim.benchmarks.coverage import coverage
 from shiftsim.edits.sampling import sample_edits
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.files import whole_file, write_text
+from shiftsim.files import write_text
 from shiftsim.report.groups import Group, KnownSet, token_digest
 from shiftsim.report.tables import Table
 from shiftsim.runs.avoidable import grade
 from shiftsim.runs.config import DEFAULT_STORE, make_config
 from shiftsim.runs.edited import EditSet, edits_text, make_edits
 from shiftsim.runs.execute import Progress, execute
-from shiftsim.runs.prepare import RUNS, Prepared, prepare
-from shiftsim.runs.results import Run, open_run, stored_results
+from shiftsim.runs.prepare import RUNS, RunPlan, prepare
+from shiftsim.runs.results import Run, open_run
 from shiftsim.runs.scenarios import open_edits, open_named_store
+from shiftsim.runs.tables import stored_results
 from shiftsim.sim.traffic import traffic_name
 
 MANIFEST = "bench.json"
@@ -44,14 +45,14 @@ class Plan:
 
     track: Track  # the track
     folder: Path  # where everything goes
-    runs: Mapping[str, Prepared]  # the runs, by the name of their folder
+    runs: Mapping[str, RunPlan]  # the runs, by the name of their folder
     own: tuple[KnownSet, ...]  # one's own lists of scenarios as a whole: recorded, then edited
     edits: str = ""  # what was drawn for it, as a file
 
     @property
     def num_tasks(self) -> int:
         """Rollouts of all runs."""
-        return sum(len(prepared.tasks) for prepared in self.runs.values())
+        return sum(len(run.tasks) for run in self.runs.values())
 
 
 def plan_bench(
@@ -112,7 +113,7 @@ def _prepared(
     modes: Sequence[str],
     folder: Path,
     edits: EditSet | None = None,
-) -> dict[str, Prepared]:
+) -> dict[str, RunPlan]:
     """The runs of some sets of scenarios, by the name of their folder."""
     runs = {}
     for name, traffic in product(sets, modes):
@@ -123,7 +124,7 @@ def _prepared(
     return runs
 
 
-def _edits(drawn: Drawn, own: Prepared, given: str, folder: Path) -> tuple[EditSet, str]:
+def _edits(drawn: Drawn, own: RunPlan, given: str, folder: Path) -> tuple[EditSet, str]:
     """The edits that are given, else those of the folder, else those that the track draws.
 
     The text is that of a file of those that were drawn.
@@ -133,7 +134,7 @@ def _edits(drawn: Drawn, own: Prepared, given: str, folder: Path) -> tuple[EditS
         return open_edits(given or str(folder / EDITS), store), ""
     read = lru_cache(maxsize=256)(store.read)
     found = [
-        sample_edits(kind, drawn.count, drawn.seed, own.tokens, read, grade, even=True)
+        sample_edits(kind, drawn.count, drawn.seed, own.selection.tokens, read, grade, even=True)
         for kind in drawn.kinds
     ]
     # all kinds in turn, so that a part of the list has all of them
@@ -169,20 +170,19 @@ def _check_folder(folder: Path, track: Track) -> None:
         )
 
 
-def _whole(prepared: Prepared) -> Prepared:
+def _whole(run: RunPlan) -> RunPlan:
     """The run on the whole list, where it is limited to its first scenarios."""
-    if not prepared.config.limit:
-        return prepared
-    out = str(prepared.folder / "whole")
-    config = replace(prepared.config, limit=0, out=out, resume=False)
-    return prepare(config, edits=prepared.edits)
+    if not run.config.limit:
+        return run
+    config = replace(run.config, limit=0, out=str(run.folder / "whole"), resume=False)
+    return prepare(config, edits=run.selection.edits)
 
 
-def _list_of(prepared: Prepared) -> KnownSet:
+def _list_of(run: RunPlan) -> KnownSet:
     """The scenarios of a run as a list."""
-    tokens = {task.token for task in (*prepared.tasks, *prepared.missing)}
-    rules = prepared.config.thresholds
-    return KnownSet(prepared.split, prepared.split, rules, len(tokens), token_digest(tokens))
+    tokens = {task.token for task in (*run.tasks, *run.missing)}
+    split, rules = run.selection.split, run.config.thresholds
+    return KnownSet(split, split, rules, len(tokens), token_digest(tokens))
 
 
 def run_bench(
@@ -210,17 +210,15 @@ def run_bench(
     if plan.edits:
         write_text(plan.folder / EDITS, plan.edits)
     text = json.dumps(manifest, indent=1, ensure_ascii=False)
-    with whole_file(plan.folder / MANIFEST) as partial:
-        partial.write_text(f"{text}\n", encoding="utf-8")
+    write_text(plan.folder / MANIFEST, f"{text}\n")
     total = _Total(plan.num_tasks, on_progress)
     out = []
-    for prepared in plan.runs.values():
-        if prepared.before == "complete":
-            out.append(open_run(prepared.folder))
-            stored = (result for result, _ in stored_results(prepared.folder))
-            total.show(Progress(len(prepared.tasks), 0, 0, news=stored))
+    for run in plan.runs.values():
+        if run.before == "complete":
+            out.append(open_run(run.folder))
+            total.show(Progress(len(run.tasks), 0, 0, news=stored_results(run.folder)))
         else:
-            out.append(execute(prepared, on_progress=total.show, argv=argv))
+            out.append(execute(run, on_progress=total.show, argv=argv))
         total.before = total.now
     return out
 

@@ -1,7 +1,7 @@
 """The command `shiftsim`, also as `python -m shiftsim`.
 
-It hears an interrupt before anything heavy is imported, so that one which comes early ends in one
-line as well.
+It listens to an interrupt before anything heavy is imported, so that an early one ends in one line
+as well.
 """
 
 import atexit
@@ -14,18 +14,16 @@ if not sys.flags.safe_path and sys.path[0] in ("", os.getcwd()):
 
 
 def _leave(*signal: object) -> None:
-    over = "\r" if os.isatty(2) else ""  # the ^C of the terminal
-    os.write(2, f"{over}error: interrupted\n".encode())
+    before = "\r" if os.isatty(2) else ""  # over the ^C of the terminal
+    os.write(2, f"{before}error: interrupted\n".encode())
     os._exit(130)
 
 
 def main() -> None:
     """Run the command line."""
-    # one thread per process, here as in workers: NumPy and SciPy would each start one for every
-    # core when they are imported, a tenth of a short command
+    # one thread per process, here as in workers; NumPy and SciPy would each start one per core
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # the end frees all memory; looking for garbage in it first is a quarter of a short command
-    atexit.register(gc.freeze)
+    atexit.register(gc.freeze)  # the end frees all memory: no need to look for garbage in it
     try:
         import signal
 

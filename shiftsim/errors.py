@@ -26,7 +26,12 @@ class ShiftsimError(Exception):
     """
 
     def __init__(self, message: str, hint: str = "") -> None:
-        self.message, self.hint = _in_one_line(message), hint
+        message = str(message)  # Gymnasium makes an error of an error
+        if len(message) > _MAX_MESSAGE or "\n" in message:  # with texts of other libraries in it
+            message = " ".join(message.split())
+        if len(message) > _MAX_MESSAGE:
+            message = f"{message[:700]} … {message[-250:]}"
+        self.message, self.hint = message, hint
         super().__init__(self.message)
 
     def __str__(self) -> str:
@@ -35,14 +40,6 @@ class ShiftsimError(Exception):
     def __reduce__(self) -> tuple[type["ShiftsimError"], tuple[str, str]]:
         """Keep the hint when the error travels between processes."""
         return type(self), (self.message, self.hint)
-
-
-def _in_one_line(message: str) -> str:
-    """The message; texts of other libraries and values of damaged files in it may be long."""
-    if len(message) <= _MAX_MESSAGE and "\n" not in message:
-        return message
-    text = " ".join(message.split())
-    return text if len(text) <= _MAX_MESSAGE else f"{text[:700]} … {text[-250:]}"
 
 
 class ConfigError(ShiftsimError):

@@ -1,9 +1,9 @@
 """Where users' files are, and how files are read and written: settings in TOML, whole files only.
 
 Nothing else in the project looks at environment variables for folders, and no file is ever seen
-half written: `whole_file` is the one way to replace one. What a file that may be anybody's names is
-looked for inside its folder only, with `below`. `sources` says what a module of ours is made of, so
-that caches and runs notice when it changes.
+half written: `atomic_write` is the one way to replace one. What a file that may be anybody's names
+is looked for inside its folder only, with `safe_join`. `sources` says what a module of ours is made
+of, so that caches and runs notice when it changes.
 """
 
 import json
@@ -23,7 +23,6 @@ from typing import Any, BinaryIO
 from shiftsim.errors import ConfigError, DataError
 
 PACKAGE = Path(__file__).parent
-# a line end is found twice as fast as a line's beginning
 _IMPORT = re.compile(
     r"\n *(?:from shiftsim\.([\w.]+) import (?:\(([^)]*)\)|([^\n(]+))|import shiftsim\.([\w.]+))"
 )
@@ -56,7 +55,7 @@ def user_cache(part: str) -> Path:
     return Path(os.environ.get("SHIFTSIM_CACHE", "~/.cache/shiftsim")).expanduser() / part
 
 
-def below(folder: Path, name: str) -> Path:
+def safe_join(folder: Path, name: str) -> Path:
     """The place of something in a folder by its relative path.
 
     Raises:
@@ -74,7 +73,7 @@ def below(folder: Path, name: str) -> Path:
     )
 
 
-def draft(path: Path) -> Path:
+def temp_path(path: Path) -> Path:
     """Where a file is written before it takes its place; nothing is there, not even a link."""
     partial = path.with_name(f".{path.name}.tmp")
     partial.unlink(missing_ok=True)
@@ -82,9 +81,9 @@ def draft(path: Path) -> Path:
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path) -> Iterator[Path]:
     """A file to be written, which then takes its place: whole or not at all."""
-    partial = draft(path)
+    partial = temp_path(path)
     try:
         yield partial
         partial.replace(path)
@@ -99,7 +98,7 @@ def write_text(path: Path, text: str) -> None:
 
     Half a surrogate pair, for which UTF-8 has no bytes, is written as JSON would escape it.
     """
-    with whole_file(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text(text, "utf-8", errors="backslashreplace", newline="")
 
 
@@ -122,7 +121,7 @@ def read_json_lines(path: Path) -> Iterator[tuple[str, Any]]:
                 ) from error
 
 
-def locked(path: Path) -> BinaryIO:
+def lock(path: Path) -> BinaryIO:
     """A file, made if needed, that one process at a time has open here; closing it lets others in.
 
     Where the system or the file system has no locks, nobody is kept out.
@@ -161,16 +160,6 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(
             f"{str(path)!r} is not TOML: {error}", hint="repair the line named above"
         ) from error
-
-
-def fresh_python(command: str, *words: str) -> tuple[list[str], dict[str, str]]:
-    """Words and environment that start an interpreter which knows this package.
-
-    What lies in the current folder is no code to it.
-    """
-    search = [str(PACKAGE.parent), os.environ.get("PYTHONPATH", "")]
-    paths = os.pathsep.join(filter(None, search))
-    return [sys.executable, "-P", "-c", command, *words], {**os.environ, "PYTHONPATH": paths}
 
 
 _IMPORTING: list[str] = []  # modules of the user that are being imported

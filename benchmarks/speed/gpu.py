@@ -22,8 +22,9 @@ from shiftsim.planners.learned.base import LearnedPlanner
 from shiftsim.planners.learned.device import resolve_device
 from shiftsim.planners.learned.owner import Address, InferenceClient, InferenceServer, new_address
 from shiftsim.planners.registry import load_planner, planner_factory
+from shiftsim.processes import in_background
 from shiftsim.runs.config import default_workers
-from shiftsim.runs.workers import beside, map_unordered
+from shiftsim.runs.workers import map_unordered
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import Rollout, simulate_together
 from shiftsim.world.scenario import Scenario
@@ -122,7 +123,7 @@ def drive_in_workers(
     address = new_address()
     parts = [tuple(tasks[start : start + batch]) for start in range(0, len(tasks), batch)]
     done = {}
-    with beside(partial(InferenceServer, make_planner, address)):
+    with in_background(partial(InferenceServer, make_planner, address)):
         make = partial(make_worker, address)
         for outcome in map_unordered(make, parts, workers=workers):
             if outcome.result is None:

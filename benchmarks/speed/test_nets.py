@@ -29,7 +29,7 @@ from shiftsim.data.store.reading import open_store
 from shiftsim.data.synthetic.store import demo_store
 from shiftsim.planners.learned.owner import InferenceClient, InferenceServer, new_address
 from shiftsim.planners.registry import load_planner
-from shiftsim.runs.workers import beside
+from shiftsim.processes import in_background
 from shiftsim.sim.loop import Rollout
 from shiftsim.verify.files import Scenes
 from shiftsim.world.state import center_poses
@@ -315,7 +315,7 @@ def test_asking_another_process(scenes, loaded, size, note, name, batch):
     forks, observations = started(planner, [scenes[n] for n in NAMES if n in scenes], batch)
     features = [fork.features(seen) for fork, seen in zip(forks, observations, strict=True)]
     outputs = list(planner.infer(features))
-    with beside(partial(InferenceServer, {name: partial(gpu.Repeating, outputs)}, address)):
+    with in_background(partial(InferenceServer, {name: partial(gpu.Repeating, outputs)}, address)):
         ask = InferenceClient(address, name)
         seconds = median_seconds(lambda: ask(features), size(ASKED, 2))
         answered = ask(features)
@@ -332,7 +332,7 @@ import re, sys
 from shiftsim.data.store.reading import open_store
 from shiftsim.planners.learned.owner import InferenceClient, InferenceServer, new_address
 from shiftsim.planners.registry import load_planner
-from shiftsim.runs.workers import beside
+from shiftsim.processes import in_background
 from shiftsim.sim.loop import Rollout
 store = open_store(sys.argv[1])
 planner = load_planner(sys.argv[2], {"checkpoint": "deterministic:drive"})

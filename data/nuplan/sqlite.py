@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 from urllib.parse import quote
 
 from shiftsim.errors import DataError
-from shiftsim.files import whole_file
+from shiftsim.files import atomic_write
 
 Value: TypeAlias = int | float | str | bytes | None
 
@@ -114,7 +114,7 @@ def write_database(
     """Write an SQLite file in one step: column definitions and rows by table, then statements."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with (
-        whole_file(path) as partial,
+        atomic_write(path) as partial,
         closing(sqlite3.connect(_absent(partial), isolation_level=None)) as connection,
     ):
         connection.execute("PRAGMA journal_mode = OFF")

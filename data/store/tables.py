@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from shiftsim.data.store import schema
 from shiftsim.errors import DataError
-from shiftsim.files import below, whole_file, write_text
+from shiftsim.files import atomic_write, safe_join, write_text
 
 MANIFEST, SCENARIOS = "store.json", "scenarios.parquet"
 FRAMES, TRACKS = "frames.parquet", "tracks.parquet"  # in the folder of a recording
@@ -37,22 +37,22 @@ def file_name(name: str) -> str:
 
 def map_file(store: Path, city: str) -> Path:
     """File of a map."""
-    return below(store, f"maps/{file_name(city)}.parquet")
+    return safe_join(store, f"maps/{file_name(city)}.parquet")
 
 
 def report_file(store: Path, city: str) -> Path:
     """File of what is known about the conversion of a city."""
-    return below(store, f"{REPORTS}/{file_name(city)}.json")
+    return safe_join(store, f"{REPORTS}/{file_name(city)}.json")
 
 
 def picture_file(store: Path, city: str, recording: str) -> Path:
     """Picture of a recording on its map, beside the report; no part of the store's content."""
-    return below(store, f"{REPORTS}/{file_name(city)}_{file_name(recording)}.png")
+    return safe_join(store, f"{REPORTS}/{file_name(city)}_{file_name(recording)}.png")
 
 
 def recording_folder(store: Path, recording: str) -> Path:
     """Folder of a recording."""
-    return below(store, f"recordings/{file_name(recording)}")
+    return safe_join(store, f"recordings/{file_name(recording)}")
 
 
 def ego_file(folder: Path, name: str) -> Path:
@@ -132,7 +132,7 @@ def write_blocks(
     notes = json.dumps({} if footer is None else footer, sort_keys=True)
     path.parent.mkdir(parents=True, exist_ok=True)
     with (
-        whole_file(path) as partial,
+        atomic_write(path) as partial,
         TableWriter(
             partial,
             first.schema,

@@ -8,7 +8,6 @@ traceback. Exit codes: 0 all well, 1 usage or settings, 2 data, 3 finished with 
 tasks, 130 interrupted; `verify` has its own.
 """
 
-import gc
 import inspect
 import json
 import os
@@ -18,7 +17,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import fields
 from functools import cache, wraps
 from importlib import import_module
@@ -58,10 +57,10 @@ def say_json(value: Any) -> None:
 
 
 @contextmanager
-def output_kept() -> Iterator[None]:
+def stdout_to_stderr() -> Iterator[None]:
     """What planners print within goes to the standard error: the output is the command's own.
 
-    That holds for worker processes that begin within, and for what is no Python, as well.
+    That holds for worker processes that begin within, and for compiled code, too.
     """
     sys.stdout.flush()
     before = os.dup(1)
@@ -113,24 +112,14 @@ def progress_bar(*, quiet: bool) -> Iterator[Advance]:
 
     It ends the command where an interrupt came and got lost.
     """
-    with _shown(quiet) as advance:
+    with _bar() if sys.stderr.isatty() and not quiet else nullcontext(_lines(quiet)) as advance:
 
         def checked(done: int, total: int, note: str) -> None:
-            if _has_come():
+            if _is_interrupted():
                 raise KeyboardInterrupt
             advance(done, total, note)
 
         yield checked
-
-
-@contextmanager
-def _shown(quiet: bool) -> Iterator[Advance]:
-    if quiet:
-        yield lambda done, total, note: None
-    elif sys.stderr.isatty():
-        yield from _bar()
-    else:
-        yield _lines()
 
 
 class _Interrupt:
@@ -143,10 +132,11 @@ class _Interrupt:
         raise KeyboardInterrupt
 
 
-def _has_come() -> bool:
+def _is_interrupted() -> bool:
     return getattr(signal.getsignal(signal.SIGINT), "came", False)
 
 
+@contextmanager
 def _bar() -> Iterator[Advance]:
     from rich import progress
     from rich.console import Console
@@ -161,31 +151,29 @@ def _bar() -> Iterator[Advance]:
     )
     with progress.Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task("", total=None)
-
-        def advance(done: int, total: int, note: str) -> None:
-            bar.update(task, completed=done, total=total or None, description=note)
-
-        yield advance
+        yield lambda done, total, note: bar.update(
+            task, completed=done, total=total or None, description=note
+        )
 
 
-def _lines() -> Advance:
-    began = time.monotonic()
-    last = [-1]
+def _lines(quiet: bool) -> Advance:
+    """A line for each tenth, and one for what happens before."""
+    began, last = time.monotonic(), -1
 
     def advance(done: int, total: int, note: str) -> None:
-        if not total:  # not known yet: what happens before
-            if last[0] < 0:
-                typer.echo(f" {note}", err=True)
-                last[0] = 0
+        nonlocal last
+        tenth = 10 * done // total if total else 0
+        if quiet or tenth <= last or (total and not tenth):
             return
-        tenth = 10 * done // total
-        if tenth > max(last[0], 0):
-            last[0] = tenth
-            elapsed = time.monotonic() - began
-            left = elapsed / done * (total - done) if done else 0.0
-            tail = f"  {note}" if note else ""
-            text = f" {10 * tenth:3d} %  {done}/{total}  {elapsed:.0f} s, {left:.0f} s left{tail}"
-            typer.echo(text, err=True)
+        last = tenth
+        if not total:
+            typer.echo(f" {note}", err=True)
+            return
+        elapsed = time.monotonic() - began
+        left = elapsed / done * (total - done)
+        tail = f"  {note}" if note else ""
+        text = f" {10 * tenth:3d} %  {done}/{total}  {elapsed:.0f} s, {left:.0f} s left{tail}"
+        typer.echo(text, err=True)
 
     return advance
 
@@ -255,7 +243,6 @@ def planner_arguments(
 
 
 _USAGE, _DATA, _INTERRUPTED = 1, 2, 130
-_FEW_LOOKS = 50_000  # new objects between two looks for garbage
 # commands that go on with what is finished, and the words that ask for it
 _GOES_ON = {
     **dict.fromkeys(("filter", "dsc3d", "av2", "py123d", "commonroad"), ()),
@@ -265,28 +252,28 @@ _GOES_ON = {
 _ClickError: Any = typer.BadParameter.__mro__[2]
 # command -> where it is: a function, or further commands; imported when it is used
 _COMMANDS = {
-    "demo": "demo:demo",
-    "run": "running:run",
-    "score": "deriving:score",
-    "merge": "deriving:merge",
+    "demo": "run:demo",
+    "run": "run:run",
+    "score": "run:score",
+    "merge": "run:merge",
     "bench": "bench:bench",
-    "report": "reading:report",
-    "explain": "reading:explain",
-    "diff": "reading:diff",
-    "check": "stores:check",
+    "report": "report:report",
+    "explain": "report:explain",
+    "diff": "report:diff",
+    "check": "store:check",
     "verify": "doctor:verify",
     "doctor": "doctor:doctor",
-    "data": "data:data",
-    "view": "viewing:view",
-    "plot": "viewing:plot",
-    "inspect": "viewing:inspect",
-    "filter": "stores:filter_scenarios",
-    "stats": "stores:show_stats",
-    "split": "stores:make_split",
+    "data": "bench:data",
+    "view": "view:view",
+    "plot": "view:plot",
+    "inspect": "view:inspect",
+    "filter": "store:filter_scenarios",
+    "stats": "store:show_stats",
+    "split": "store:make_split",
     "edits": "edits:app",
     "planners": "planners:app",
     "convert": "open_data:app",
-    "export": "stores:export",
+    "export": "store:export",
     "checkpoint": "planners:checkpoint",
     "train": "training:app",
     "realism": "training:realism",
@@ -320,7 +307,7 @@ def _command(name: str) -> Any:
         alone.command()(found)
         command = typer.main.get_command(alone)
     command.name = name
-    return values.with_plain_values(command)
+    return command
 
 
 app = new_app(
@@ -339,7 +326,7 @@ def _options(
 ) -> None:
     """Closed-loop evaluation of driving planners with nuPlan's semantics."""
     if version:
-        from shiftsim import __version__
+        from shiftsim._version import __version__
 
         typer.echo(__version__)
         raise typer.Exit
@@ -349,13 +336,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and leave with its exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
-    # imports make a hundred thousand objects that stay: looking for garbage among them while they
-    # are made takes a sixth of the time of a short command
-    looks, before = gc.get_threshold(), signal.getsignal(signal.SIGINT)
-    gc.set_threshold(_FEW_LOOKS)
+    before = signal.getsignal(signal.SIGINT)
     if callable(before):  # else it is ignored, as in the background of a shell
         signal.signal(signal.SIGINT, _Interrupt())
-    sys.unraisablehook = _raised_nowhere
+    sys.unraisablehook = _ignore_interrupt
     try:
         code = _run([word for word in words if word != "--debug"], debug)
     except BrokenPipeError:  # the reader of our output has left, as `| head` does
@@ -364,19 +348,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     finally:
         signal.signal(signal.SIGINT, before)
         sys.unraisablehook = sys.__unraisablehook__
-        gc.set_threshold(*looks)
     sys.exit(code)
 
 
-def _raised_nowhere(found: Any) -> None:
-    """No words on an interrupt where nothing can be raised: `progress_bar` knows that it came."""
+def _ignore_interrupt(found: Any) -> None:
+    """Print nothing about an interrupt in a finalizer: `progress_bar` ends the command."""
     if found.exc_type is not KeyboardInterrupt:
         sys.__unraisablehook__(found)
 
 
 def _run(words: list[str], debug: bool) -> int:
     try:
-        command = values.with_plain_values(typer.main.get_command(app))
+        command: Any = typer.main.get_command(app)
         code = command.main(words, prog_name="shiftsim", standalone_mode=False)
     except (KeyboardInterrupt, typer.Abort):
         code = _INTERRUPTED
@@ -398,7 +381,7 @@ def _run(words: list[str], debug: bool) -> int:
         path = context.command_path if context is not None else "shiftsim"
         return _complain(error.format_message(), f"{path} --help", _USAGE)
     except Exception:
-        if not _has_come():
+        if not _is_interrupted():
             raise
         code = _INTERRUPTED  # a library has made something else of it
     if code == _INTERRUPTED:  # typer has taken the interrupt for itself
@@ -410,8 +393,8 @@ def _after_interrupt(words: list[str]) -> str:
     """What becomes of the work of a command that was interrupted, and how to go on."""
     for name in words[:2]:
         if name in _GOES_ON:
-            again = [*words, *(word for word in _GOES_ON[name] if word not in words)]
-            return f"what is finished is kept; go on with: {shlex.join(['shiftsim', *again])}"
+            resumed = [*words, *(word for word in _GOES_ON[name] if word not in words)]
+            return f"what is finished is kept; go on with: {shlex.join(['shiftsim', *resumed])}"
     return f"start again with: {shlex.join(['shiftsim', *words])}" if words else ""
 
 

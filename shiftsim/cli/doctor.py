@@ -4,18 +4,17 @@ The few reference values that come with the package are compared by the code tha
 """
 
 import os
+import tempfile
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import typer
 
 from shiftsim.cli import Advance, Debug, Json, Quiet, progress_bar, say, show
 from shiftsim.files import PACKAGE
-
-if TYPE_CHECKING:
-    from shiftsim.cli.compiling import Compiled
 
 REFERENCE = PACKAGE / "verify" / "reference"
 _DATA = 2
@@ -66,8 +65,6 @@ def doctor(
     """Versions, cores and memory, and whether the kernels compute what they should."""
     kernels = None
     if fills:
-        from shiftsim.cli.compiling import compile_kernels
-
         with progress_bar(quiet=quiet or as_json) as advance:
             kernels = compile_kernels(advance)
     with progress_bar(quiet=quiet or as_json) as advance:
@@ -75,6 +72,24 @@ def doctor(
     show(asdict(found), found.lines(), as_json=as_json)
     if not found.is_well:
         raise typer.Exit(_DATA)
+
+
+@dataclass(frozen=True)
+class Compiled:
+    """What `compile_kernels` left on disk."""
+
+    folder: str  # where the machine code is
+    files: int  # kernels, one for each combination of types
+    bytes: int  # their size
+    compiled: int  # of the files, those that were not there before
+    seconds: float  # from start to end [s]
+
+    def line(self) -> str:
+        """As text."""
+        return (
+            f"kernels: {self.files} ({self.bytes / 1e6:.1f} MB) in {self.folder}, "
+            f"{self.compiled} of them compiled in {self.seconds:.0f} s"
+        )
 
 
 @dataclass(frozen=True)
@@ -90,7 +105,7 @@ class Diagnosis:
     seconds: float  # how long the checks took, compilation included [s]
     cases: int  # reference values compared
     mismatches: tuple[str, ...]  # those that differ, in words
-    kernels: "Compiled | None" = None  # what was compiled before, where it was asked for
+    kernels: Compiled | None = None  # what was compiled before, where it was asked for
 
     @property
     def is_well(self) -> bool:
@@ -158,3 +173,49 @@ def _torch() -> str:
         return f"{torch.__version__}, no CUDA device"
     names = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
     return f"{torch.__version__}, CUDA {torch.version.cuda}: {', '.join(names)}"
+
+
+def compile_kernels(advance: Advance) -> Compiled:
+    """Make small runs that together use every kernel of a run.
+
+    Raises:
+        ShiftsimError: A run failed.
+    """
+    from shiftsim.api import run
+    from shiftsim.data.synthetic.store import demo_store
+    from shiftsim.kernels import CACHE_FOLDER, machine_code
+
+    began, before = perf_counter(), len(machine_code())
+    runs = [*_compiling_runs()]
+    with tempfile.TemporaryDirectory(prefix="shiftsim-kernels-") as folder:
+        store = demo_store(Path(folder, "demo"))
+        for number, (planners, settings) in enumerate(runs):
+            advance(number, len(runs), f"{', '.join(planners)} in {settings['traffic']} traffic")
+            settings |= {"store": str(store), "split": "demo-mini", "limit": 6, "workers": 1}
+            run(planners, noise="ou-high", out=f"{folder}/run-{number}", **settings)
+        advance(len(runs), len(runs), "")
+    files = machine_code()
+    return Compiled(
+        folder=CACHE_FOLDER,
+        files=len(files),
+        bytes=sum(path.stat().st_size for path in files),
+        compiled=len(files) - before,
+        seconds=perf_counter() - began,
+    )
+
+
+def _compiling_runs() -> Iterator[tuple[Sequence[str], dict[str, Any]]]:
+    """Planners and settings of runs that together use every kernel."""
+    from importlib.util import find_spec
+
+    from shiftsim.planners.table import PLANNERS
+
+    learned = [name for name, entry in PLANNERS.items() if entry.kind == "learned"]
+    rules = [name for name in PLANNERS if name not in ("scripted", *learned)]
+    yield ["constant-velocity"], {"traffic": "reactive"}
+    yield rules, {"traffic": "nonreactive"}
+    yield ["constant-velocity"], {"traffic": "constant-velocity", "controller": "perfect"}
+    if find_spec("torch") is not None:
+        drawn = {name: {"checkpoint": "deterministic:drive"} for name in learned}
+        yield learned, {"traffic": "nonreactive", "planner_args": drawn}
+        yield ["constant-velocity"], {"traffic": "learned"}

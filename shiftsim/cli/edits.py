@@ -79,7 +79,7 @@ def show(
     from shiftsim.report.palette import save_picture
     from shiftsim.runs.edited import EditedStore
     from shiftsim.runs.scenarios import open_edits, open_named_store
-    from shiftsim.view.edited import before_and_after
+    from shiftsim.view.still import before_and_after
 
     opened = open_named_store(store)
     edited = EditedStore(opened, open_edits(file, opened))

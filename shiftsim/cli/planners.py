@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from shiftsim.cli import Debug, Json, new_app, output_kept, plural, say, say_json, show, values
+from shiftsim.cli import Debug, Json, new_app, plural, say, say_json, show, stdout_to_stderr, values
 
 _USAGE = 1
 app = new_app("Planners: what there is, and does mine obey the contract.")
@@ -91,14 +91,14 @@ def check_one_planner(
     others = [row for row in rows if row["token"] != scenario.token]
     # of another map where there is one: a planner that keeps the map of the first shows there
     others.sort(key=lambda row: row["city"] == scenario.city)
-    with output_kept():
+    with stdout_to_stderr():
         load_planner(planner, arguments)
         make = partial(load_planner, planner, arguments)
         findings = check_planner(
             make, scenario, scenes.read(others[0]["token"]) if others else None
         )
     errors = [finding for finding in findings if finding.severity == "error"]
-    doubts = [finding for finding in findings if finding.severity == "warning"]
+    warnings = [finding for finding in findings if finding.severity == "warning"]
     if as_json:
         say_json([asdict(finding) for finding in findings])
     else:
@@ -107,7 +107,7 @@ def check_one_planner(
             if finding.hint:
                 say(f"   hint: {finding.hint}")
         verdict = plural(len(errors), "error") if errors else "obeys the contract"
-        verdict += f", {plural(len(doubts), 'warning')}" if doubts else ""
+        verdict += f", {plural(len(warnings), 'warning')}" if warnings else ""
         say(f"{planner} on scenario {scenario.token}: {verdict}")
     if any(finding.check == HANGS for finding in errors):
         raise KeyboardInterrupt
@@ -134,5 +134,5 @@ def convert(
     """Write the weights that the planner loads, and nothing else, to a safetensors file."""
     from shiftsim.planners.learned.convert import convert_checkpoint
 
-    made = convert_checkpoint(path, out)
-    show(made.to_dict(), made.lines(), as_json=as_json)
+    converted = convert_checkpoint(path, out)
+    show(converted.to_dict(), converted.lines(), as_json=as_json)

@@ -1,6 +1,6 @@
 """`shiftsim train`: making weights."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -47,8 +47,8 @@ def carl(
     from shiftsim.planners.learned.device import require_torch
 
     require_torch("training")
+    from shiftsim.train.folder import Settings
     from shiftsim.train.recipe import Training
-    from shiftsim.train.settings import Settings
 
     settings = Settings(
         store=store,
@@ -65,9 +65,7 @@ def carl(
         device=device,
         workers=workers,
     )
-    shown = (lambda text: None) if quiet else (lambda text: typer.echo(text, err=True))
-    training = Training(settings, shown, resume=resume)
-    training.run()
+    Training(settings, _on_message(quiet), resume=resume).run()
     say(f"best network: {settings.best}")
     say(f"drive with it: shiftsim run -p carl --checkpoint carl={settings.best}")
 
@@ -94,9 +92,12 @@ def traffic(
     from shiftsim.train.traffic.recipe import TrafficSettings, train_traffic
 
     settings = TrafficSettings(store, out, split, seed, rounds, scenarios, epochs, tests)
-    shown = (lambda text: None) if quiet else (lambda text: typer.echo(text, err=True))
-    say(f"weights: {train_traffic(settings, shown)}")
+    say(f"weights: {train_traffic(settings, _on_message(quiet))}")
     say(f"how real it is: shiftsim realism {store} --weights {out}/weights.npz")
+
+
+def _on_message(quiet: bool) -> Callable[[str], None]:
+    return (lambda text: None) if quiet else partial(typer.echo, err=True)
 
 
 def realism(

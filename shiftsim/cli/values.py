@@ -1,13 +1,7 @@
-"""Values of options: what the shell offers, and what is made of what was typed.
+"""What the shell offers for a value of an option; nothing heavy is imported for it."""
 
-Nothing heavy is imported for either.
-"""
-
-import os
 from collections.abc import Callable, Iterable
-from functools import partial
 from pathlib import Path
-from typing import Any, get_args
 
 import typer
 
@@ -71,50 +65,3 @@ BY_SETTING: dict[str, Complete] = {
     "traffic": among("nonreactive", "reactive", "constant-velocity"),
     "thresholds": among("nuplan", "deepplan"),
 }
-
-
-def with_plain_values(command: Any) -> Any:
-    """A command, or several, whose options make texts and numbers of what was typed themselves."""
-    all_options = command.get_params
-
-    def get_params(context: Any) -> list[Any]:
-        options: list[Any] = all_options(context)
-        for option in options:
-            if "process_value" not in vars(option):
-                option.process_value = partial(_plain_value, option, option.process_value)
-        return options
-
-    command.get_params = get_params
-    for inner in getattr(command, "commands", {}).values():
-        with_plain_values(inner)
-    return command
-
-
-def _plain_value(option: Any, convert: Callable[[Any, Any], Any], context: Any, value: Any) -> Any:
-    """What an option gets, without typer where that is plain.
-
-    Newer versions of typer have pydantic look at every value, even where none was given, and to
-    import pydantic is a tenth of a short command.
-    """
-    about = getattr(option, "type_descriptor", None)  # of older versions of typer none
-    if about is None or about.is_ranged:
-        return convert(context, value)
-    if value is None and not option.required:
-        nothing = () if option.multiple or option.nargs == -1 else None
-        return option.callback(context, option, nothing) if option.callback else nothing
-    make = _MAKE.get(get_args(about.annotation)[0] if about.is_list else about.annotation)
-    if make is not None and value is not None and option.callback is None:
-        try:
-            return [make(item) for item in value] if about.is_list else make(value)
-        except ValueError:
-            pass  # typer says what is wrong with it
-    return convert(context, value)
-
-
-def _readable(path: str | Path) -> Path:
-    if os.path.exists(path) and not os.access(path, os.R_OK):
-        raise ValueError(path)
-    return Path(path)
-
-
-_MAKE: dict[Any, Callable[[Any], Any]] = {str: str, int: int, float: float, Path: _readable}

@@ -198,16 +198,12 @@ def _change(
         except ValueError as error:
             where = f"a rollout of scenario {task.token!r} in {first.path} or {second.path}"
             raise DataError(f"{where} is damaged: {error}", hint="make the run again") from error
-        note = "" if departure else _why_only_scored(first, second)
+        if departure is None:  # why scores differ where the ego drove the same
+            traffic = [run.manifest["determining"]["traffic"] for run in (first, second)]
+            note = "the rollouts are the same: they were scored differently"
+            if traffic[0] != traffic[1]:
+                note = f"the ego drove the same, but in other traffic ({', '.join(traffic)})"
     return Change(task, planner, rows[0]["cls"], rows[1]["cls"], metrics, departure, note)
-
-
-def _why_only_scored(first: Run, second: Run) -> str:
-    """Why scores differ where the ego drove the same."""
-    ours, theirs = (run.manifest["determining"]["traffic"] for run in (first, second))
-    if ours != theirs:
-        return f"the ego drove the same, but in other traffic ({ours}, {theirs})"
-    return "the rollouts are the same: they were scored differently"
 
 
 def find_departure(first: pa.RecordBatch, second: pa.RecordBatch) -> Departure | None:

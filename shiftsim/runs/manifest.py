@@ -15,7 +15,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-from shiftsim import __version__
+from shiftsim._version import __version__
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.files import PACKAGE, sources
 from shiftsim.runs.config import RunConfig
@@ -27,7 +27,6 @@ _PACKAGES = ("numpy", "numba", "scipy", "shapely", "pyarrow", "torch")
 _ROOTS = ("runs/task.py", "planners/**/*.py", "sim/traffic/**/*.py")
 
 State: TypeAlias = Literal["new", "unfinished", "failed", "complete"]
-_EARLIER_JOURNAL = "unfinished.jsonl"
 _MAX_MESSAGE = 600  # characters
 _DIGEST = re.compile("[0-9a-f]{16,64}")
 _NAMES = {"tokens": "scenarios", "review": "reviews"}  # in messages
@@ -43,10 +42,13 @@ def make_manifest(
     config: RunConfig,
     split: str,
     store: str,
-    determining: dict[str, Any],
+    fingerprint: dict[str, Any],
     argv: Sequence[str],
 ) -> dict[str, Any]:
-    """What a run folder says about how its results were made; state and counts come later."""
+    """What a run folder says about how its results were made; state and counts come later.
+
+    The run fingerprint, `determining` in the file, is everything that scores depend on.
+    """
     return {
         "format": FORMAT_VERSION,
         "run": folder.name,
@@ -57,7 +59,7 @@ def make_manifest(
         "shard": config.shard,
         "store": store,
         "counts": {},
-        "determining": determining,
+        "determining": fingerprint,
         "started": now(),
         "versions": versions(),
         "machine": {
@@ -114,16 +116,10 @@ def state_of(folder: Path) -> State:
 
     Raises:
         DataError: The folder holds something else.
-        ConfigError: It holds an unfinished run of an earlier version.
     """
     if not folder.exists() or (folder.is_dir() and not _has_content(folder)):
         return "new"
     manifest = read_manifest(folder)
-    if has_entries(folder / _EARLIER_JOURNAL):
-        raise ConfigError(
-            f"{str(folder)!r} holds an unfinished run of an earlier version of shiftsim",
-            hint="it cannot be finished: remove the folder and run again",
-        )
     has_results = has_entries(folder / JOURNAL)
     if manifest["state"] == "running" and not has_results:
         return "new"
@@ -142,7 +138,7 @@ def _has_content(folder: Path) -> bool:
     return names != {JOURNAL} or has_entries(folder / JOURNAL) if names else False
 
 
-def check_target(folder: Path, determining: dict[str, Any], *, shard: str = "") -> State:
+def check_target(folder: Path, fingerprint: dict[str, Any], *, shard: str = "") -> State:
     """How far the run in a folder is, to which another one is to be written: the same, or none yet.
 
     Raises:
@@ -156,25 +152,25 @@ def check_target(folder: Path, determining: dict[str, Any], *, shard: str = "") 
         ) from error
     if state == "new":
         return state
-    different = difference(read_manifest(folder), determining, shard)
-    if different:
+    differs = difference(read_manifest(folder), fingerprint, shard)
+    if differs:
         raise ConfigError(
-            f"{str(folder)!r} holds another run: {different}"[:_MAX_MESSAGE],
+            f"{str(folder)!r} holds another run: {differs}"[:_MAX_MESSAGE],
             hint="choose another --out, or remove that folder",
         )
     return state
 
 
-def difference(manifest: dict[str, Any], determining: dict[str, Any], shard: str = "") -> str:
+def difference(manifest: dict[str, Any], fingerprint: dict[str, Any], shard: str = "") -> str:
     """What tells a run from the one of a manifest, in words; empty when nothing does."""
     before = {**manifest.get("determining", {}), "shard": manifest.get("shard", "")}
-    after = {**determining, "shard": shard}
+    after = {**fingerprint, "shard": shard}
     names = [n for n in sorted({*before, *after}) if before.get(n) != after.get(n)]
     if not names:
         return ""
     first = _in_words(names[0], before.get(names[0]), after.get(names[0]))
-    shown = ", ".join(_NAMES.get(name, name) for name in names)
-    return f"{shown} differ{first and f' ({first})'}"
+    listed = ", ".join(_NAMES.get(name, name) for name in names)
+    return f"{listed} differ{first and f' ({first})'}"
 
 
 def _in_words(name: str, old: Any, new: Any) -> str:
@@ -195,7 +191,7 @@ def _value(value: Any) -> str:
     return "none" if value in (None, "", {}) else str(value)
 
 
-def check_resumable(folder: Path, determining: dict[str, Any], *, shard: str = "") -> None:
+def check_resumable(folder: Path, fingerprint: dict[str, Any], *, shard: str = "") -> None:
     """Refuse to begin anew where an unfinished run with other settings seems to be meant.
 
     Raises:
@@ -209,8 +205,8 @@ def check_resumable(folder: Path, determining: dict[str, Any], *, shard: str = "
                 continue
         except (DataError, KeyError):
             continue
-        different = difference(manifest, determining, shard)
-        text = f"no unfinished run with these settings; {str(other)!r} is another one: {different}"
+        differs = difference(manifest, fingerprint, shard)
+        text = f"no unfinished run with these settings; {str(other)!r} is another one: {differs}"
         raise ConfigError(
             text[:_MAX_MESSAGE], hint="give its settings, or leave out --resume to begin anew"
         )

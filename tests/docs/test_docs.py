@@ -45,7 +45,7 @@ from shiftsim.metrics import MULTIPLIERS, PROFILES, SHORT_NAMES, WEIGHTS
 from shiftsim.planners.registry import PLANNERS
 from shiftsim.report.words import LONG
 from shiftsim.runs import config
-from shiftsim.runs.results import TABLES
+from shiftsim.runs.tables import TABLES
 
 DOCS = REPOSITORY / "docs"
 BLOCKS = [block for page in PAGES for block in read_blocks(page)]
@@ -313,7 +313,7 @@ def test_column_tables_are_those_of_the_files(page: Path, heading: str, table: p
 
 
 def test_verdicts_of_the_filter_are_described() -> None:
-    from shiftsim.runs.verdicts import SCHEMA
+    from shiftsim.runs.filter import SCHEMA
 
     rows = table_below(DOCS / "store_format.md", "### filter/verdicts.parquet")
     assert [row[:3] for row in rows] == _described(SCHEMA)

@@ -22,7 +22,7 @@ from stores import write_toy_store
 from shiftsim.data.store.plausible import require_plausible, require_sound
 from shiftsim.errors import DataError
 from shiftsim.planners.table import shipped_file
-from shiftsim.runs.results import _RANGES as RUN_COLUMNS
+from shiftsim.runs.tables import _RANGES as RUN_COLUMNS
 from shiftsim.world.map import LAYERS, VectorMap
 from shiftsim.world.ranges import (
     CHECKPOINT,
@@ -325,7 +325,8 @@ def _read_run(folder: Path) -> Any:
     from shiftsim.data.store.reading import ScenarioStore
     from shiftsim.report.scores import score_table
     from shiftsim.runs.manifest import state_of
-    from shiftsim.runs.results import open_run, stored_results
+    from shiftsim.runs.results import open_run
+    from shiftsim.runs.tables import stored_results
 
     run = open_run(folder)
     state_of(folder)

@@ -9,7 +9,7 @@ import shiftsim
 from shiftsim.benchmarks import published
 from shiftsim.edits.interplan.codes import import_names
 from shiftsim.errors import ConfigError
-from shiftsim.report.data_tables import benchmark_comparison, own_statistics
+from shiftsim.report.dataset import benchmark_comparison, own_statistics
 from shiftsim.report.groups import read_groups
 from shiftsim.runs.edited import EditedStore, edits_text, make_edits
 from shiftsim.runs.scenarios import open_run_store

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from shiftsim.errors import DataError
 from shiftsim.runs.folder import RunWriter
-from shiftsim.runs.results import TaskResult
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.rollouts import files as rollout_files
 from shiftsim.runs.rollouts.columns import (
@@ -26,6 +25,7 @@ from shiftsim.runs.rollouts.columns import (
     track_columns,
 )
 from shiftsim.runs.rollouts.files import PartWriter, Place, RolloutReader, without_key
+from shiftsim.runs.tables import TaskResult
 from shiftsim.sim.log import pack_plans, unpack_plans
 
 TRACK_WIDTHS = {"track_poses": 3, "track_velocities": 2, "track_sizes": 2}

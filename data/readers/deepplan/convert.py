@@ -38,7 +38,7 @@ from shiftsim.data.store.reading import read_report
 from shiftsim.data.store.tables import PARTIAL, digest, file_name
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import ConversionError
-from shiftsim.files import below
+from shiftsim.files import safe_join
 from shiftsim.kernels import FloatArray
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AgentKind
@@ -133,7 +133,7 @@ def convert_dsc3d(
     share = _check_placement(road, source, [read[n] for n in names if n not in skipped], config)
     with alone_in(store):
         writer = StoreWriter(store)
-        work = below(store, f"{PARTIAL}/{file_name(road.name)}")
+        work = safe_join(store, f"{PARTIAL}/{file_name(road.name)}")
         work.mkdir(parents=True, exist_ok=True)
         write_map(work / MAP_FILE, road)
         job = Job(source, work, config, digest(work / MAP_FILE), last)

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from shiftsim import __version__
+from shiftsim._version import __version__
 from shiftsim.data.readers.deepplan.recording import convert_recording
 from shiftsim.data.readers.deepplan.windows import ConversionConfig
 from shiftsim.data.readers.dsc3d.recording import Annotations, Site, read_recording

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from shiftsim import __version__
+from shiftsim._version import __version__
 from shiftsim.data.maps.build import PieceMap
 from shiftsim.data.maps.lights import LightStates, light_rows
 from shiftsim.data.readers.deepplan.convert import Progress, Spread, one_by_one

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 from shiftsim.data.store.tables import TableWriter
 from shiftsim.errors import DataError
-from shiftsim.files import draft
+from shiftsim.files import temp_path
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.rollouts.columns import IN_PLANES, as_today, check_columns
 
@@ -157,7 +157,7 @@ class PartWriter:
         rows = pa.Table.from_batches([batch for _, batch in self._pending]).combine_chunks()
         schema = pa.schema([*_KEY, *rows.schema])
         if self._writer is None:
-            self._partial = draft(self._path)
+            self._partial = temp_path(self._path)
             self._writer = TableWriter(self._partial, schema, **_WRITE_OPTIONS)
         group = pa.Table.from_arrays([*_keys(self._pending), *rows.columns], schema=schema)
         self._writer.write_table(group, row_group_size=len(group))

@@ -17,7 +17,9 @@ from shiftsim.world.map import VectorMap
 def make(od: OpenDrive, **options: object) -> tuple[VectorMap, MapReport]:
     """The map of a file; all self-checks must pass."""
     built, report = build_road_map(od, name="test", **options)
-    assert [name for name, passed in check_map(built, report.stacked)[0].items() if not passed] == []
+    assert [
+        name for name, passed in check_map(built, report.stacked)[0].items() if not passed
+    ] == []
     return built, report
 
 

@@ -62,11 +62,11 @@ def report(
     from shiftsim.benchmarks import published as published_figures
     from shiftsim.benchmarks.bench import open_runs
     from shiftsim.errors import one_of
-    from shiftsim.files import below
+    from shiftsim.files import safe_join
     from shiftsim.report.build import BRIEF, TABLES, Options, make_tables, write_report
     from shiftsim.report.groups import read_groups
     from shiftsim.report.scores import summary
-    from shiftsim.report.writers import FORMATS, render
+    from shiftsim.report.tables import FORMATS, render
 
     opened, own_lists, extra = open_runs(runs)
     if as_json:
@@ -76,7 +76,7 @@ def report(
         one_of("format", name, FORMATS)
     groups = read_groups(opened, (*known_sets(), *own_lists))
     if figures and out is None:
-        out = below(runs[0], "report")
+        out = safe_join(runs[0], "report")
     kind = (style or ["text"])[0]
     default = TABLES if out or site else ("scores",) if kind == "csv" else BRIEF
     options = Options(tuple(table or default), by, published, allow_partial)

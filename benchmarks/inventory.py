@@ -59,7 +59,7 @@ class Row(TypedDict):
     missing: list[Missing]
 
 
-class Stock(TypedDict):
+class Inventory(TypedDict):
     """All that was found."""
 
     store_folder: str
@@ -69,7 +69,7 @@ class Stock(TypedDict):
     rows: list[Row]
 
 
-def take_stock() -> Stock:
+def list_available_data() -> Inventory:
     """Look through the folders of stores and of checkpoints."""
     folder = store_path("demo").parent
     stores = [_store(path.parent) for path in sorted(folder.glob("*/store.json"))]

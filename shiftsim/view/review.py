@@ -1,16 +1,20 @@
-"""What the review page asks for: the list of scenarios, one of them, and a review to keep.
+"""The review of a store in the browser: the server, and what its page asks for.
 
-Nothing here knows of HTTP. Every change is on disk before its answer.
+The only file written is the review; every change is on disk before its answer.
 """
 
 import getpass
+import json
 from dataclasses import replace
+from http import HTTPStatus
 from pathlib import Path
+from threading import Lock
 from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
-import shiftsim
+from shiftsim._version import __version__
 from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.review import (
     ACCEPT,
@@ -21,14 +25,16 @@ from shiftsim.data.store.review import (
     route_problems,
     write_reviews,
 )
-from shiftsim.errors import ConfigError
-from shiftsim.runs.verdicts import read_verdicts
+from shiftsim.errors import ConfigError, ShiftsimError
+from shiftsim.runs.filter import read_filter_results
 from shiftsim.sim.log import as_recorded
+from shiftsim.view.local import TOKEN_HEADER, LocalHandler, LocalServer
 from shiftsim.view.pack import Quantised, pack
+from shiftsim.view.page import framed
 from shiftsim.view.scene import (
     Fields,
     Replay,
-    Shown,
+    ShownRollout,
     describe_scene,
     indices_near,
     rollout_fields,
@@ -36,6 +42,7 @@ from shiftsim.view.scene import (
 )
 from shiftsim.world.scenario import Scenario
 
+MAX_BODY = 1 << 20  # bytes
 MAX_COMMENT = 4000  # characters
 _STEP = 0.05  # m
 
@@ -51,16 +58,16 @@ class ReviewService:
             reviewer: Who reviews; the user's login name when empty.
 
         Raises:
-            DataError: There is no store, or its verdicts or reviews are damaged.
+            DataError: There is no store, or its filter results or reviews are damaged.
         """
         self.store = open_store(store)
         self.reviewer = reviewer or _login()
-        found = read_verdicts(self.store.path, self.store.hash)
-        self._verdicts = {row["token"]: row for row in (found.rows if found else ())}
+        filtered = read_filter_results(self.store.path, self.store.hash)
+        self._filter_results = {row["token"]: row for row in (filtered.rows if filtered else ())}
         self._reviews = read_reviews(self.store.path)
 
     def listing(self) -> dict[str, Any]:
-        """All scenarios with their verdict and review."""
+        """All scenarios with their filter result and review."""
         table = self.store.summary().select(["token", "type", "city"]).to_pylist()
         return {
             "store": self.store.path.name,
@@ -69,11 +76,11 @@ class ReviewService:
         }
 
     def _state(self, token: str) -> dict[str, Any]:
-        verdict = self._verdicts.get(token)
+        result = self._filter_results.get(token)
         review = self._reviews.get(token, Review(token))
         return {
-            "verdict": verdict["verdict"] if verdict else "not filtered",
-            "reason": verdict["reason"] if verdict else "",
+            "verdict": result["verdict"] if result else "not filtered",
+            "reason": result["reason"] if result else "",
             "decision": review.decision,
             "comment": review.comment,
             "route": None if review.route is None else list(review.route),
@@ -86,9 +93,9 @@ class ReviewService:
             DataError: The store has no such scenario.
         """
         recorded = self.store.read_recorded(token)
-        replay = Replay(recorded, [Shown("recorded", "none", 0, as_recorded(recorded))])
+        replay = Replay(recorded, [ShownRollout("recorded", "none", 0, as_recorded(recorded))])
         blocks = _blocks_near(replay)
-        verdict = self._verdicts.get(token) or {}
+        result = self._filter_results.get(token) or {}
         numbers = ("max_outside_m", "path_m", "progress_m", "first_violation_s", "partner_token")
         return {
             "meta": describe_scene(replay),
@@ -97,7 +104,7 @@ class ReviewService:
             "blocks": pack(_block_fields(replay, blocks)),
             "blockIds": [recorded.map.blocks.ids[block] for block in blocks],
             "recordedRoute": list(recorded.route),
-            "numbers": {name: verdict[name] for name in numbers if verdict.get(name) is not None},
+            "numbers": {name: result[name] for name in numbers if result.get(name) is not None},
             **self._state(token),
             **self.check_route(token, self._route(recorded)),
         }
@@ -129,7 +136,7 @@ class ReviewService:
         recorded = self.store.read_recorded(token)
         review = self._reviews.get(token, Review(token))
         review = replace(review, **_checked(values, recorded))
-        review = replace(review, reviewer=self.reviewer, version=shiftsim.__version__)
+        review = replace(review, reviewer=self.reviewer, version=__version__)
         reviews = self._reviews.with_review(review)
         write_reviews(self.store.path, reviews)
         self._reviews = reviews
@@ -197,3 +204,94 @@ def _block_fields(replay: Replay, blocks: list[int]) -> Fields:
         "blocks.count": Quantised(np.array([len(ring) for ring in flat], float), 1.0),
         "blocks.xy": Quantised(xy - replay.origin, _STEP),
     }
+
+
+class ReviewServer(LocalServer):
+    """Serves the reviews of one store.
+
+    Attributes:
+        service: Does the work; one request at a time.
+    """
+
+    def __init__(self, service: ReviewService, port: int = 0) -> None:
+        """Bind to a port of the loopback interface; 0 chooses a free one."""
+        self.service = service
+        self.turn = Lock()
+        super().__init__(_Handler, port)
+
+
+class _Handler(LocalHandler):
+    server: ReviewServer
+
+    def do_GET(self) -> None:
+        """The page, the list of scenarios, or one of them."""
+        url = urlsplit(self.path)
+        query = parse_qs(url.query)
+        given = self.headers.get(TOKEN_HEADER) or query.get("token", [""])[0]
+        if not self.may(given if url.path == "/" else self.headers.get(TOKEN_HEADER, "")):
+            return
+        if url.path == "/":
+            self.answer(review_page(self.server.service.store.path.name), "text/html")
+        elif url.path == "/api/scenarios":
+            self._work(lambda service: service.listing())
+        elif url.path == "/api/scenario":
+            token = query.get("id", [""])[0]
+            self._work(lambda service: service.scenario(token))
+        else:
+            self.refuse(HTTPStatus.NOT_FOUND, "no such page")
+
+    def do_POST(self) -> None:
+        """Check a route, or keep a review."""
+        if not self.may(self.headers.get(TOKEN_HEADER, "")):
+            return
+        body = self._body()
+        if body is None:
+            return
+        token, values = str(body.get("token", "")), body.get("values")
+        path = urlsplit(self.path).path
+        if path == "/api/review" and isinstance(values, dict):
+            self._work(lambda service: service.keep(token, values))
+        elif path == "/api/route" and _is_route(values):
+            self._work(lambda service: service.check_route(token, values))
+        else:
+            self.refuse(HTTPStatus.NOT_FOUND, "no such request")
+
+    def _body(self) -> dict[str, Any] | None:
+        length = self.headers.get("Content-Length", "")
+        if not length.isdecimal() or int(length) > MAX_BODY:
+            self.refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "the request is too long")
+            return None
+        try:
+            body = json.loads(self.rfile.read(int(length)))
+        except ValueError:
+            body = None
+        if not isinstance(body, dict):
+            self.refuse(HTTPStatus.BAD_REQUEST, "the request is not a JSON object")
+            return None
+        return body
+
+    def _work(self, request: Any) -> None:
+        try:
+            with self.server.turn:
+                answer = request(self.server.service)
+        except ShiftsimError as error:
+            self.refuse(HTTPStatus.BAD_REQUEST, f"{error.message} {error.hint}".strip())
+        except OSError as error:
+            self.refuse(HTTPStatus.INTERNAL_SERVER_ERROR, f"not kept: {error.strerror or error}")
+        else:
+            self.answer(json.dumps(answer), "application/json")
+
+
+def _is_route(values: Any) -> bool:
+    return isinstance(values, list) and all(isinstance(name, str) for name in values)
+
+
+def review_page(store: str) -> str:
+    """The page; it fetches everything else."""
+    return framed(
+        "review.html",
+        title=f"{store} · review",
+        meta='<meta name="referrer" content="no-referrer">',
+        styles=["replay.css", "review.css"],
+        scripts=["codec.js", "world.js", "review.js"],
+    )

@@ -6,7 +6,7 @@ import pytest
 from commands import call
 from stores import write_toy_store
 
-from shiftsim.benchmarks import TRACKS, known_sets, stock
+from shiftsim.benchmarks import TRACKS, inventory, known_sets
 from shiftsim.report.groups import KnownSet, token_digest
 
 
@@ -18,12 +18,12 @@ def place(tmp_path, monkeypatch):
 
 
 def rows(**wanted):
-    found = stock.take_stock()["rows"]
+    found = inventory.list_available_data()["rows"]
     return [row for row in found if all(row[name] == value for name, value in wanted.items())]
 
 
 def test_where_nothing_is_there_every_row_names_what_to_get(place):
-    found = stock.take_stock()
+    found = inventory.list_available_data()
     assert found["stores"] == []
     assert len(found["rows"]) == 16
     [row] = rows(track="state-drift", planner="plantf")
@@ -41,12 +41,12 @@ def test_a_store_of_ones_own_and_a_checkpoint_are_found(place):
     store = write_toy_store(place / "stores" / "toy")
     (store / "splits").mkdir()
     (store / "splits" / "half.toml").write_text('tokens = ["toy-1"]')
-    token = stock.open_store(store).tokens[0]
+    token = inventory.open_store(store).tokens[0]
     (store / "splits" / "half.toml").write_text(f'tokens = ["{token}"]')
     (store / "splits" / "other.toml").write_text('tokens = ["not-here"]')
     (place / "checkpoints").mkdir()
     (place / "checkpoints" / "planTF.ckpt").touch()
-    [found] = stock.take_stock()["stores"]
+    [found] = inventory.list_available_data()["stores"]
     assert [(one["name"], one["scenarios"]) for one in found["sets"]] == [
         ("toy", 4),
         ("toy:half", 1),
@@ -59,10 +59,10 @@ def test_a_store_of_ones_own_and_a_checkpoint_are_found(place):
 
 
 def test_the_published_list_is_known_by_its_tokens(place, monkeypatch):
-    tokens = stock.open_store(write_toy_store(place / "stores" / "mine")).tokens
+    tokens = inventory.open_store(write_toy_store(place / "stores" / "mine")).tokens
     mine = KnownSet("val14", "Val14", "nuplan", len(tokens), token_digest(tokens))
     others = tuple(one for one in known_sets() if one.name != "val14")
-    monkeypatch.setattr(stock, "known_sets", lambda: (mine, *others))
+    monkeypatch.setattr(inventory, "known_sets", lambda: (mine, *others))
     [row] = rows(track="semantic-shift", planner="pdm-closed")
     assert (row["reference"], row["own"]) == ("mine", [])
     assert [lack["what"] for lack in row["missing"]] == ["own scenarios"]
@@ -72,7 +72,7 @@ def test_a_damaged_store_is_named_and_the_others_are_listed(place):
     write_toy_store(place / "stores" / "toy")
     broken = write_toy_store(place / "stores" / "broken")
     (broken / "store.json").write_text("{")
-    first, second = stock.take_stock()["stores"]
+    first, second = inventory.list_available_data()["stores"]
     assert "store.json" in first["problem"]
     assert (second["name"], second["problem"]) == ("toy", "")
 

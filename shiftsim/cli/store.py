@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from shiftsim.data.store.check import Problem, RecordingRow
     from shiftsim.data.store.reading import ScenarioStore
-    from shiftsim.runs.verdicts import Verdicts
+    from shiftsim.runs.filter import FilterResults
 
 _DATA, _PARTIAL = 2, 3
 _MAX_SHOWN = 20  # problems of one kind
@@ -134,7 +134,7 @@ def filter_scenarios(
         raise typer.Exit(_PARTIAL)
 
 
-def _show_verdicts(found: "Verdicts", *, thresholds: str) -> None:
+def _show_verdicts(found: "FilterResults", *, thresholds: str) -> None:
     for row in found.rejected:
         details = [f"{row[n]:.1f} m {what}" for n, what in _DETAILS.items() if row[n] is not None]
         if row["partner_token"] is not None:
@@ -155,8 +155,8 @@ _DETAILS = {"path_m": "path", "progress_m": "along the route", "max_outside_m": 
 def _chosen(store: "ScenarioStore", settings: cli.Settings) -> tuple[str, ...]:
     """The scenarios of a split, or all that review and filter accepted."""
     from shiftsim.errors import DataError
+    from shiftsim.runs.filter import read_filter_results
     from shiftsim.runs.scenarios import find_split
-    from shiftsim.runs.verdicts import read_verdicts
 
     if split := settings.get("split"):
         tokens = find_split(split, store.path, store.tokens).tokens
@@ -170,7 +170,7 @@ def _chosen(store: "ScenarioStore", settings: cli.Settings) -> tuple[str, ...]:
         return tokens
     if settings.get("all_scenarios"):
         return store.tokens
-    verdicts = read_verdicts(store.path, store.hash)
+    verdicts = read_filter_results(store.path, store.hash)
     usable = store.tokens if verdicts is None else verdicts.accepted
     return store.reviews.usable(store.tokens, usable)
 
@@ -196,8 +196,7 @@ def make_split(
 
     Scenarios are taken in the order of their tokens, which says nothing about their content.
     """
-    from shiftsim.runs.filter import choose_scenarios, write_split
-    from shiftsim.runs.scenarios import open_named_store
+    from shiftsim.runs.scenarios import choose_scenarios, open_named_store, write_split
 
     opened = open_named_store(store)
     found = choose_scenarios(

@@ -1,14 +1,25 @@
-"""Settings of a training, and what its folder holds."""
+"""The folder of a training: settings, state, networks, tables, and a picture of the curves."""
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
-from shiftsim.errors import ConfigError
-from shiftsim.files import write_text
+import pyarrow as pa
+import pyarrow.parquet as pq
+import torch
+from torch import Tensor
+
+from shiftsim.errors import CheckpointError, ConfigError, MissingExtraError
+from shiftsim.files import atomic_write, write_text
+from shiftsim.report.palette import dashes, new_figure, planner_styles, save_picture
 
 SETTINGS = "settings.json"
 TAUS = (0.2, 0.3, 0.5)  # s, tried where none is given
+
+OnMessage = Callable[[str], None]  # gets a line that says how far a training is
+Weights = dict[str, Tensor]  # by their names in CaRL's checkpoint
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,3 +110,65 @@ def prepare_folder(settings: Settings, store: str, *, resume: bool) -> None:
         raise ConfigError(f"{str(settings.out)!r} is not empty", hint="choose another --out")
     settings.out.mkdir(parents=True, exist_ok=True)
     write_text(place, json.dumps(now, indent=2) + "\n")
+
+
+def read_state(path: Path) -> dict[str, Any]:
+    """What a training needs to go on.
+
+    Raises:
+        CheckpointError: The file is damaged.
+    """
+    try:
+        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise CheckpointError(
+            f"{str(path)!r} cannot be read: {error}", hint="delete it to begin again"
+        ) from error
+    return state
+
+
+def write_state(path: Path, state: dict[str, Any]) -> None:
+    """Keep what a training needs to go on."""
+    with atomic_write(path) as partial:
+        torch.save(state, partial)
+
+
+def write_network(path: Path, weights: Weights) -> None:
+    """Write a network as `--checkpoint carl=PATH` reads it."""
+    from safetensors.torch import save_file
+
+    tensors = {name: value.detach().cpu().contiguous() for name, value in weights.items()}
+    with atomic_write(path) as partial:
+        save_file(tensors, partial, {"planner": "carl"})
+
+
+def write_table(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Write rows as Parquet."""
+    with atomic_write(path) as partial:
+        pq.write_table(pa.Table.from_pylist(rows), partial)
+
+
+def draw_curves(path: Path, curve: list[dict[str, Any]], scores: list[dict[str, Any]]) -> None:
+    """Draw errors while training, and scores after each round; nothing without matplotlib."""
+    try:
+        figure = new_figure(figsize=(8.0, 3.2))
+    except MissingExtraError:
+        return
+    left, right = figure.subplots(1, 2)
+    samples = [row["samples"] / 1e6 for row in curve]
+    for name, factor, colour in (("acceleration", 1.0, "0.15"), ("steering", 10.0, "0.6")):
+        values = [factor * row[f"{name}_error"] for row in curve]
+        label = f"{name} error" + (f" × {factor:g}" if factor != 1.0 else "")
+        left.plot(samples, values, label=label, color=colour, linewidth=0.9)
+    left.set(xlabel="samples [million]", ylabel="mean absolute error", yscale="log")
+    left.legend(frameon=False, ncols=2, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    at = [row["samples"] / 1e6 for row in scores]
+    style = planner_styles(["carl"])["carl"]
+    for noise in ("none", "ou-high"):
+        look = {"label": f"noise {noise}", "linestyle": dashes(noise), **style.marks(noise)}
+        right.plot(at, [100.0 * row[noise] for row in scores], **look)
+    right.set(xlabel="samples [million]", ylim=(0, 100))
+    right.set_ylabel("closed-loop score × 100")
+    right.set_title("on towns left out", fontsize=9)
+    right.legend(frameon=False, loc="lower right")
+    save_picture(figure, path)

@@ -52,11 +52,11 @@ def view(
     debug: Debug = False,
 ) -> None:
     """Replay rollouts in the browser: pages that need no server and no network."""
-    from shiftsim.files import below
+    from shiftsim.files import safe_join
     from shiftsim.view.build import page_name, write_site
 
     found = _galleries([run, *(others or ())], planner, noise, seed, store)
-    folder = out or below(run, "view")
+    folder = out or safe_join(run, "view")
     if token is not None:
         gallery, token = _holding(found, token)
         folder.mkdir(parents=True, exist_ok=True)
@@ -129,8 +129,7 @@ def inspect(
     """Review scenarios in the browser: accept, reject, comment, correct the route."""
     from shiftsim.data.store.tables import REVIEW
     from shiftsim.runs.scenarios import open_named_store
-    from shiftsim.view.review.server import ReviewServer
-    from shiftsim.view.review.service import ReviewService
+    from shiftsim.view.review import ReviewServer, ReviewService
 
     path = open_named_store(store).path
     with ReviewServer(ReviewService(path, reviewer), port) as server:
