@@ -31,7 +31,7 @@ CENTER_TO_IMU = 1.3  # m, of the ego's box
 
 
 @cache
-def demo_map(site="junction"):
+def demo_map(site="avenue"):
     """The map of a town of the demo, as OpenDRIVE gives it."""
     xml = _generated(site)[0].town.network.xml()
     return build_road_map(parse_opendrive(xml.encode(), site), name=site)[0]
@@ -43,7 +43,7 @@ def _generated(name):
 
 
 @cache
-def demo_content(site="junction", seconds=11.0):
+def demo_content(site="avenue", seconds=11.0):
     """Lanes, areas and tracks of a town of the demo, in plain JSON values.
 
     Tracks are (T, 5) t [s], x, y, heading, speed every 0.1 s; `ego` is the car that gets farthest.
@@ -121,7 +121,7 @@ def _tracks(traffic, seconds):
 # --- Argoverse 2
 
 
-def write_av2(folder, name=AV2_NAME, site="junction"):
+def write_av2(folder, name=AV2_NAME, site="avenue"):
     """One scene of Argoverse 2 motion forecasting; returns the Parquet file."""
     content = demo_content(site)
     folder.mkdir(parents=True, exist_ok=True)
@@ -188,7 +188,7 @@ def _segment(lane):
 # --- CommonRoad
 
 
-def write_commonroad(folder, version="2020a", site="junction"):
+def write_commonroad(folder, version="2020a", site="avenue"):
     """One CommonRoad scenario; returns the file."""
     content = demo_content(site)
     folder.mkdir(parents=True, exist_ok=True)
@@ -257,7 +257,7 @@ def _obstacle(track, is_new):
 # --- py123d
 
 
-def write_py123d(folder, split="demo_val", site="junction", labels="NuPlanBoxDetectionLabel"):
+def write_py123d(folder, split="demo_val", site="avenue", labels="NuPlanBoxDetectionLabel"):
     """One log as py123d writes it, with a map of its own; returns the folder of the log."""
     content = demo_content(site)
     log = folder / "logs" / split / "log-1"
