@@ -8,9 +8,7 @@ from dataclasses import replace
 import numpy as np
 import shapely
 
-from shiftsim.data.synthetic.agents import SIZES, Driver, Walker, has_room
-from shiftsim.data.synthetic.layouts import Place
-from shiftsim.data.synthetic.paths import STEP, Path, arc_at, shifted
+from shiftsim.data.synthetic.agents import SIZES, STEP, Driver, Path, Pedestrian, arc_at, shifted
 from shiftsim.data.synthetic.routes import RandomRoutes
 from shiftsim.data.synthetic.town import Town
 from shiftsim.data.synthetic.traffic import Box, Traffic
@@ -39,20 +37,20 @@ _PARKED = -1  # number of what nobody drives
 _ON_FOOT = 1.0  # m, who is shorter walks
 
 
-def random_traffic(place: Place, rng: np.random.Generator, duration: float) -> Traffic:
+def random_traffic(town: Town, rng: np.random.Generator, duration: float) -> Traffic:
     """Traffic that was recorded for a time [s], without anybody touching anybody."""
-    town = place.town
     routes = RandomRoutes(town, rng)
-    drivers = [*_present(place, routes, rng), *_arriving(routes, rng, duration)]
-    walkers = _walkers(town, rng, duration)
+    drivers = [*_present(routes, rng), *_arriving(routes, rng, duration)]
+    pedestrians = _pedestrians(town, rng, duration)
     for _ in range(_ROUNDS):
-        fresh = [replace(driver, held=set(), waiting=set()) for driver in drivers]
-        on_foot = [replace(walker) for walker in walkers]
-        traffic = Traffic(town, fresh, on_foot, lights=place.lights)
+        fresh = [replace(driver, admitted=set(), waiting=set()) for driver in drivers]
+        traffic = Traffic(town, fresh, [replace(pedestrian) for pedestrian in pedestrians])
         left_out = touching(traffic.record(duration), town.parked(), drivers)
         if not left_out:
             break
-        walkers = [x for number, x in enumerate(walkers, len(drivers)) if number not in left_out]
+        pedestrians = [
+            x for number, x in enumerate(pedestrians, len(drivers)) if number not in left_out
+        ]
         drivers = [x for number, x in enumerate(drivers) if number not in left_out]
     return traffic
 
@@ -89,11 +87,11 @@ def _halt(path: Path, driver: Driver, rng: np.random.Generator) -> tuple[float, 
     return _NEVER
 
 
-def _present(place: Place, routes: RandomRoutes, rng: np.random.Generator) -> list[Driver]:
+def _present(routes: RandomRoutes, rng: np.random.Generator) -> list[Driver]:
     """Those who are there at time 0: queues before junctions, parked ones, and others anywhere."""
     placed: list[Driver] = []
     for entry in routes.entries:
-        if rng.random() < (0.85 if _is_red(place, entry) else 0.12):
+        if rng.random() < (0.85 if _is_red(routes.town, entry) else 0.12):
             placed += _queue(routes, entry, rng, placed)
     for entry in routes.entries:
         placed += _moving_off(routes, entry, rng)
@@ -113,7 +111,7 @@ def _present(place: Place, routes: RandomRoutes, rng: np.random.Generator) -> li
         driver.v = 0.0 if rng.random() < 0.12 else speed * float(rng.uniform(0.7, 1.0))
         if driver.halt[0] < driver.front + 20.0:
             driver.halt = _NEVER
-        if _may_begin(driver) and _fits(driver, placed) and has_room(driver, placed):
+        if _may_begin(driver) and _fits(driver, placed) and driver.has_room(placed):
             placed.append(driver)
     return placed
 
@@ -142,14 +140,14 @@ def _queue(
     return out
 
 
-def _is_red(place: Place, entry: str) -> bool:
+def _is_red(town: Town, entry: str) -> bool:
     """Whether a street has a light that is red at time 0."""
-    connectors = place.town.connectors.items()
+    connectors = town.connectors.items()
     numbers = {number for (_, name, _, _), (number, _) in connectors if name == entry}
     return any(
-        numbers & phase and lights.status(place_in_turn, 0.0) == LightStatus.RED
-        for lights in place.lights
-        for place_in_turn, phase in enumerate(lights.phases)
+        numbers & group and lights.status(phase, 0.0) == LightStatus.RED
+        for lights in town.lights
+        for phase, group in enumerate(lights.phases)
     )
 
 
@@ -198,9 +196,10 @@ def _may_begin(driver: Driver) -> bool:
 def _fits(driver: Driver, placed: list[Driver], gap: float = 6.0) -> bool:
     """Whether a driver stands a gap away from all others, more at speed [m]."""
     for other in placed:
-        apart = float(np.hypot(*np.subtract(driver.place, other.place)[:2]))
+        apart = float(np.hypot(*np.subtract(driver.pose, other.pose)[:2]))
         apart -= 0.5 * (driver.length + other.length)
-        aside = min(abs(driver.aside(*other.place[:2])), abs(other.aside(*driver.place[:2])))
+        one, two = driver.offset(*other.pose[:2]), other.offset(*driver.pose[:2])
+        aside = min(abs(one[1]), abs(two[1]))
         needed = gap + 1.2 * max(driver.v, other.v)
         if apart < min(needed, 40.0) and (aside < 2.3 or (apart < 0.5 and aside < 2.6)):
             return False
@@ -228,19 +227,19 @@ def _arriving(routes: RandomRoutes, rng: np.random.Generator, duration: float) -
     return sorted(out, key=lambda driver: driver.start)
 
 
-def _walkers(town: Town, rng: np.random.Generator, duration: float) -> list[Walker]:
+def _pedestrians(town: Town, rng: np.random.Generator, duration: float) -> list[Pedestrian]:
     """Pedestrians over crossings and along the streets."""
     out = []
     level = float(rng.choice((0.5, 1.0, 1.5)))
-    for walk in town.walks.values():
+    for walk in town.walks:
         last = walk.kerb - 4.0 if walk.crossing else 0.7 * walk.length
         if last < 3.0:
             continue
         for _ in range(int(rng.poisson(level if walk.crossing else 0.5 * level))):
             start = float(rng.uniform(0.0, duration - 8.0)) if rng.random() < 0.7 else 0.0
             s = float(rng.uniform(max(2.0, last - _WALK_UP), last))
-            out.append(Walker(walk, start=round(start, 2), s=round(s, 2)))
-    return sorted(out, key=lambda walker: walker.start)
+            out.append(Pedestrian(walk, start=round(start, 2), s=round(s, 2)))
+    return sorted(out, key=lambda pedestrian: pedestrian.start)
 
 
 def touching(boxes: list[Box], parked: FloatArray, drivers: list[Driver]) -> set[int]:

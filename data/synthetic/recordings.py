@@ -24,9 +24,9 @@ from shiftsim.data.store.tables import recording_folder
 from shiftsim.data.store.tracks import open_recording
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.data.synthetic.agents import SIZES
-from shiftsim.data.synthetic.layouts import Place, random_place
-from shiftsim.data.synthetic.lights import Lights
+from shiftsim.data.synthetic.layouts import random_town
 from shiftsim.data.synthetic.population import random_traffic
+from shiftsim.data.synthetic.town import Lights, Town
 from shiftsim.data.synthetic.traffic import DT, Box, Traffic
 from shiftsim.errors import ConversionError
 from shiftsim.geometry.boxes import wrap_angles
@@ -80,10 +80,10 @@ def make_town(folder: Path, spec: TownSpec) -> None:
     for attempt in range(_TRIES):
         with tempfile.TemporaryDirectory(prefix="shiftsim-town-") as scratch:
             source, store = Path(scratch) / spec.name, Path(scratch) / "store"
-            place, traffics = generate_town(spec, attempt)
-            write_recordings(source, spec, place, traffics)
+            town, traffics = generate_town(spec, attempt)
+            write_recordings(source, spec, town, traffics)
             try:
-                count = _convert(source, store, spec, place)
+                count = _convert(source, store, spec, town)
             except ConversionError:  # such as traffic that is not on the road
                 continue
             if count >= spec.min_scenarios:
@@ -94,20 +94,20 @@ def make_town(folder: Path, spec: TownSpec) -> None:
     )
 
 
-def generate_town(spec: TownSpec, attempt: int = 0) -> tuple[Place, list[Traffic]]:
+def generate_town(spec: TownSpec, attempt: int = 0) -> tuple[Town, list[Traffic]]:
     """A town, and the traffic of each of its recordings."""
     rng = spec.generator(attempt)
-    place = random_place(spec.kind, spec.name, rng)
-    return place, [random_traffic(place, rng, DURATION) for _ in spec.starts]
+    town = random_town(spec.kind, spec.name, rng)
+    return town, [random_traffic(town, rng, DURATION) for _ in spec.starts]
 
 
-def write_recordings(folder: Path, spec: TownSpec, place: Place, traffics: list[Traffic]) -> None:
+def write_recordings(folder: Path, spec: TownSpec, town: Town, traffics: list[Traffic]) -> None:
     """Write a town and its traffic as one DSC3D folder, always the same bytes."""
     (folder / "map").mkdir(parents=True, exist_ok=True)
-    (folder / "map/map.xodr").write_text(place.town.network.xml(), encoding="utf-8")
+    (folder / "map/map.xodr").write_text(town.network.xml(), encoding="utf-8")
     categories: set[str] = set()
     for start, traffic in zip(spec.starts, traffics, strict=True):
-        table = _annotations(traffic.record(DURATION), place.town.parked())
+        table = _annotations(traffic.record(DURATION), town.parked())
         categories |= set(table["category"].combine_chunks().dictionary.to_pylist())
         _write_recording(folder / "annotations" / _name(start), start, table)
     location = {"id": 1, "latitude": _LATITUDE, "longitude": _LONGITUDE}
@@ -129,13 +129,13 @@ def _name(start: datetime) -> str:
     return start.strftime("%Y-%m-%dT%H-%M-%S")
 
 
-def _convert(source: Path, store: Path, spec: TownSpec, place: Place) -> int:
+def _convert(source: Path, store: Path, spec: TownSpec, town: Town) -> int:
     """Convert a town; the number of its scenarios."""
     config = ConversionConfig(overlap_s=spec.overlap_s)
     report = convert_dsc3d(source, store, site=spec.name, options=config)
-    if place.lights:
+    if town.lights:
         for start in spec.starts:
-            _add_lights(store, f"{spec.name}_{_name(start)}", place, spec.offset)
+            _add_lights(store, f"{spec.name}_{_name(start)}", town, spec.offset)
     return len(usable(ScenarioStore(store))) if report.accepted else 0
 
 
@@ -203,15 +203,15 @@ def _write(table: pa.Table, path: Path) -> None:
     pq.write_table(table.cast(schema), path, compression="zstd")
 
 
-def _add_lights(store: Path, recording: str, place: Place, offset: FloatArray) -> None:
+def _add_lights(store: Path, recording: str, town: Town, offset: FloatArray) -> None:
     """Write what the traffic lights showed into a recording."""
     opened = ScenarioStore(store)
-    road = opened.map(place.town.name)
+    road = opened.map(town.name)
     stored = open_recording(recording_folder(store, recording))
     found = stored.read(0, stored.num_rows)
     seconds = (np.arange(stored.num_rows) * ROW_S).tolist()
     names, columns = [], []
-    for edge, lights, phase in _lit_connectors(road, place, offset):
+    for edge, lights, phase in _lit_connectors(road, town, offset):
         names.append(road.edges.ids[edge])
         columns.append([int(lights.status(phase, time)) for time in seconds])
     status = np.array(columns, np.int8).T
@@ -220,12 +220,12 @@ def _add_lights(store: Path, recording: str, place: Place, offset: FloatArray) -
 
 
 def _lit_connectors(
-    road: VectorMap, place: Place, offset: FloatArray
+    road: VectorMap, town: Town, offset: FloatArray
 ) -> Iterator[tuple[int, Lights, int]]:
     """Connectors of the map that have a light, whose lights, and their phase."""
     ends = {
         number: np.concatenate([line[0], line[-1]])
-        for number, spec in place.town.network.roads.items()
+        for number, spec in town.network.roads.items()
         if spec.junction >= 0
         for line in [spec.center_of(-1, np.array([0.0, spec.length]))[:, :2] + offset]
     }
@@ -235,7 +235,7 @@ def _lit_connectors(
         gaps = np.hypot(*(places - np.concatenate([line[0], line[-1]])).reshape(-1, 2, 2).T).sum(0)
         number = numbers[int(gaps.argmin())]
         assert gaps.min() < _SAME_PLACE, f"{road.name}: connector {road.edges.ids[edge]}"
-        for lights in place.lights:
+        for lights in town.lights:
             for phase, group in enumerate(lights.phases):
                 if number in group:
                     yield edge, lights, phase

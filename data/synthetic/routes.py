@@ -5,13 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.data.synthetic.paths import (
+from shiftsim.data.synthetic.agents import (
     STEP,
     Path,
     Zone,
     arc_at,
     brake_in_time,
-    for_bicycles,
     path_along,
     shifted,
 )
@@ -24,6 +23,8 @@ _CHANGES = 0.3  # chance of a lane change that no turn asks for
 _PARKS = 0.35  # chance that who drives through a car park stays there
 _TRIES = 6
 _LANE_CHANGE = 45.0  # m
+_WIDE = 0.3  # m, how far drivers swing out to turn right
+_CYCLING, _CYCLING_ASIDE = 4.5, -0.9  # m/s; m, near the right border of the lane
 _NARROW_SPEED, _NARROW_RAMP = 5.5, 12.0  # m/s, m
 
 
@@ -144,13 +145,16 @@ def make_path(town: Town, route: Route) -> Path:
         points = inner.center_of(-1, np.arange(0.0, inner.length, STEP))[:, :2]
         parts.append(points)
         limits.append(min(street.limit, onward.limit))
-        zone = Zone(connector, 0.0, 0.0, 0.0, rank, origin)
-        swing = street.wide if turn < -0.5 else 0.0
+        zone = Zone(connector, rank, origin)
+        swing = _WIDE if turn < -0.5 and not street.is_one_way else 0.0
         zones.append((zone, points[0], points[-1], street.stop, swing))
         leg, lane = target, to_lane
     path = path_along(parts, limits)
     path = _with_places(path, zones, crossings, is_parking=route.bay is not None)
-    return for_bicycles(path) if route.is_bicycle else path
+    if route.is_bicycle:
+        speed = np.minimum(path.speed, _CYCLING)
+        path = replace(shifted(path, _CYCLING_ASIDE), speed=speed)
+    return path
 
 
 def _with_places(
@@ -188,7 +192,7 @@ def _narrow_zone(leg: Leg) -> Zone:
     name = f"{leg.street.name}{'>' if leg.is_forward else '<'}"
     ahead, back = leg.street.swings
     goes_first = leg.is_forward if ahead == back else (ahead < back) == leg.is_forward
-    return Zone(number, 0.0, 0.0, 0.0, 1 - goes_first, name)
+    return Zone(number, 1 - goes_first, name)
 
 
 def _ends(

@@ -1,11 +1,12 @@
 """Towns from streets: junctions between them, ways of pedestrians, and parking spaces."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import permutations, product
 
 import numpy as np
 
-from shiftsim.data.synthetic import paths
+from shiftsim.data.synthetic.agents import STEP, Walk, arc_at, resample
 from shiftsim.data.synthetic.roads import (
     CrosswalkSpec,
     LaneSpec,
@@ -15,6 +16,7 @@ from shiftsim.data.synthetic.roads import (
     connect,
 )
 from shiftsim.kernels import FloatArray
+from shiftsim.world.state import LightStatus
 
 _CLOSE = 2.9  # m between the centres of connecting roads that conflict
 _NARROW_ASIDE = 0.3  # m
@@ -23,6 +25,7 @@ _PARKING_STEP, _BAY_STEP = 6.6, 3.1  # m along the street between parked cars, d
 _UNMARKED = 4.0  # m from a place to cross without a crosswalk to the middle of a parked car
 _DIAGONAL = 3.0  # m, wider strips are for diagonal parking
 _ROUNDING = 0.6  # m
+_CLEARING = 2.0  # s between the yellow light of one phase and the green light of the next
 
 
 @dataclass(frozen=True)
@@ -50,9 +53,13 @@ class Street:
     narrow: tuple[float, float] | None = None  # first and last s where vehicles cannot meet [m]
     # how far vehicles swing to the left there, along s and against it; who must more gives way [m]
     swings: tuple[float, float] = (_NARROW_ASIDE, _NARROW_ASIDE)
-    wide: float = 0.0  # how far vehicles swing out to turn right at its junctions [m]
     obstacles: tuple[tuple[float, float], ...] = ()  # s and t of cars parked on the road [m]
     has_lights: bool = False  # whether traffic lights stand before its junctions
+
+    @property
+    def length(self) -> float:
+        """Length [m]."""
+        return sum(piece.length for piece in self.pieces)
 
     @property
     def half(self) -> float:
@@ -86,6 +93,44 @@ class Street:
 
 
 @dataclass(frozen=True)
+class Lights:
+    """The lights of one junction: streets take turns."""
+
+    # connecting roads that are green together, phase after phase
+    phases: tuple[frozenset[int], ...]
+    green: tuple[float, ...]  # how long each phase is green [s]
+    begun: float  # how long the cycle has been going on at time 0 [s]
+    crossings: dict[str, int]  # phase of the vehicles that a crosswalk stops, by its name
+    yellow: float = 3.0  # how long a phase is yellow [s]
+
+    def status(self, phase: int, time: float) -> LightStatus:
+        """What a phase shows at a time [s]."""
+        wait = self.wait(phase, time)
+        if wait > 0.0:
+            return LightStatus.RED
+        return LightStatus.GREEN if -wait < self.green[phase] else LightStatus.YELLOW
+
+    def wait(self, phase: int, time: float) -> float:
+        """Time until a phase becomes green; 0 and less, how long it has been, or yellow [s]."""
+        spans = [green + self.yellow + _CLEARING for green in self.green]
+        since = (self.begun + time - sum(spans[:phase])) % sum(spans)
+        return -since if since < self.green[phase] + self.yellow else sum(spans) - since
+
+    def closed(self, time: float) -> set[int]:
+        """Connecting roads that nobody may enter at a time [s]."""
+        return {
+            number
+            for phase, numbers in enumerate(self.phases)
+            if self.status(phase, time) != LightStatus.GREEN
+            for number in numbers
+        }
+
+    def waits(self, time: float) -> dict[str, float]:
+        """How long the vehicles before each crosswalk will see red [s]."""
+        return {name: self.wait(phase, time) for name, phase in self.crossings.items()}
+
+
+@dataclass(frozen=True)
 class Leg:
     """A street in one direction."""
 
@@ -112,7 +157,7 @@ class Leg:
 
     def lane(self, road: RoadSpec, lane: int) -> FloatArray:
         """(n, 2) centre of a lane, in its direction."""
-        s = np.arange(0.0, road.length, paths.STEP)
+        s = np.arange(0.0, road.length, STEP)
         center = road.center_of(-lane if self.is_forward else lane, s)[:, :2]
         return center if self.is_forward else center[::-1]
 
@@ -128,8 +173,9 @@ class Town:
     connectors: dict[tuple[int, str, int, str], tuple[int, int]] = field(default_factory=dict)
     # connecting roads and narrow places that cannot be used at once
     conflicts: set[tuple[int, int]] = field(default_factory=set)
-    walks: dict[str, paths.Walk] = field(default_factory=dict)  # by name
+    walks: list[Walk] = field(default_factory=list)
     bays: dict[str, FloatArray] = field(default_factory=dict)  # (n, 3) parking spaces by street
+    lights: tuple[Lights, ...] = ()  # of its junctions
 
     def parked(self) -> FloatArray:
         """(n, 3) poses of parked cars."""
@@ -145,7 +191,7 @@ class Town:
         return np.concatenate([np.zeros((0, 3)), *poses])
 
 
-def build_town(name: str, streets: tuple[Street, ...]) -> Town:
+def build_town(name: str, streets: Sequence[Street]) -> Town:
     """A town from its streets; junctions connect all that meet there."""
     town = Town(name, {street.name: street for street in streets}, RoadNetwork(name))
     legs = [Leg(street, True) for street in streets]
@@ -157,17 +203,22 @@ def build_town(name: str, streets: tuple[Street, ...]) -> Town:
         meet = source.enters and source.enters == target.leaves
         if meet and source.street is not target.street:
             _connect(town, source, target, lines)
+    roads = town.network.roads
     starts = {number: (street, lane) for street, number, lane in town.network.links}
     for a, b in permutations(lines, 2):
-        same = town.network.roads[a].junction == town.network.roads[b].junction
-        if same and starts[a] != starts[b] and _closest(lines[a], lines[b]) < _CLOSE:
-            town.conflicts.add((a, b))
+        if roads[a].junction == roads[b].junction and starts[a] != starts[b]:
+            gaps = np.hypot(*np.moveaxis(lines[a][:, None] - lines[b], -1, 0))
+            if gaps.min() < _CLOSE:
+                town.conflicts.add((a, b))
     for street in streets:
         if street.narrow:
             one, other = -2 * street.id, -2 * street.id - 1
             town.conflicts |= {(one, other), (other, one)}
-    _add_walks(town)
-    _add_bays(town)
+    for street in streets:
+        if not street.is_one_way:
+            _add_walks(town, street)
+        if street.parking > 0.0:
+            town.bays[street.name] = _bays(town, street)
     return town
 
 
@@ -198,7 +249,7 @@ def _connect(town: Town, source: Leg, target: Leg, lines: dict[int, FloatArray])
         roads[number] = road
         town.network.links.append((a.id, number, incoming))
         town.connectors[source.enters, a.name, from_lane, b.name] = (number, to_lane)
-        lines[number] = road.center_of(-1, np.arange(0.0, road.length, paths.STEP))[:, :2]
+        lines[number] = road.center_of(-1, np.arange(0.0, road.length, STEP))[:, :2]
 
 
 def turn_angle(town: Town, source: Leg, target: Leg) -> float:
@@ -208,27 +259,15 @@ def turn_angle(town: Town, source: Leg, target: Leg) -> float:
     return float((b[2] - a[2] + np.pi) % (2 * np.pi) - np.pi)
 
 
-def _closest(a: FloatArray, b: FloatArray) -> float:
-    gaps = a[:, None] - b[None]
-    return float(np.hypot(gaps[..., 0], gaps[..., 1]).min())
-
-
-def _add_walks(town: Town) -> None:
-    """Add ways over every crossing, and along the sidewalks."""
-    for street in town.streets.values():
-        if street.sidewalk <= 0.0 or street.is_one_way:
-            continue
-        for number in range(len(street.crossings)):
-            _add_crossing(town, street, number)
-        road = town.network.roads[street.id]
-        first = 0.5 * sum(street.crossings[0]) + 8.0 if street.crossings else 3.0
-        s = np.arange(first, road.length - 3.0, paths.STEP)
-        for name, sign in (("left", 1.0), ("right", -1.0)):
-            points = road.at(s, sign * (street.half + 2.5))[:, :2]
-            points = points if sign > 0 else points[::-1]
-            town.walks[f"{street.name}-along-{name}"] = paths.Walk(
-                paths.resample(points, _ROUNDING)
-            )
+def _add_walks(town: Town, street: Street) -> None:
+    """Add ways over the crossings of a street, and along its sidewalks."""
+    for number in range(len(street.crossings)):
+        _add_crossing(town, street, number)
+    road = town.network.roads[street.id]
+    first = 0.5 * sum(street.crossings[0]) + 8.0 if street.crossings else 3.0
+    s = np.arange(first, road.length - 3.0, STEP)
+    left, right = (road.at(s, sign * (street.half + 2.5))[:, :2] for sign in (1.0, -1.0))
+    town.walks += [Walk(resample(points, _ROUNDING)) for points in (left, right[::-1])]
 
 
 def _add_crossing(town: Town, street: Street, number: int) -> None:
@@ -236,27 +275,17 @@ def _add_crossing(town: Town, street: Street, number: int) -> None:
     road = town.network.roads[street.id]
     half, middle = street.half, 0.5 * sum(street.crossings[number])
     far = min(middle + 30.0, road.length - 3.0)
-    label = f"{street.name}.{number}" if number else street.name
-    for name, sign in (("right", 1.0), ("left", -1.0)):
+    for sign, offsets in ((1.0, (-0.9, -0.2)), (-1.0, (0.5, 1.2))):
         aside = half + 1.2 + 0.4 * sign
-        for suffix, offset in (("", -0.9), ("-b", -0.2)) if sign > 0 else (("", 0.5), ("-b", 1.2)):
-            at = middle + offset
-            before = road.at(np.arange(far, at, -paths.STEP), sign * aside)[:, :2]
-            lateral = np.arange(aside, -aside, -paths.STEP)
+        for at in (middle + offset for offset in offsets):
+            before = road.at(np.arange(far, at, -STEP), sign * aside)[:, :2]
+            lateral = np.arange(aside, -aside, -STEP)
             over = road.at(np.full(len(lateral), at), sign * lateral)[:, :2]
-            after = road.at(np.arange(at, far - 6.0, paths.STEP), -sign * aside)[:, :2]
-            points = paths.resample(np.concatenate([before, over, after]), _ROUNDING)
-            kerb = paths.arc_at(points, over[0]) + (aside - half) - 0.6
+            after = road.at(np.arange(at, far - 6.0, STEP), -sign * aside)[:, :2]
+            points = resample(np.concatenate([before, over, after]), _ROUNDING)
+            kerb = arc_at(points, over[0]) + (aside - half) - 0.6
             across = kerb + 2 * half + 1.4
-            crossing = street.crossing_name(number)
-            town.walks[f"{label}-cross-{name}{suffix}"] = paths.Walk(points, crossing, kerb, across)
-
-
-def _add_bays(town: Town) -> None:
-    """Add the parking spaces of every street."""
-    for street in town.streets.values():
-        if street.parking > 0.0:
-            town.bays[street.name] = _bays(town, street)
+            town.walks.append(Walk(points, street.crossing_name(number), kerb, across))
 
 
 def _bays(town: Town, street: Street) -> FloatArray:

@@ -8,8 +8,8 @@ from shiftsim.benchmarks.speed.city import bench_scene
 from shiftsim.data.readers.deepplan.windows import overlap_partners
 from shiftsim.data.readers.dsc3d.recording import open_site, read_recording
 from shiftsim.data.store.reading import ScenarioStore
-from shiftsim.data.synthetic.layouts import random_place
-from shiftsim.data.synthetic.paths import STEP
+from shiftsim.data.synthetic.agents import STEP
+from shiftsim.data.synthetic.layouts import random_town
 from shiftsim.data.synthetic.routes import RandomRoutes, Route, make_path
 from shiftsim.data.synthetic.store import demo_store, write_demo
 from shiftsim.metrics import compute_metrics
@@ -116,7 +116,7 @@ def test_better_planners_score_higher_in_every_demo(store):
 
 @pytest.fixture(scope="module")
 def avenue():
-    return random_place("avenue", "test", np.random.Generator(np.random.Philox(1))).town
+    return random_town("avenue", "test", np.random.Generator(np.random.Philox(1)))
 
 
 def test_a_path_is_smooth_and_passes_the_junctions_in_turn(avenue):
@@ -131,7 +131,7 @@ def test_a_path_is_smooth_and_passes_the_junctions_in_turn(avenue):
 
 
 def test_a_route_into_a_parking_space_ends_there():
-    town = random_place("parking", "test", np.random.Generator(np.random.Philox(1))).town
+    town = random_town("parking", "test", np.random.Generator(np.random.Philox(1)))
     junction = next(x for x in town.streets["lot"].junctions if x)
     entry = next(x.name for x in town.streets.values() if x.junctions == (junction, 0))
     end = make_path(town, Route(1, (entry, "lot"), (0, 0), bay=4)).points[-1]

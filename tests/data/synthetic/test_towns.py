@@ -13,12 +13,11 @@ from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.data.synthetic import recordings as town_recordings
-from shiftsim.data.synthetic.agents import SIZES
-from shiftsim.data.synthetic.layouts import KINDS, random_place
-from shiftsim.data.synthetic.lights import Lights
-from shiftsim.data.synthetic.paths import arc_at
+from shiftsim.data.synthetic.agents import SIZES, arc_at
+from shiftsim.data.synthetic.layouts import KINDS, random_town
 from shiftsim.data.synthetic.population import random_traffic
 from shiftsim.data.synthetic.store import town_specs, write_towns
+from shiftsim.data.synthetic.town import Lights
 from shiftsim.data.synthetic.traffic import DT
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.geometry.boxes import boxes_to_corners
@@ -31,9 +30,9 @@ ONE_PROCESS = partial(map_unordered, workers=1)
 DURATION = 42.08  # s
 
 
-def _place(kind, number=0):
+def _town(kind, number=0):
     rng = np.random.Generator(np.random.Philox(number))
-    return random_place(kind, "test", rng), rng
+    return random_town(kind, "test", rng), rng
 
 
 @pytest.fixture(scope="module")
@@ -148,14 +147,14 @@ def test_a_generator_that_is_no_table_is_an_error(tmp_path):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_map_of_every_kind_passes_the_checks_of_the_reader(kind, tmp_path):
-    place, _ = _place(kind)
+    town, _ = _town(kind)
     path = tmp_path / "map.xodr"
-    path.write_text(place.town.network.xml())
+    path.write_text(town.network.xml())
     road, report = build_road_map(read_opendrive(path), name=kind)
     assert {name for name, good in check_map(road, report.stacked)[0].items() if not good} == set()
     assert report.warnings == {}
     lit = {road.edges.ids[k] for k in np.flatnonzero(road.has_traffic_lights)}
-    assert bool(lit) == bool(place.lights)
+    assert bool(lit) == bool(town.lights)
 
 
 def test_towns_differ_in_arms_lanes_and_limits():
@@ -188,10 +187,10 @@ def _assert_apart(boxes, parked):
     ["street", *(pytest.param(x, marks=pytest.mark.thorough) for x in KINDS if x != "street")],
 )
 def test_nobody_touches_anybody_and_traffic_drives_smoothly(kind):
-    place, rng = _place(kind, 3)
-    traffic = random_traffic(place, rng, DURATION)
+    town, rng = _town(kind, 3)
+    traffic = random_traffic(town, rng, DURATION)
     boxes = traffic.record(DURATION)
-    _assert_apart(boxes, place.town.parked())
+    _assert_apart(boxes, town.parked())
     rows = np.array([(x[0], x[1], *x[3:8]) for x in boxes if x[2] != "pedestrian"])
     rows = rows[np.lexsort((rows[:, 0], rows[:, 1]))]
     same = (np.diff(rows[:, 1]) == 0) & (np.diff(rows[:, 0]) == 1)
@@ -204,7 +203,7 @@ def test_nobody_touches_anybody_and_traffic_drives_smoothly(kind):
 def test_some_people_step_out_between_parked_cars():
     found = {True: [], False: []}
     for number in range(6):
-        town = _place("street", number)[0].town
+        town = _town("street", number)[0]
         for street in town.streets.values():
             for ends in street.crossings if street.parking else ():
                 middle = town.network.roads[street.id].at(np.array([sum(ends) / 2]))[0, :2]
@@ -236,20 +235,20 @@ def test_streets_take_turns_and_yellow_lies_between_green_and_red():
 
 @pytest.mark.parametrize("number", [0, pytest.param(4, marks=pytest.mark.thorough)])
 def test_nobody_enters_a_junction_at_red(number):
-    place, rng = _place("lights", number)
-    traffic = random_traffic(place, rng, DURATION)
-    (lights,) = place.lights
+    town, rng = _town("lights", number)
+    traffic = random_traffic(town, rng, DURATION)
+    (lights,) = town.lights
     phases = {road: k for k, group in enumerate(lights.phases) for road in group}
     entered = 0
     for driver in traffic.drivers:
         zone = driver.path.zones[0]
-        rows = [x for x in traffic.record(DURATION) if x[1] == driver.token]
+        rows = [x for x in traffic.record(DURATION) if x[1] == driver.track]
         front = [arc_at(driver.path.points, np.array(x[3:5])) + driver.length / 2 for x in rows]
         late = [x[0] * DT for x, s in zip(rows, front, strict=True) if s > zone.stop + 2.5]
         if rows and front[0] < zone.stop and late:
             entered += 1
             shown = lights.status(phases[zone.id], late[0])
-            assert shown in (LightStatus.GREEN, LightStatus.YELLOW), driver.token
+            assert shown in (LightStatus.GREEN, LightStatus.YELLOW), driver.track
     assert entered >= 5
 
 
