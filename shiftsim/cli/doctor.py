@@ -174,7 +174,7 @@ def compile_kernels(advance: Advance) -> dict[str, Any]:
         ShiftsimError: A run failed.
     """
     from shiftsim.api import run
-    from shiftsim.data.demo.store import demo_store
+    from shiftsim.data.synthetic.store import demo_store
     from shiftsim.kernels import CACHE_FOLDER, machine_code
 
     began, before = perf_counter(), len(machine_code())

@@ -374,7 +374,7 @@ def demo(
         return
     if seed is not None:
         raise ConfigError("--seed is of random towns only", hint="say how many with --towns")
-    from shiftsim.data.demo.store import DEMO_SPLIT, demo_store
+    from shiftsim.data.synthetic.store import DEMO_SPLIT, demo_store
     from shiftsim.files import store_path
     from shiftsim.runs.config import DEFAULT_STORE
 
@@ -408,7 +408,7 @@ def _make_towns(
     """Generate, convert and filter random towns."""
     if "limit" in settings:
         raise ConfigError("--limit is of runs, --towns runs nothing", hint="leave one of them out")
-    from shiftsim.data.towns.store import write_towns
+    from shiftsim.data.synthetic.store import write_towns
     from shiftsim.files import store_path
     from shiftsim.runs.config import default_workers
     from shiftsim.runs.filter import filter_store

@@ -27,7 +27,11 @@ CASES = [
         "start again, with: shiftsim convert nuplan x y --store z",
     ),
     ("stats {store}", "shiftsim.data.store.statistics.store_stats", "start again, with: shiftsim"),
-    ("demo --out x", "shiftsim.data.demo.store.demo_store", "start again, with: shiftsim demo"),
+    (
+        "demo --out x",
+        "shiftsim.data.synthetic.store.demo_store",
+        "start again, with: shiftsim demo",
+    ),
     (
         "run -p idm --store {store}",
         "shiftsim.runs.prepare.prepare",
