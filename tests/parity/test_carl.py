@@ -19,6 +19,7 @@ from parity_cases import (
 from parity_nets import (
     ANY,
     FILE_COLUMNS,
+    HYPER_PARAMETERS,
     Loop,
     compare_manifest,
     loop_steps,
@@ -162,7 +163,7 @@ WEIGHTS = {
 def manifest(network: Any) -> dict[str, Any]:
     return {
         "checkpoint": dict.fromkeys(("file", "container", "prefix", "loading", "config"), ANY),
-        "hyper": network.RELEASED,
+        "hyper": HYPER_PARAMETERS["carl"],
         "drive_overrides": {
             "dist_mu.0.weight, dist_sigma.0.weight": (
                 "base value, then row 0 times 4 and row 1 times 0.05"
