@@ -36,14 +36,13 @@ from parity_nets import (
 torch = pytest.importorskip("torch")
 
 from shiftsim.planners.learned import features as builder  # noqa: E402
+from shiftsim.planners.learned.checkpoint import network_module  # noqa: E402
+from shiftsim.planners.learned.features import STEP, plan_of_poses  # noqa: E402
 from shiftsim.planners.learned.map_features import CROSSWALK  # noqa: E402
-from shiftsim.planners.learned.match import network_module  # noqa: E402
-from shiftsim.planners.learned.plan_states import STEP, plan_of_poses  # noqa: E402
 from shiftsim.planners.learned.plantf.planner import PlanTF, make_batch  # noqa: E402
-from shiftsim.planners.learned.pluto import brake, scoring  # noqa: E402
-from shiftsim.planners.learned.pluto import inputs as pluto_inputs  # noqa: E402
-from shiftsim.planners.learned.pluto.planner import Pluto  # noqa: E402
-from shiftsim.planners.learned.pluto.proposals import headings_of  # noqa: E402
+from shiftsim.planners.learned.pluto import planner as pluto_planner  # noqa: E402
+from shiftsim.planners.learned.pluto import scoring  # noqa: E402
+from shiftsim.planners.learned.pluto.planner import Pluto, headings_of  # noqa: E402
 from shiftsim.world.state import NUM_STATE, PACIFICA, VX, VY  # noqa: E402
 
 pytestmark = [pytest.mark.golden, pytest.mark.learned, pytest.mark.slow]
@@ -361,11 +360,9 @@ def compare_choice(loop: Loop) -> None:
 
 def compare_stored(loop: Loop) -> None:
     """Features, raw outputs, and what the scores of the stored proposals are."""
-    from shiftsim.planners.learned.pluto.network import Inputs
-
     compare_pluto_features(loop)
     choice, stored = loop.planner.choice, loop.stored.below("post/")
-    batch = Inputs(*pluto_inputs.stack([loop.features], "cpu"))
+    batch = pluto_planner.make_batch([loop.features], "cpu")
     compare_network(loop, pluto_outputs, batch)
     agents, proposals = choice.agents, np.ascontiguousarray(stored["cand"])
     agents = agents._replace(poses=stored["agents_pred"], speeds=stored["agents_vel"])
@@ -435,9 +432,9 @@ def test_emergency_brake(path: Path, cases: Cases) -> None:
     for number, case in enumerate(rows := file.array_rows()):
         ego, time = case.take("ego", NUM_STATE), float(case["fault_time"])
         speed = float(np.hypot(ego[VX], ego[VY]))
-        braked, states = brake.must_brake(speed, time), np.full((81, NUM_STATE), np.nan)
+        braked, states = scoring.must_brake(speed, time), np.full((81, NUM_STATE), np.nan)
         if braked:
-            states = brake.brake(case["candidate"], ego, time, PACIFICA)
+            states = scoring.brake(case["candidate"], ego, time, PACIFICA)
         ours = {"speed": speed, "braked": braked, "states": states}
         case.match(f"case {number}", ours, {"speed": LINE, "": STATE})
     rows[-1].finish()

@@ -12,7 +12,7 @@ import numpy as np
 from shiftsim.geometry.boxes import box_corners
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.learned.carl.raster import Crossings, Raster, draw_line, fill, make_crossings
-from shiftsim.planners.learned.carl.roads import CHUNK, MAX_SPEED, YES, Lines, Roads, level
+from shiftsim.planners.learned.carl.roads import MAX_SPEED, YES, Roads, level
 from shiftsim.world.layers import Polygons, meets_convex
 from shiftsim.world.map import NONE
 from shiftsim.world.state import LAST_AGENT_KIND, AgentKind
@@ -156,6 +156,7 @@ def draw_roads(
 def _draw_edge(
     rasters: Raster, roads: Roads, scratch: Scratch, frame: FloatArray, edge: int, light: int
 ) -> None:
+    """Draw the lines of an edge: its speed limit, boundaries that are not drawn yet, its light."""
     for slot in range(4):
         line = roads.lines_of[edge, slot]
         channel, value = BOUNDARIES, YES
@@ -167,8 +168,13 @@ def _draw_edge(
             if scratch.drawn[line]:
                 continue
             scratch.drawn[line] = True
-        if line != NONE and value > 0:
-            _draw_line_of(rasters[channel], roads.lines, line, frame, value)
+        if line == NONE or value == 0:
+            continue
+        xy = roads.lines.xy[roads.lines.ptr[line] : roads.lines.ptr[line + 1]]
+        for vertex in range(len(xy) - 1):
+            x0, y0 = _to_pixel(frame, xy[vertex, 0], xy[vertex, 1])
+            x1, y1 = _to_pixel(frame, xy[vertex + 1, 0], xy[vertex + 1, 1])
+            draw_line(rasters[channel], x0, y0, x1, y1, value)
 
 
 @kernel
@@ -182,27 +188,6 @@ def _fill_shell(
         x, y = _to_pixel(frame, polygons.xy[vertex, 0], polygons.xy[vertex, 1])
         scratch.ring[vertex - start, 0], scratch.ring[vertex - start, 1] = x, y
     fill(raster, scratch.ring[: stop - start], YES, scratch.crossings, False)
-
-
-@kernel
-def _draw_line_of(raster: Raster, lines: Lines, line: int, frame: FloatArray, value: int) -> None:
-    """Draw a line, chunk by chunk."""
-    first, last = lines.ptr[line], lines.ptr[line + 1] - 1
-    for chunk in range(lines.chunk_ptr[line], lines.chunk_ptr[line + 1]):
-        start = first + (chunk - lines.chunk_ptr[line]) * CHUNK
-        dx, dy = lines.circles[chunk, 0] - frame[0], lines.circles[chunk, 1] - frame[1]
-        reach = HALF_SIDE + lines.circles[chunk, 2] + 1.0  # a pixel more than needed
-        if abs(frame[2] * dx + frame[3] * dy) > reach or abs(frame[2] * dy - frame[3] * dx) > reach:
-            continue
-        px, py = _to_pixel(frame, lines.xy[start, 0], lines.xy[start, 1])
-        for vertex in range(start + 1, min(start + CHUNK, last) + 1):
-            x, y = _to_pixel(frame, lines.xy[vertex, 0], lines.xy[vertex, 1])
-            if vertex > start + 1 and abs(x - px) <= 1 and abs(y - py) <= 1:
-                if 0 <= x < SIZE and 0 <= y < SIZE:  # the pixel before is drawn already
-                    raster[y, x] = value
-            else:
-                draw_line(raster, px, py, x, y, value)
-            px, py = x, y
 
 
 @kernel

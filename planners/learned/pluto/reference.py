@@ -9,11 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.geometry.boxes import meets_bounds, wrap_angles
-from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.geometry.boxes import wrap_angles
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.planners.proposals.areas import Areas, make_areas, select_areas
 from shiftsim.planners.routes.graph import LanePath, deviation, lane_path, sub_path
-from shiftsim.world.layers import Polygons, Polylines, meets_convex, square_around
 from shiftsim.world.map import NONE, VectorMap
 
 AREA_HALF_SIDE = 60.0  # m, of the square of the drivable areas
@@ -97,11 +96,13 @@ def reference_lines(
     `rear` (3,) and `center` (3,) are the poses of the rear axle and of the ego box.
     """
     x, y = float(rear[0]), float(rear[1])
-    found = np.empty(len(route.starts), np.int64)
-    count = _start_lanes(
-        road.edges.polygons, road.baselines, route.starts, rear, center[0], center[1], found
-    )
-    starts = found[:count].tolist()
+    near = road.edges.within_box(float(center[0]), float(center[1]), START_HALF_SIDE)
+    starts = [
+        start
+        for start in route.starts[np.isin(route.starts, near)].tolist()
+        if road.baselines.length(start) > MIN_BASELINE
+        and deviation(road.baselines, start, STRIDE, *rear.tolist())[1] < MAX_HEADING_ERROR
+    ]
     after = {lane for start in starts for lane in road.outgoing.at(start).tolist()}
     lines, lengths = [], []
     for start in starts:
@@ -148,31 +149,6 @@ def _distinct(lines: list[FloatArray]) -> list[FloatArray]:
         else:
             distinct.append(line)
     return distinct
-
-
-@kernel
-def _start_lanes(
-    polygons: Polygons,
-    baselines: Polylines,
-    lanes: IntArray,
-    rear: FloatArray,
-    x: float,
-    y: float,
-    out: IntArray,
-) -> int:
-    """Write the lanes a line may start on into `out`; their number."""
-    count = 0
-    square = square_around(x, y, START_HALF_SIDE)
-    for lane in lanes:
-        if (
-            meets_bounds(square, polygons.bounds[lane])
-            and baselines.arc[baselines.ptr[lane + 1] - 1] > MIN_BASELINE
-            and meets_convex(polygons, lane, square)
-            and deviation(baselines, lane, STRIDE, rear[0], rear[1], rear[2])[1] < MAX_HEADING_ERROR
-        ):
-            out[count] = lane
-            count += 1
-    return count
 
 
 def _cut(path: LanePath, x: float, y: float) -> tuple[FloatArray, float]:
