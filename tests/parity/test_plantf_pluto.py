@@ -35,7 +35,6 @@ from parity_nets import (
 
 torch = pytest.importorskip("torch")
 
-from shiftsim.planners.learned import features as builder  # noqa: E402
 from shiftsim.planners.learned.checkpoint import network_module  # noqa: E402
 from shiftsim.planners.learned.features import STEP, plan_of_poses  # noqa: E402
 from shiftsim.planners.learned.map_features import CROSSWALK  # noqa: E402
@@ -220,7 +219,7 @@ def compare_inputs(stored: File, planner: str, radius: float, codes: set[str]) -
     names = ("position", "heading", "velocity", "shape")
     position, heading, velocity, shape = (given[f"agent.{name}"] for name in names)
     ours["agent.position"][:, 0, -1] = ours["agent.heading"][:, 0, -1] = 0.0
-    ours["agent.shape"][:, 0] = builder.EGO_WIDTH, builder.EGO_LENGTH
+    ours["agent.shape"][:, 0] = PACIFICA.width, PACIFICA.length
     ours["agent.category"][:, 0], ours["agent.valid_mask"][:, 0] = 0.0, 1.0
     ours["current_state"][:, :3], ours["current_state"][:, 3] = 0.0, velocity[:, 0, -1, 0]
     for name in {"agent.target", "reference_line.future_projection"} & set(ours):

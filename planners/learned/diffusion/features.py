@@ -13,7 +13,7 @@ import shapely
 from numpy.typing import NDArray
 
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.planners.learned.features import route_blocks
+from shiftsim.planners.learned.features import route_blocks, turned
 from shiftsim.planners.learned.map_features import LightLookup, resample
 from shiftsim.planners.routes.correction import RouteCorrector
 from shiftsim.sim.planner import Observation, SceneInfo
@@ -207,7 +207,7 @@ def lane_inputs(
     rows = np.zeros((LANES, POINTS, LANE_COLUMNS), np.float32)
     pairs = lanes.rows[edges].reshape(count, POINTS, 4, 2)
     pairs[:, :, 0] -= anchor[:2]
-    rows[:count, :, 0:8:2], rows[:count, :, 1:8:2] = _turned(pairs, anchor[2])
+    rows[:count, :, :8] = turned(pairs, anchor[2]).reshape(count, POINTS, 8)
     rows[np.arange(count), :, 8 + lights] = 1.0
     known, limits = np.zeros((LANES, 1), np.bool_), np.zeros((LANES, 1), np.float32)
     known[:count, 0] = ~np.isnan(lanes.limits[edges])
@@ -229,7 +229,7 @@ def agent_features(tracks: Tracks, anchor: FloatArray) -> tuple[Single, Single, 
     source = _samples_of(tracks.valid[:, chosen]), chosen
     rows = agents[: len(chosen)].swapaxes(0, 1)
     _fill_poses(rows, tracks.poses[source], anchor)
-    rows[..., 4], rows[..., 5] = _turned(tracks.velocities[source], anchor[2])
+    rows[..., 4:6] = turned(tracks.velocities[source], anchor[2])
     rows[..., 6:8] = tracks.sizes[source][..., ::-1]
     agents[np.arange(len(chosen)), :, 8 + kinds[chosen]] = 1.0
     static = _by_distance(present & (kinds > LAST_AGENT_KIND), now, anchor)[:OBJECTS]
@@ -255,15 +255,8 @@ def _samples_of(valid: BoolArray) -> IntArray:
 def _fill_poses(rows: Single, poses: FloatArray, anchor: FloatArray) -> None:
     """Write poses (..., 3) in the frame of a rear axle (3,) as x, y, cos and sin of the heading."""
     local = poses - anchor
-    rows[..., 0], rows[..., 1] = _turned(local, anchor[2])
+    rows[..., :2] = turned(local, anchor[2])
     rows[..., 2], rows[..., 3] = np.cos(local[..., 2]), np.sin(local[..., 2])
-
-
-def _turned(vectors: FloatArray, heading: float) -> tuple[FloatArray, FloatArray]:
-    """Components (...) forward and to the left of a heading, of vectors (..., 2 or more)."""
-    cos, sin = np.cos(heading), np.sin(heading)
-    x, y = vectors[..., 0], vectors[..., 1]
-    return cos * x + sin * y, cos * y - sin * x
 
 
 def _choose_agents(
