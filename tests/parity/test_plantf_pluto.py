@@ -366,9 +366,9 @@ def compare_stored(loop: Loop) -> None:
     agents, proposals = choice.agents, np.ascontiguousarray(stored["cand"])
     agents = agents._replace(poses=stored["agents_pred"], speeds=stored["agents_vel"])
     scores = loop.planner.rate(loop.seen, proposals, stored["lscore"], agents).scores
-    sight = loop.planner.sight
-    line = scoring.nearest_line(sight.lines, loop.seen.history.ego[-1])
-    tokens = [loop.tracks.tokens[i] for i in sight.agents.tracks]
+    seen = loop.planner.surroundings
+    line = scoring.nearest_line(seen.lines, loop.seen.history.ego[-1])
+    tokens = [loop.tracks.tokens[i] for i in seen.agents.tracks]
     loop.match(stored, {"agents_tok": tokens, "baseline": line}, SCORED)
     ours = {
         "rule": scores.rule,
@@ -385,8 +385,8 @@ def compare_stored(loop: Loop) -> None:
 
 def compare_pluto_features(loop: Loop) -> None:
     """Compare what was made before the network."""
-    sight, given, road = loop.planner.sight, loop.features, loop.road
-    near, lines = sight.road, sight.lines
+    seen, given, road = loop.planner.surroundings, loop.features, loop.road
+    near, lines = seen.road, seen.lines
     blocks = [
         0 if kind == CROSSWALK else int(road.blocks.ids[road.block_of[row]])
         for row, kind in zip(near.objects.tolist(), near.kind.tolist(), strict=True)
@@ -401,7 +401,7 @@ def compare_pluto_features(loop: Loop) -> None:
         "reference_line.valid_mask": given.line_valid,
         "reference_line.future_projection": np.zeros((len(lines), 8, 2)),
     }
-    compare_features(loop, sight.agents, near, loop.planner.route.blocks, more)
+    compare_features(loop, seen.agents, near, loop.planner.route.blocks, more)
     stored = loop.stored.below("reference_line_")
     loop.compare("reference lines", len(lines), len(list(stored)))
     numbered = {str(number): line for number, line in enumerate(lines)}

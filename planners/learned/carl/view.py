@@ -13,7 +13,7 @@ from shiftsim.geometry.boxes import box_corners
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.learned.carl.raster import Crossings, Raster, draw_line, fill, make_crossings
 from shiftsim.planners.learned.carl.roads import MAX_SPEED, YES, Roads, level
-from shiftsim.world.layers import Polygons, meets_convex
+from shiftsim.world.layers import Polygons, meeting
 from shiftsim.world.map import NONE
 from shiftsim.world.state import LAST_AGENT_KIND, AgentKind
 
@@ -72,30 +72,14 @@ def picture_frame(center: FloatArray) -> FloatArray:
     return np.array([center[0] + AHEAD * cos, center[1] + AHEAD * sin, cos, sin])
 
 
-@kernel
 def find_areas(roads: Roads, frame: FloatArray) -> IntArray:
     """Areas that touch the raster, in the order of the spatial index."""
-    corners = np.empty((4, 2))
-    for corner in range(4):
-        ahead = HALF_SIDE if corner == 0 or corner == 3 else -HALF_SIDE
-        left = HALF_SIDE if corner < 2 else -HALF_SIDE
-        corners[corner, 0] = frame[0] + (ahead * frame[2] - left * frame[3])
-        corners[corner, 1] = frame[1] + (ahead * frame[3] + left * frame[2])
-    reach = HALF_SIDE * (abs(frame[2]) + abs(frame[3])) + 1e-6
-    bounds = roads.areas.bounds
-    out = np.empty(len(roads.order), np.int64)
-    found = 0
-    for area in roads.order:
-        if (
-            bounds[area, 0] <= frame[0] + reach
-            and bounds[area, 2] >= frame[0] - reach
-            and bounds[area, 1] <= frame[1] + reach
-            and bounds[area, 3] >= frame[1] - reach
-            and meets_convex(roads.areas, area, corners)
-        ):
-            out[found] = area
-            found += 1
-    return out[:found].copy()
+    ahead, left = HALF_SIDE * np.array([[1, -1, -1, 1], [1, 1, -1, -1]])
+    cos, sin = frame[2:]
+    corners = frame[:2] + np.column_stack([ahead * cos - left * sin, ahead * sin + left * cos])
+    touches = np.zeros(len(roads.areas.bounds), np.bool_)
+    touches[meeting(roads.areas, corners)] = True
+    return roads.order[touches[roads.order]]
 
 
 @kernel
