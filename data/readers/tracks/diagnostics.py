@@ -11,7 +11,7 @@ from shiftsim.data.readers.codes import KINDS
 from shiftsim.data.readers.motion import contradiction
 from shiftsim.data.readers.tracks.axes import check_headings, check_reference, check_velocities
 from shiftsim.data.readers.tracks.columns import UNITS, Columns
-from shiftsim.data.readers.tracks.map_fit import Fit, fit_map
+from shiftsim.data.readers.tracks.map_fit import MIN_ALONG, Fit, fit_map
 from shiftsim.data.readers.tracks.statistics import (
     FAST,
     LEAST_CONTRADICTING,
@@ -277,7 +277,7 @@ def _check_fit(fit: Fit, columns: Columns, min_share: float, out: Diagnostics) -
     else:
         what = (
             f"only {fit.along:.0%} of the moving vehicles drive along the lane they are on, need"
-            f" {fit.min_along:.0%}"
+            f" {MIN_ALONG:.0%}"
         )
     if fit.best is None:
         out.error(

@@ -196,9 +196,8 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         footprint = boxes_to_corners(observation.ego.center, size)
         lights = world.red_lights(scene.map, route, observation)
         hazards = world.make_world(surroundings.static, agents, lights, footprint)
-        place = Place(
-            surroundings.drivable, scene.map.edges.polygons, nearest_line(surroundings.lines, ego)
-        )
+        line = nearest_line(surroundings.lines, ego)
+        place = Place(surroundings.drivable, scene.map.edges.polygons, line)
         scores = score(poses, learned, ego, hazards, place, scene.vehicle)
         best = int(np.argmax(scores.total))  # the first one on ties
         speed = float(np.hypot(ego[VX], ego[VY]))

@@ -36,13 +36,6 @@ class Drivable(NamedTuple):
     limits: FloatArray  # (M,) speed limit of each area of the map, of this step [m/s]
 
 
-class MapAreas(NamedTuple):
-    """What is made once per map."""
-
-    areas: Areas  # all areas of the map, none of them on a route
-    limits: FloatArray  # (M,) speed limits, 50 where the map has none [m/s]
-
-
 class RouteLanes(NamedTuple):
     """What is made once per scenario."""
 
@@ -55,25 +48,27 @@ class RouteLanes(NamedTuple):
     paths: dict[tuple[int, ...], LanePath]  # made so far, by their lanes
 
 
-def areas_of_map(road: VectorMap) -> MapAreas:
-    """Areas of all lanes, connectors and car parks of a map."""
+def areas_of_map(road: VectorMap) -> tuple[Areas, FloatArray]:
+    """Areas of a map, none on a route, and their speed limits (M,), 50 m/s where it has none."""
     limits = np.full(len(road.edges) + len(road.car_parks), FALLBACK_LIMIT)
     known = np.nan_to_num(road.speed_limits, nan=0.0)
     limits[: len(known)] = np.where(known == 0.0, FALLBACK_LIMIT, known)
-    return MapAreas(make_areas(road, []), limits)
+    return make_areas(road, []), limits
 
 
-def route_lanes(road: VectorMap, map_areas: MapAreas, blocks: Sequence[int]) -> RouteLanes:
-    """Lanes of a corrected route."""
+def route_lanes(
+    road: VectorMap, map_areas: tuple[Areas, FloatArray], blocks: Sequence[int]
+) -> RouteLanes:
+    """Lanes of a corrected route; `map_areas` are of `areas_of_map`."""
+    areas, limits = map_areas
     unique = list(dict.fromkeys(blocks))
     has_block = np.zeros(len(road.blocks), np.bool_)
     has_block[unique] = True
     is_on = (road.block_of != NONE) & has_block[road.block_of]
     lanes = np.flatnonzero(is_on)
     starts = np.concatenate([lanes[lanes >= road.num_lanes], lanes[lanes < road.num_lanes]])
-    on_route = np.isin(map_areas.areas.lane, lanes)
-    areas = map_areas.areas._replace(on_route=on_route)
-    return RouteLanes(unique, starts, has_block, is_on, areas, map_areas.limits, {})
+    areas = areas._replace(on_route=np.isin(areas.lane, lanes))
+    return RouteLanes(unique, starts, has_block, is_on, areas, limits, {})
 
 
 def drivable_near(road: VectorMap, route: RouteLanes, x: float, y: float) -> Drivable:
