@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
-from shiftsim.planners.learned.device import on_device
 from shiftsim.sim.planner import History, SceneInfo
 from shiftsim.world.state import (
     AY,
@@ -206,11 +205,13 @@ def _interpolate(at: FloatArray, knots: FloatArray, values: FloatArray) -> Float
 
 def stack_scenes(scenes: Sequence[Sequence[np.ndarray]], device: str) -> list[Any]:
     """Tensors (B, …) of the arrays of B scenes; where one has fewer rows, zeros follow."""
+    import torch
+
     out: list[Any] = []
     for arrays in zip(*scenes, strict=True):
         shape = np.max([array.shape for array in arrays], axis=0)
         batch = np.zeros((len(arrays), *shape), arrays[0].dtype)
         for row, array in zip(batch, arrays, strict=True):
             row[tuple(slice(size) for size in array.shape)] = array
-        out.append(on_device(batch, device))
+        out.append(torch.from_numpy(batch).to(device))
     return out

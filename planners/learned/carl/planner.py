@@ -18,7 +18,7 @@ from shiftsim.planners.learned.carl import view
 from shiftsim.planners.learned.carl.raster import Raster
 from shiftsim.planners.learned.carl.roads import MAX_SPEED, Roads, level, make_roads
 from shiftsim.planners.learned.checkpoint import load_network, split_ensemble
-from shiftsim.planners.learned.device import on_device, resolve_device
+from shiftsim.planners.learned.device import resolve_device
 from shiftsim.planners.learned.features import route_blocks
 from shiftsim.planners.learned.map_features import LightLookup
 from shiftsim.planners.per_map import PerMap
@@ -94,7 +94,7 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         import torch
 
         parts = (np.stack(part) for part in zip(*features, strict=True))
-        pictures, measured = (on_device(part, self.device) for part in parts)
+        pictures, measured = (torch.from_numpy(part).to(self.device) for part in parts)
         with torch.inference_mode():
             each = [network(pictures, measured).action for network in self.networks]
             return list(torch.stack(each).mean(dim=0).cpu().numpy())
