@@ -122,21 +122,16 @@ def fit_map(
             continue
         for shifted in (False, True):
             for name, axes in _AXES.items():
-                guess = _try(road, points @ (scale * axes).T, ways @ axes.T, name, unit, shifted)
+                placed = points @ (scale * axes).T
+                shift = place_on_map(road, placed, 1.1).shift if shifted else np.zeros(2)
+                shares = _shares(road, placed + shift, ways @ axes.T)[:2]
+                guess = Guess(name, unit, shift, *shares)
                 found = guess.share * guess.along
                 if min(guess.share, guess.along) >= _ENOUGH and found > value + _GAIN:
                     best, value = guess, found
         if best is not None:
             break
     return Fit(share, along, False, best)
-
-
-def _try(
-    road: VectorMap, points: FloatArray, ways: FloatArray, axes: str, unit: str, shifted: bool
-) -> Guess:
-    shift = place_on_map(road, points, 1.1).shift if shifted else np.zeros(2)
-    share, along, _ = _shares(road, points + shift, ways)
-    return Guess(axes, unit, shift, share, along)
 
 
 def _shares(

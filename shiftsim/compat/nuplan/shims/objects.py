@@ -201,20 +201,17 @@ class TrackedObjects:
 # nuplan.planning.simulation.observation.observation_type
 
 
-CameraChannel = Enum(
-    "CameraChannel",
-    {
-        "CAM_F0": "CAM_F0",
-        "CAM_B0": "CAM_B0",
-        "CAM_L0": "CAM_L0",
-        "CAM_L1": "CAM_L1",
-        "CAM_L2": "CAM_L2",
-        "CAM_R0": "CAM_R0",
-        "CAM_R1": "CAM_R1",
-        "CAM_R2": "CAM_R2",
-    },
-)
-LidarChannel = Enum("LidarChannel", {"MERGED_PC": "MergedPointCloud"})
+class CameraChannel(Enum):
+    """Cameras of the recording car."""
+
+    CAM_F0, CAM_B0, CAM_L0, CAM_L1 = "CAM_F0", "CAM_B0", "CAM_L0", "CAM_L1"
+    CAM_L2, CAM_R0, CAM_R1, CAM_R2 = "CAM_L2", "CAM_R0", "CAM_R1", "CAM_R2"
+
+
+class LidarChannel(Enum):
+    """Point clouds of the recording car."""
+
+    MERGED_PC = "MergedPointCloud"
 
 
 @dataclass
