@@ -70,7 +70,7 @@ def _cut(
 ) -> tuple[bool, int, int, int, int]:
     """Cut a line at the borders: whether it can be seen, and its ends as far as they were cut."""
     sx0, sy0, sx1, sy1 = _side(x0, width), _side(y0, height), _side(x1, width), _side(y1, height)
-    if _apart(sx0, sx1) or _apart(sy0, sy1):
+    if sx0 * sx1 > 0 or sy0 * sy1 > 0:  # both ends lie beyond the same border
         return False, x0, y0, x1, y1
     if sy0 != 0:
         border = 0 if sy0 < 0 else height - 1
@@ -82,7 +82,7 @@ def _cut(
         x1 += int(float(border - y1) * (x1 - x0) / (y1 - y0))
         y1 = border
         sx1 = _side(x1, width)
-    if _apart(sx0, sx1):
+    if sx0 * sx1 > 0:
         return False, x0, y0, x1, y1
     if sx0 != 0:
         border = 0 if sx0 < 0 else width - 1
@@ -93,12 +93,6 @@ def _cut(
         y1 += int(float(border - x1) * (y1 - y0) / (x1 - x0))
         x1 = border
     return True, x0, y0, x1, y1
-
-
-@kernel
-def _apart(side0: int, side1: int) -> bool:
-    """Whether both ends lie beyond the same border."""
-    return side0 * side1 > 0
 
 
 @kernel
