@@ -124,7 +124,7 @@ def test_a_time_years_away_is_an_error_and_takes_no_memory(tmp_path):
     log = write_py123d(tmp_path)
     name = f"{BOXES}.timestamp_us"
     changed_arrow(log / f"{BOXES}.arrow", with_value(name, START_US - 4_000_000_000))
-    refused(Py123dReader(tmp_path), log, log, "none between 0 s and 4000 s")
+    refused(Py123dReader(tmp_path), log, log, "row between 0 s and 4000 s")
 
 
 XML_FAULTS = {
