@@ -191,7 +191,7 @@ def road_features(
     near = np.concatenate([edges, len(road.edges) + meeting(road.crosswalks.polygons, square)])
     heading = float(ego[2])
     offsets = turned(known.lines[near, 0, :-1] - ego[:2], heading)
-    valid: BoolArray = (np.abs(offsets) < radius).all(axis=-1)
+    valid: BoolArray = np.all(np.abs(offsets) < radius, axis=-1)
     seen = valid.any(axis=1)
     chosen, valid = near[seen], valid[seen]
     lines = known.lines[chosen]

@@ -11,7 +11,7 @@ import numpy as np
 
 from shiftsim.geometry.boxes import box_corners
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.planners.learned.carl.raster import Crossings, Raster, draw_line, fill, make_crossings
+from shiftsim.planners.learned.carl.raster import Raster, draw_line, fill
 from shiftsim.planners.learned.carl.roads import MAX_SPEED, YES, Roads, level
 from shiftsim.world.layers import Polygons, meeting
 from shiftsim.world.map import NONE
@@ -34,15 +34,6 @@ _PEDESTRIAN = AgentKind.PEDESTRIAN
 _LAST_AGENT = LAST_AGENT_KIND
 
 
-class Scratch(NamedTuple):
-    """Scratch of `draw_roads`, as large as the map needs."""
-
-    ring: IntArray  # (V, 2) pixels of one ring
-    crossings: Crossings  # of its outline
-    filled: BoolArray  # areas that are drawn already
-    drawn: BoolArray  # lines that are drawn already
-
-
 class Boxes(NamedTuple):
     """Objects of one moment. N objects."""
 
@@ -50,19 +41,6 @@ class Boxes(NamedTuple):
     sizes: FloatArray  # (N, 2) length, width [m]
     velocities: FloatArray  # (N, 2) in the map frame [m/s]
     kinds: IntArray  # (N,) AgentKind codes
-
-
-def make_scratch(roads: Roads) -> Scratch:
-    """Scratch for a map."""
-    shells = roads.areas.poly_ptr[:-1]
-    sizes = roads.areas.ring_ptr[shells + 1] - roads.areas.ring_ptr[shells]
-    longest = max(4, *sizes.tolist())
-    return Scratch(
-        np.empty((longest, 2), np.int64),
-        make_crossings(SIZE, longest),
-        np.zeros(len(roads.areas.bounds), np.bool_),
-        np.zeros(len(roads.lines.ptr), np.bool_),
-    )
 
 
 @kernel
@@ -103,7 +81,6 @@ def _to_pixel(frame: FloatArray, x: float, y: float) -> tuple[int, int]:
 def draw_roads(
     rasters: Raster,
     roads: Roads,
-    scratch: Scratch,
     frame: FloatArray,
     found: IntArray,
     on_route: BoolArray,
@@ -114,18 +91,18 @@ def draw_roads(
     `found` are the areas in the raster, `on_route` (B,) the blocks of the route, `lights` (E,) the
     LightStatus by edge, ABSENT where there is none.
     """
-    scratch.filled[:] = False
-    scratch.drawn[:] = False
+    filled = np.zeros(len(roads.areas.bounds), np.bool_)
+    drawn = np.zeros(len(roads.lines.ptr), np.bool_)
     for area in found:
         for channel in (DRIVABLE, ROUTE):
             shape = roads.drivable[area] if channel == DRIVABLE else area
             if channel == ROUTE and (area >= roads.num_blocks or not on_route[area]):
                 continue
-            if channel == DRIVABLE and (shape == NONE or scratch.filled[shape]):
+            if channel == DRIVABLE and (shape == NONE or filled[shape]):
                 continue
             if channel == DRIVABLE:
-                scratch.filled[shape] = True
-            _fill_shell(rasters[channel], roads.areas, shape, frame, scratch)
+                filled[shape] = True
+            _fill_shell(rasters[channel], roads.areas, shape, frame)
     for connectors in (False, True):  # lanes first
         for area in found:
             if area >= roads.num_blocks or (area >= roads.num_roadblocks) != connectors:
@@ -133,12 +110,12 @@ def draw_roads(
             for entry in range(roads.block_edges.ptr[area], roads.block_edges.ptr[area + 1]):
                 edge = roads.block_edges.items[entry]
                 light = LIGHT_VALUES[lights[edge]] if connectors else 0
-                _draw_edge(rasters, roads, scratch, frame, edge, light)
+                _draw_edge(rasters, roads, drawn, frame, edge, light)
 
 
 @kernel
 def _draw_edge(
-    rasters: Raster, roads: Roads, scratch: Scratch, frame: FloatArray, edge: int, light: int
+    rasters: Raster, roads: Roads, drawn: BoolArray, frame: FloatArray, edge: int, light: int
 ) -> None:
     """Draw the lines of an edge: its speed limit, boundaries that are not drawn yet, its light."""
     for slot in range(4):
@@ -149,9 +126,9 @@ def _draw_edge(
         elif slot == 3:
             channel, value = LIGHTS, int(light)
         elif line != NONE:
-            if scratch.drawn[line]:
+            if drawn[line]:
                 continue
-            scratch.drawn[line] = True
+            drawn[line] = True
         if line == NONE or value == 0:
             continue
         xy = roads.lines.xy[roads.lines.ptr[line] : roads.lines.ptr[line + 1]]
@@ -162,20 +139,19 @@ def _draw_edge(
 
 
 @kernel
-def _fill_shell(
-    raster: Raster, polygons: Polygons, poly: int, frame: FloatArray, scratch: Scratch
-) -> None:
+def _fill_shell(raster: Raster, polygons: Polygons, poly: int, frame: FloatArray) -> None:
     """Fill a polygon; its holes are filled, too."""
     shell = polygons.poly_ptr[poly]
     start, stop = polygons.ring_ptr[shell], polygons.ring_ptr[shell + 1]
+    ring = np.empty((stop - start, 2), np.int64)
     for vertex in range(start, stop):
         x, y = _to_pixel(frame, polygons.xy[vertex, 0], polygons.xy[vertex, 1])
-        scratch.ring[vertex - start, 0], scratch.ring[vertex - start, 1] = x, y
-    fill(raster, scratch.ring[: stop - start], YES, scratch.crossings, False)
+        ring[vertex - start, 0], ring[vertex - start, 1] = x, y
+    fill(raster, ring, YES, False)
 
 
 @kernel
-def draw_objects(rasters: Raster, frame: FloatArray, boxes: Boxes, scratch: Scratch) -> None:
+def draw_objects(rasters: Raster, frame: FloatArray, boxes: Boxes) -> None:
     """Draw the objects whose centre is in the raster."""
     for is_static in (False, True):
         for index in range(len(boxes.kinds)):
@@ -190,7 +166,7 @@ def draw_objects(rasters: Raster, frame: FloatArray, boxes: Boxes, scratch: Scra
             elif kind == _PEDESTRIAN:
                 channel, value = PEDESTRIANS, level(speed, MAX_WALK)
             length, width = boxes.sizes[index, 0], boxes.sizes[index, 1]
-            draw_box(rasters[channel], frame, x, y, heading, length, width, value, scratch)
+            draw_box(rasters[channel], frame, x, y, heading, length, width, value)
 
 
 @kernel
@@ -203,12 +179,11 @@ def draw_box(
     length: float,
     width: float,
     value: int,
-    scratch: Scratch,
 ) -> None:
     """Draw a box."""
-    corners, pixels = np.empty((4, 2)), scratch.ring[:4]
+    corners, pixels = np.empty((4, 2)), np.empty((4, 2), np.int64)
     box_corners(x, y, heading, length, width, corners)
     for corner in range(4):
         column, row = _to_pixel(frame, corners[corner, 0], corners[corner, 1])
         pixels[corner, 0], pixels[corner, 1] = column, row
-    fill(raster, pixels, value, scratch.crossings, True)
+    fill(raster, pixels, value, True)
