@@ -5,7 +5,13 @@ import numpy as np
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.sim.dynamics.idm import idm_step
-from shiftsim.sim.traffic.idm.lead import OFF_PATH, find_lead
+from shiftsim.sim.traffic.idm.lead import (
+    FREE,
+    corridor_ahead,
+    find_lead,
+    in_corridor,
+    stop_line_gap,
+)
 from shiftsim.sim.traffic.idm.paths import (
     extend_route,
     move_agent,
@@ -13,7 +19,8 @@ from shiftsim.sim.traffic.idm.paths import (
     set_box,
 )
 from shiftsim.sim.traffic.idm.scene import PROGRESS, Fleet, Row, Scene
-from shiftsim.sim.traffic.idm.yielding import place_ego_ahead
+from shiftsim.sim.traffic.idm.yielding import ignores_ego_ahead, place_ego_ahead
+from shiftsim.sim.traffic.lanes import RED
 from shiftsim.world.state import HEADING as EGO_HEADING
 from shiftsim.world.state import PACIFICA, VX, VY, YAW_RATE
 
@@ -33,7 +40,7 @@ def advance(scene: Scene, row: Row, ego: FloatArray, span: float) -> tuple[int, 
         agent that is outside of its own corridor.
     """
     fleet, footprints, num_agents = scene.fleet, scene.footprints, len(scene.agents)
-    parameters, graph = scene.parameters, scene.graph
+    parameters, graph, scratch = scene.parameters, scene.graph, scene.scratch
     heading = ego[EGO_HEADING]
     x = ego[0] + _EGO_CENTER * np.cos(heading)
     y = ego[1] + _EGO_CENTER * np.sin(heading)
@@ -59,15 +66,30 @@ def advance(scene: Scene, row: Row, ego: FloatArray, span: float) -> tuple[int, 
         if not fleet.alive[agent]:
             continue
         # nuPlan rule 123: agents move one after the other, and see where those before them went
-        lead, gap = find_lead(scene, agent)
-        if lead == OFF_PATH:
-            return LEFT_PATH, agent
+        path, size, progress = fleet.path[agent], fleet.path_size[agent], fleet.progress[agent]
+        path_end, half_width = path[size - 1, PROGRESS], 0.5 * fleet.size[agent, 1]
+        corridor = corridor_ahead(path, size, progress, half_width, scratch)
+        if not progress < path_end and not in_corridor(footprints, agent, corridor, scratch):
+            return LEFT_PATH, agent  # nuPlan rule 128
+        ignored, ahead = FREE, num_agents + 1
+        if (
+            footprints.present[ahead]
+            and in_corridor(footprints, ahead, corridor, scratch)
+            and ignores_ego_ahead(scene, agent)
+        ):
+            ignored = ahead
+        lead, gap = find_lead(footprints, agent, ignored, corridor, scratch)
+        for segment in range(fleet.route_size[agent]):
+            edge = fleet.route[agent, segment]
+            if graph.lights[edge] & RED:
+                stop_gap = stop_line_gap(scene, agent, edge, corridor, gap)
+                if stop_gap < gap:
+                    lead, gap = len(footprints.present), stop_gap
         heading = fleet.pose[agent, 2]
         lead_speed, lead_heading = 0.0, heading
-        if lead < 0:
+        if lead == FREE:
             # nuPlan rule 124: on a free road the agent brakes for the end of its path
-            path_end = fleet.path[agent, fleet.path_size[agent] - 1, PROGRESS]
-            gap = path_end - fleet.progress[agent] - 0.5 * fleet.size[agent, 0]
+            gap = path_end - progress - 0.5 * fleet.size[agent, 0]
         elif lead < num_agents:
             lead_speed, lead_heading = fleet.speed[lead], fleet.pose[lead, 2]
         elif lead <= num_agents + 1 and not scene.yielding.cautious[agent]:
@@ -89,7 +111,7 @@ def advance(scene: Scene, row: Row, ego: FloatArray, span: float) -> tuple[int, 
         )
         fleet.progress[agent] += distance
         fleet.speed[agent] = max(speed, 0.0)
-        move_agent(fleet, footprints, scene.scratch.line, parameters.headway, agent)
+        move_agent(fleet, footprints, scratch.line, parameters.headway, agent)
     write_agents(fleet, scene.agents, row)
     return DONE, 0
 
