@@ -333,35 +333,3 @@ def centroid(ring: FloatArray) -> tuple[float, float]:
         y += double * (oy + ay + by)
         area += double
     return x / 3.0 / area, y / 3.0 / area
-
-
-@kernel
-def ring_segment_distance(
-    ring: FloatArray, a: FloatArray, b: FloatArray, limit: float, starts_outside: bool
-) -> float:
-    """Distance between the area of a simple ring (V, 2) and the segment a-b, points (2,) [m].
-
-    Infinite where it is more than `limit`. `starts_outside` where a is known to be outside.
-    """
-    if not starts_outside and locate_in_ring(ring, a[0], a[1]) != EXTERIOR:
-        return 0.0
-    low_x, high_x = min(a[0], b[0]) - limit, max(a[0], b[0]) + limit
-    low_y, high_y = min(a[1], b[1]) - limit, max(a[1], b[1]) + limit
-    best = np.inf
-    before = len(ring) - 1
-    for index in range(len(ring)):
-        c, d = ring[before], ring[index]
-        before = index
-        if (
-            max(c[0], d[0]) < low_x
-            or min(c[0], d[0]) > high_x
-            or max(c[1], d[1]) < low_y
-            or min(c[1], d[1]) > high_y
-        ):
-            continue
-        if segments_intersect(a, b, c, d):
-            return 0.0
-        best = min(best, point_segment_distance(a[0], a[1], c[0], c[1], d[0], d[1]))
-        best = min(best, point_segment_distance(b[0], b[1], c[0], c[1], d[0], d[1]))
-        best = min(best, point_segment_distance(d[0], d[1], a[0], a[1], b[0], b[1]))
-    return best if best <= limit else np.inf

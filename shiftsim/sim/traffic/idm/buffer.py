@@ -36,18 +36,22 @@ def buffer_curve(line: FloatArray, distance: float, out: FloatArray) -> int:
     """
     count = 0
     for side in range(2):  # the left of the line, and the left of the way back
-        points = line[_simplify(line, distance * _SIMPLIFY, side == 0)]
+        keep = _simplify(line, distance * _SIMPLIFY, side == 0)
+        seen = 0
         x0 = y0 = x1 = y1 = x2 = y2 = 0.0
         vx = vy = ux = uy = 0.0  # from the segments before and after x1, y1 to their offsets
-        for index in range(len(points)):
-            at = index if side == 0 else len(points) - 1 - index
-            x0, y0, x1, y1, x2, y2 = x1, y1, x2, y2, points[at, 0], points[at, 1]
-            if index == 0:
+        for index in range(len(line)):
+            at = index if side == 0 else len(line) - 1 - index
+            if not keep[at]:
+                continue
+            x0, y0, x1, y1, x2, y2 = x1, y1, x2, y2, line[at, 0], line[at, 1]
+            seen += 1
+            if seen == 1:
                 continue
             dx, dy = x2 - x1, y2 - y1
             length = np.sqrt(dx * dx + dy * dy)
             vx, vy, ux, uy = ux, uy, -distance * dy / length, distance * dx / length
-            turn = orientation(x0, y0, x1, y1, x2, y2) if index > 1 else 0
+            turn = orientation(x0, y0, x1, y1, x2, y2) if seen > 2 else 0
             if turn == 0:
                 continue
             is_narrow = np.sqrt((vx - ux) ** 2 + (vy - uy) ** 2) < distance * _NARROW_TURN
@@ -94,8 +98,8 @@ def _simplify(line: FloatArray, tolerance: float, left: bool) -> BoolArray:
     concave, size = 1 if left else -1, len(line)
     keep = np.ones(size, np.bool_)
     for vertex in range(1, size):
-        before = line[vertex - 1]
-        keep[vertex] = line[vertex, 0] != before[0] or line[vertex, 1] != before[1]
+        is_moved_x = line[vertex, 0] != line[vertex - 1, 0]
+        keep[vertex] = is_moved_x or line[vertex, 1] != line[vertex - 1, 1]
     changed = True
     while changed:
         changed = False

@@ -7,20 +7,15 @@ and exact predicates decide whether two edges meet.
 
 import numpy as np
 
-from shiftsim.geometry.rings import orientation, point_segment_distance, segments_meet
+from shiftsim.geometry.rings import (
+    orientation,
+    point_segment_distance,
+    ring_bounds,
+    segments_meet,
+)
 from shiftsim.kernels import FloatArray, kernel
 
 _ROUNDING = 1.0 + 1e-9  # factor on a square below which bounds of distances are equal
-
-
-@kernel
-def bound_ring(ring: FloatArray, bounds: FloatArray) -> None:
-    """Widen `bounds` (4,) min x, min y, max x, max y by a ring (V, 2)."""
-    for vertex in range(len(ring)):
-        bounds[0] = min(bounds[0], ring[vertex, 0])
-        bounds[1] = min(bounds[1], ring[vertex, 1])
-        bounds[2] = max(bounds[2], ring[vertex, 0])
-        bounds[3] = max(bounds[3], ring[vertex, 1])
 
 
 @kernel
@@ -45,19 +40,12 @@ def winds_around(ring: FloatArray, x: float, y: float) -> bool:
 @kernel
 def ring_gap(a: FloatArray, b: FloatArray, limit: float) -> float:
     """Distance between what two rings (V, 2) enclose, at most `limit`; 0 where they meet [m]."""
-    low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
-    for vertex in range(len(b)):
-        low_x, high_x = min(low_x, b[vertex, 0]), max(high_x, b[vertex, 0])
-        low_y, high_y = min(low_y, b[vertex, 1]), max(high_y, b[vertex, 1])
+    low_x, low_y, high_x, high_y = ring_bounds(b)
     # two vertices that are close to one another give a bound, which makes the search short
-    x, y, square = a[0, 0], a[0, 1], np.inf
-    for ring in (b, a, b, a, b):
-        square, nearest = np.inf, 0
-        for vertex in range(len(ring)):
-            apart = (ring[vertex, 0] - x) ** 2 + (ring[vertex, 1] - y) ** 2
-            if apart < square:
-                square, nearest = apart, vertex
-        x, y = ring[nearest, 0], ring[nearest, 1]
+    x, y, _ = _nearest_vertex(b, a[0, 0], a[0, 1])
+    x, y, _ = _nearest_vertex(a, x, y)
+    x, y, _ = _nearest_vertex(b, x, y)
+    _, _, square = _nearest_vertex(a, x, y)
     best = min(limit, np.sqrt(square) * (1.0 + 1e-12))
     px, py = a[-1, 0], a[-1, 1]
     for edge in range(len(a)):
@@ -80,3 +68,15 @@ def ring_gap(a: FloatArray, b: FloatArray, limit: float) -> float:
     if winds_around(b, a[0, 0], a[0, 1]) or winds_around(a, b[0, 0], b[0, 1]):
         return 0.0
     return best
+
+
+@kernel
+def _nearest_vertex(ring: FloatArray, x: float, y: float) -> tuple[float, float, float]:
+    """The vertex of a ring (V, 2) nearest to a point: x, y [m], and the squared distance [m^2]."""
+    square, nearest = np.inf, 0
+    for vertex in range(len(ring)):
+        dx, dy = ring[vertex, 0] - x, ring[vertex, 1] - y
+        apart = dx * dx + dy * dy
+        if apart < square:
+            square, nearest = apart, vertex
+    return ring[nearest, 0], ring[nearest, 1], square

@@ -10,9 +10,9 @@ import numpy as np
 
 from shiftsim.geometry.boxes import box_corners, wrap_angle
 from shiftsim.geometry.polylines import interpolate, vertex_heading
+from shiftsim.geometry.rings import ring_bounds
 from shiftsim.kernels import FloatArray, kernel
 from shiftsim.sim.traffic.idm.buffer import buffer_curve
-from shiftsim.sim.traffic.idm.gaps import bound_ring
 from shiftsim.sim.traffic.idm.scene import (
     HEADING,
     MAX_ROUTE,
@@ -21,7 +21,6 @@ from shiftsim.sim.traffic.idm.scene import (
     Footprints,
     IdmParameters,
     LaneGraph,
-    Scene,
 )
 from shiftsim.sim.traffic.lanes import GREEN, RED
 from shiftsim.world.lanes import initial_curvature
@@ -91,18 +90,11 @@ def first_after(path: FloatArray, size: int, progress: float) -> int:
 def pose_on_path(path: FloatArray, size: int, progress: float) -> tuple[float, float, float]:
     """Pose x [m], y [m], heading [rad] at a progress within the path; heading wrapped."""
     index = min(max(first_after(path, size, progress), 1), size - 1)
-    before, after = path[index - 1], path[index]
-    span, along = after[PROGRESS] - before[PROGRESS], progress - before[PROGRESS]
-    x = interpolate(before[0], after[0], span, along)
-    y = interpolate(before[1], after[1], span, along)
-    return x, y, wrap_angle(interpolate(before[HEADING], after[HEADING], span, along))
-
-
-@kernel
-def point_on_path(path: FloatArray, size: int, progress: float) -> tuple[float, float]:
-    """Point x, y [m] at a progress within the path, as in `pose_on_path`."""
-    index = min(max(first_after(path, size, progress), 1), size - 1)
-    return _point_before(path, index, progress)
+    start = path[index - 1, PROGRESS]
+    span, along = path[index, PROGRESS] - start, progress - start
+    heading = interpolate(path[index - 1, HEADING], path[index, HEADING], span, along)
+    x, y = _point_before(path, index, progress)
+    return x, y, wrap_angle(heading)
 
 
 @kernel
@@ -140,11 +132,8 @@ def extend_route(fleet: Fleet, agent: int, graph: LaneGraph, parameters: IdmPara
         0, or how many vertices a path needs where they do not fit; to be called again then.
     """
     path = fleet.path[agent]
-    while True:
+    while needs_longer_path(fleet, agent, parameters):
         size = fleet.path_size[agent]
-        wanted = parameters.min_path_length + fleet.target[agent] * parameters.headway
-        if not path[size - 1, PROGRESS] - fleet.progress[agent] < wanted:
-            return 0
         chosen = choose_successor(graph, fleet.route[agent, fleet.route_size[agent] - 1])
         if chosen < 0:
             return 0
@@ -162,6 +151,15 @@ def extend_route(fleet: Fleet, agent: int, graph: LaneGraph, parameters: IdmPara
             last -= 1
         route[last] = chosen
         fleet.route_size[agent] = last + 1
+    return 0
+
+
+@kernel
+def needs_longer_path(fleet: Fleet, agent: int, parameters: IdmParameters) -> bool:
+    """Whether the path of an agent is too short for its speed."""
+    path_end = fleet.path[agent, fleet.path_size[agent] - 1, PROGRESS]
+    wanted = parameters.min_path_length + fleet.target[agent] * parameters.headway
+    return path_end - fleet.progress[agent] < wanted
 
 
 @kernel
@@ -197,11 +195,23 @@ def set_box(
     width: float,
 ) -> None:
     """Put something where its box is, without a path ahead."""
-    box, bounds = footprints.box[index], footprints.bounds[index]
+    box, bounds = footprints.box[index], footprints.bounds
     box_corners(x, y, heading, length, width, box)
     footprints.present[index] = True
-    bounds[0], bounds[1], bounds[2], bounds[3] = x, y, x, y
-    bound_ring(box, bounds)
+    bounds[index, 0], bounds[index, 1], bounds[index, 2], bounds[index, 3] = ring_bounds(box)
+
+
+@kernel
+def add_curve(footprints: Footprints, index: int, line: FloatArray, distance: float) -> None:
+    """Add the buffer of a line (K, 2) to the box of an agent or of the ego ahead."""
+    bounds, curve = footprints.bounds, footprints.curve[index]
+    size = buffer_curve(line, distance, curve)
+    footprints.curve_size[index] = size
+    low_x, low_y, high_x, high_y = ring_bounds(curve[:size])
+    bounds[index, 0] = min(bounds[index, 0], low_x)
+    bounds[index, 1] = min(bounds[index, 1], low_y)
+    bounds[index, 2] = max(bounds[index, 2], high_x)
+    bounds[index, 3] = max(bounds[index, 3], high_y)
 
 
 @kernel
@@ -222,22 +232,22 @@ def cut_path(path: FloatArray, size: int, start: float, stop: float, line: Float
         line[count, 0], line[count, 1] = path[after, 0], path[after, 1]
         count += 1
         after += 1
-    line[count, 0], line[count, 1] = point_on_path(path, size, last)
+    after = min(max(first_after(path, size, last), 1), size - 1)
+    line[count, 0], line[count, 1] = _point_before(path, after, last)
     return count + 1
 
 
 @kernel
-def move_agent(scene: Scene, agent: int) -> None:
-    """Pose and footprint of an agent from its progress."""
-    fleet, footprints, line = scene.fleet, scene.footprints, scene.scratch.line
+def move_agent(
+    fleet: Fleet, footprints: Footprints, line: FloatArray, headway: float, agent: int
+) -> None:
+    """Pose and footprint of an agent from its progress; `line` (K, 2) is scratch."""
     path, size = fleet.path[agent], fleet.path_size[agent]
     progress = fleet.progress[agent]
     x, y, heading = pose_on_path(path, size, clamp_progress(path, size, progress))
     fleet.pose[agent, 0], fleet.pose[agent, 1], fleet.pose[agent, 2] = x, y, heading
     length, width = fleet.size[agent, 0], fleet.size[agent, 1]
     set_box(footprints, agent, x, y, heading, length, width)
-    front = progress + 0.5 * length + fleet.speed[agent] * scene.parameters.headway
+    front = progress + 0.5 * length + fleet.speed[agent] * headway
     points = cut_path(path, size, progress - 0.5 * length, front, line)
-    curve = footprints.curve[agent]
-    footprints.curve_size[agent] = buffer_curve(line[:points], 0.5 * width, curve)
-    bound_ring(curve[: footprints.curve_size[agent]], footprints.bounds[agent])
+    add_curve(footprints, agent, line[:points], 0.5 * width)

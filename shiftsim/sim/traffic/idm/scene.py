@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from shiftsim.geometry.polylines import runs_of
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.sim.traffic.idm.buffer import curve_capacity
 from shiftsim.world.layers import Lists, Polygons, Polylines
@@ -83,6 +84,7 @@ class Scratch(NamedTuple):
     """Room for intermediate results of one agent."""
 
     line: FloatArray  # (K, 2) a piece of a path [m]
+    runs: FloatArray  # (R, 4) bounds of its runs of segments, as in `Path` [m]
     outline: FloatArray  # (V, 2) outline of its buffer [m]
     outline_size: IntArray  # (1,) how many of its vertices count; -1 before it is made
 
@@ -169,8 +171,8 @@ def _make_curves(fleet: Fleet) -> FloatArray:
 
 def _make_scratch(fleet: Fleet) -> Scratch:
     points = fleet.path.shape[1] + _EXTRA_POINTS
-    outline = np.zeros((curve_capacity(points), 2))
-    return Scratch(np.zeros((points, 2)), outline, np.zeros(1, np.int64))
+    runs, outline = np.zeros((runs_of(points), 4)), np.zeros((curve_capacity(points), 2))
+    return Scratch(np.zeros((points, 2)), runs, outline, np.zeros(1, np.int64))
 
 
 def with_longer_paths(scene: Scene, needed: int) -> Scene:

@@ -9,9 +9,8 @@ import random
 import numpy as np
 
 from shiftsim.kernels import BoolArray, kernel
-from shiftsim.sim.traffic.idm.buffer import buffer_curve
-from shiftsim.sim.traffic.idm.gaps import bound_ring, ring_gap
-from shiftsim.sim.traffic.idm.paths import set_box
+from shiftsim.sim.traffic.idm.gaps import ring_gap
+from shiftsim.sim.traffic.idm.paths import add_curve, set_box
 from shiftsim.sim.traffic.idm.scene import Scene, Yielding
 from shiftsim.world.events import ASSERTIVE, DEFAULT, MIXED, OFF
 from shiftsim.world.layers import contains
@@ -71,9 +70,7 @@ def place_ego_ahead(scene: Scene, x: float, y: float, heading: float, vx: float,
     else:
         line[2, 0] += reach * cos
         line[2, 1] += reach * sin
-    curve = footprints.curve[place]
-    footprints.curve_size[place] = buffer_curve(line[:count], reach, curve)
-    bound_ring(curve[: footprints.curve_size[place]], footprints.bounds[place])
+    add_curve(footprints, place, line[:count], reach)
 
 
 @kernel
