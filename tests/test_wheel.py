@@ -11,7 +11,7 @@ import zipfile
 import pytest
 from places import REPOSITORY
 
-from shiftsim.data.demo.store import demo_store
+from shiftsim.data.synthetic.store import demo_store
 from shiftsim.planners.table import SHIPPED_NOTE
 
 MOST = 3.0e6  # bytes, without weights

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from strategies import rigid_motions
 from worlds import cruise_scenario, moved, standing_tracks, straight_road
 
-from shiftsim.data.demo.store import bench_scene
+from shiftsim.benchmarks.speed.city import bench_scene
 from shiftsim.planners.learned.diffusion.features import (
     FeatureBuilder,
     agent_features,
