@@ -61,14 +61,16 @@ def filter_signal(values: FloatArray, how: Filter, scale: float, out: FloatArray
     interior, fit = how.interior, how.fit
     count, window = len(values), len(fit)
     half = window // 2
+    middle, tail = out[half : count - half], out[count - half :]
+    moved, tail_fit = values[half - (window - 1) // 2 :], fit[:, window - half :]
     out[:] = 0.0
     for j in range(window):
+        first, weight, last = values[j], interior[j], values[count - window + j]
         for n in range(half):
-            out[n] += fit[j, n] * values[j]
-        for n in range(half, count - half):
-            out[n] += interior[j] * values[n - (window - 1) // 2 + j]
-        for n in range(count - half, count):
-            out[n] += fit[j, n - count + window] * values[count - window + j]
+            out[n] += fit[j, n] * first
+            tail[n] += tail_fit[j, n] * last
+        for n in range(len(middle)):
+            middle[n] += weight * moved[n + j]
     for n in range(count):
         # nuPlan rule 81: rounded between smoothing and differentiation, and before comparison
         out[n] = np.rint(out[n] / scale * 1e8) / 1e8
