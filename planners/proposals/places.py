@@ -162,11 +162,25 @@ def _locate(
                             x, y = points[point, 0], points[point, 1]
                             if y < runs[run, 0] or y > runs[run, 1] or x > runs[run, 2]:
                                 continue
-                            is_odd, on_edge = ray_crossings(xy, before, start, stop, x, y)
-                            if on_edge:
-                                on_boundary |= 1 << point
-                            elif is_odd:
-                                within ^= 1 << point
+                            px, py = xy[before, 0], xy[before, 1]
+                            for vertex in range(start, stop):
+                                qx, qy = xy[vertex, 0], xy[vertex, 1]
+                                if not (min(py, qy) > y or max(py, qy) < y or max(px, qx) < x):
+                                    is_odd, on_edge = (py > y) != (qy > y), False
+                                    if not is_odd or min(px, qx) <= x:
+                                        is_odd, on_edge = ray_crossings(
+                                            xy,
+                                            before if vertex == start else vertex - 1,
+                                            vertex,
+                                            vertex + 1,
+                                            x,
+                                            y,
+                                        )
+                                    if on_edge:
+                                        on_boundary |= 1 << point
+                                    elif is_odd:
+                                        within ^= 1 << point
+                                px, py = qx, qy
                 within &= ~on_boundary
                 if within & _MIDDLE:
                     limit = max(limit, limits[area])
