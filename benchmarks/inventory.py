@@ -5,7 +5,7 @@ Everything is a plain value, for `shiftsim data --json`; nothing is converted, d
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TypedDict
+from typing import Any, TypeAlias
 
 from shiftsim.benchmarks import TRACKS, known_sets, load_track
 from shiftsim.data.store.reading import ScenarioStore, open_store
@@ -23,54 +23,20 @@ _REMEDIES = {  # of what a track drives: how to make it
 }
 
 
-class Set(TypedDict):
-    """A list of scenarios in a store: all of them, or a split."""
-
-    name: str  # STORE, or STORE:SPLIT
-    scenarios: int
-    known: str  # name of the known list that this is, or empty
+Row: TypeAlias = dict[str, Any]
 
 
-class Store(TypedDict):
-    """A store that is there."""
+def list_available_data() -> Row:
+    """Look through the folders of stores and of checkpoints.
 
-    name: str
-    path: str
-    maps: list[str]  # cities
-    sets: list[Set]  # the whole store first
-    problem: str  # why it cannot be opened, or empty
-
-
-class Missing(TypedDict):
-    """Something that a row of a benchmark lacks."""
-
-    what: str
-    get: str  # the command that makes it, or where it is described
-    page: str  # of the documentation
-
-
-class Row(TypedDict):
-    """A planner of a track."""
-
-    track: str
-    planner: str
-    reference: str  # the set that is the track's published list, empty, or "–" where it has none
-    own: list[str]  # sets that may be driven as one's own scenarios
-    missing: list[Missing]
-
-
-class Inventory(TypedDict):
-    """All that was found."""
-
-    store_folder: str
-    stores: list[Store]
-    checkpoint_folder: str
-    checkpoints: dict[str, str]  # planner: what is missing to run it, or empty
-    rows: list[Row]
-
-
-def list_available_data() -> Inventory:
-    """Look through the folders of stores and of checkpoints."""
+    Returns:
+        `store_folder` and `stores`: each with `name`, `path`, `maps` (cities), `problem` (why it
+        cannot be opened) and `sets` (the whole store first, then splits: `name`, `scenarios`, and
+        the `known` list that it is); `checkpoint_folder` and `checkpoints`: what a planner lacks,
+        or empty; `rows`: a `planner` of a `track`, the set that is its published list (`reference`,
+        "–" where it has none), sets of `own` scenarios, and what is `missing`: `what`, the command
+        to `get` it, and the `page` of the documentation.
+    """
     folder = store_path("demo").parent
     stores = [_store(path.parent) for path in sorted(folder.glob("*/store.json"))]
     learned = {name: entry for name, entry in PLANNERS.items() if entry.checkpoint}
@@ -83,8 +49,8 @@ def list_available_data() -> Inventory:
     }
 
 
-def _store(path: Path) -> Store:
-    found = Store(name=path.name, path=str(path), maps=[], sets=[], problem="")
+def _store(path: Path) -> Row:
+    found: Row = {"name": path.name, "path": str(path), "maps": [], "sets": [], "problem": ""}
     try:
         store = open_store(path)
         found["maps"], found["sets"] = list(store.cities), list(_sets(store))
@@ -93,7 +59,7 @@ def _store(path: Path) -> Store:
     return found
 
 
-def _sets(store: ScenarioStore) -> Iterator[Set]:
+def _sets(store: ScenarioStore) -> Iterator[Row]:
     """The whole store, and its splits as far as it has all of their scenarios."""
     digests = {known.sha256: known.name for known in known_sets()}
     names = ["", *(file.stem for file in sorted(store.path.glob("splits/*.toml")))]
@@ -102,10 +68,10 @@ def _sets(store: ScenarioStore) -> Iterator[Set]:
         if all(token in store for token in tokens):
             known = digests.get(token_digest(tokens), "")
             full = f"{store.path.name}:{name}" if name else store.path.name
-            yield Set(name=full, scenarios=len(tokens), known=known)
+            yield {"name": full, "scenarios": len(tokens), "known": known}
 
 
-def _rows(track: str, stores: list[Store]) -> Iterator[Row]:
+def _rows(track: str, stores: list[Row]) -> Iterator[Row]:
     wanted = load_track(track)
     sets = [one for store in stores for one in store["sets"]]
     listed = wanted.reference
@@ -115,12 +81,18 @@ def _rows(track: str, stores: list[Store]) -> Iterator[Row]:
         missing = []
         if listed and not reference:
             label = f"{listed.label} ({listed.count} scenarios)"
-            missing.append(Missing(what=label, get=_REMEDIES[listed.name], page=_PAGE))
+            missing.append(dict(what=label, get=_REMEDIES[listed.name], page=_PAGE))
         if not own:
-            missing.append(Missing(what=OWN, get=_REMEDIES[OWN], page=_PAGE))
+            missing.append(dict(what=OWN, get=_REMEDIES[OWN], page=_PAGE))
         entry, page = PLANNERS[planner], "docs/learned_planners.md"
         if (lack := readiness(entry)) and (file := entry.checkpoint):
             get = f"{lack}; it is {file.file} of the project {file.project}"
-            missing.append(Missing(what=f"planner {planner}", get=get, page=page))
+            missing.append(dict(what=f"planner {planner}", get=get, page=page))
         first = reference[0] if reference else "" if listed else "–"
-        yield Row(track=track, planner=planner, reference=first, own=own, missing=missing)
+        yield {
+            "track": track,
+            "planner": planner,
+            "reference": first,
+            "own": own,
+            "missing": missing,
+        }

@@ -84,7 +84,7 @@ def compute_metrics(
 
     Example:
         ```python
-        scenario = shiftsim.open_store("demo")["03b23c"]
+        scenario = shiftsim.open_store("demo")["01f13e"]
         result = shiftsim.score(shiftsim.simulate(scenario, "idm"), scenario.map)
         print(result.score, result.scores)
         ```

@@ -75,7 +75,7 @@ def check_planner(planner: Any, scenario: Scenario, other: Scenario | None = Non
 
     Example:
         ```python
-        scenario = shiftsim.open_store("demo")["03b23c"]
+        scenario = shiftsim.open_store("demo")["01f13e"]
         for found in shiftsim.check_planner(shiftsim.load_planner("idm"), scenario):
             print(found.severity, found.message)
         ```

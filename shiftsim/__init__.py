@@ -41,13 +41,12 @@ _DEPRECATED = {
     "shiftsim.data.lanes": "shiftsim.data.maps",
     "shiftsim.data.lanes.map": "shiftsim.data.maps.build",
     "shiftsim.data.lanes.pieces": "shiftsim.data.maps.segments",
-    "shiftsim.data.maps.segments:LanePiece": "shiftsim.data.maps.segments:LaneSegment",
     "shiftsim.data.opendrive": "shiftsim.data.maps.opendrive",
     "shiftsim.data.opendrive.map": "shiftsim.data.maps.opendrive.map",
     "shiftsim.data.opendrive.reading": "shiftsim.data.maps.opendrive.reading",
     "shiftsim.data.tracks": "shiftsim.data.readers.tracks",
-    "shiftsim.data.tracks.build": "shiftsim.data.readers.tracks.build",
-    "shiftsim.data.tracks.scenarios": "shiftsim.data.readers.tracks.scenarios",
+    "shiftsim.data.tracks.build": "shiftsim.data.readers.build",
+    "shiftsim.data.tracks.scenarios": "shiftsim.data.readers.scenarios",
 }
 
 

@@ -220,7 +220,7 @@ def simulate(
 
     Example:
         ```python
-        scenario = shiftsim.open_store("demo")["03b23c"]
+        scenario = shiftsim.open_store("demo")["01f13e"]
         log = shiftsim.simulate(scenario, "idm", noise="ou-high")
         ```
     """
@@ -238,7 +238,7 @@ def open_store(name: str | Path) -> ScenarioStore:
     Example:
         ```python
         store = shiftsim.open_store("demo")
-        scenario = store["03b23c"]  # a token, or its beginning
+        scenario = store["01f13e"]  # a token, or its beginning
         print(len(store), store.cities, scenario)
         ```
     """

@@ -6,7 +6,6 @@ from importlib import import_module
 from types import ModuleType
 
 _MAX_TEXT = 100_000  # characters
-_MAX_MESSAGE = 1000  # characters
 
 
 class ShiftsimError(Exception):
@@ -26,12 +25,8 @@ class ShiftsimError(Exception):
     """
 
     def __init__(self, message: str, hint: str = "") -> None:
-        message = str(message)  # Gymnasium makes an error of an error
-        if len(message) > _MAX_MESSAGE or "\n" in message:  # with texts of other libraries in it
-            message = " ".join(message.split())
-        if len(message) > _MAX_MESSAGE:
-            message = f"{message[:700]} … {message[-250:]}"
-        self.message, self.hint = message, hint
+        # one line, also with the text of another library in it; Gymnasium gives an error here
+        self.message, self.hint = " ".join(str(message).splitlines()), hint
         super().__init__(self.message)
 
     def __str__(self) -> str:
@@ -92,14 +87,8 @@ def import_extra(module: str, extra: str) -> ModuleType:
 
 
 def readable(value: object) -> str:
-    """A value as text that every file can hold, whatever its `__str__` does; cut where too long."""
-    try:
-        text = str(value)
-    except (Exception, SystemExit) as error:
-        text = (
-            f"{type(value).__name__}, which has no text: its __str__ raises {type(error).__name__}"
-        )
-    return text[:_MAX_TEXT].encode("utf-8", "backslashreplace").decode()
+    """A value as text that every file can hold; cut where too long."""
+    return str(value)[:_MAX_TEXT].encode("utf-8", "backslashreplace").decode()
 
 
 def one_of(what: str, value: str, choices: Iterable[str]) -> str:

@@ -2,8 +2,7 @@
 
 Nothing else in the project looks at environment variables for folders, and no file is ever seen
 half written: `atomic_write` is the one way to replace one. What a file that may be anybody's names
-is looked for inside its folder only, with `safe_join`. `sources` says what a module of ours is made
-of, so that caches and runs notice when it changes.
+is looked for inside its folder only, with `safe_join`.
 """
 
 import json
@@ -12,7 +11,7 @@ import re
 import sys
 import tomllib
 import traceback
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import import_module
@@ -161,9 +160,6 @@ def read_toml(path: Path) -> dict[str, Any]:
         ) from error
 
 
-_IMPORTING: list[str] = []  # modules of the user that are being imported
-
-
 def import_named(module: str) -> ModuleType:
     """A module by its name, or by its file, `folder/name.py`.
 
@@ -172,25 +168,19 @@ def import_named(module: str) -> ModuleType:
 
     Raises:
         ImportError: There is none, it fails, or it ends the process.
-        ConfigError: It starts a run.
     """
     name, folder = (module, Path.cwd()) if not module.endswith(".py") else _module_of(Path(module))
     own = not name.startswith("shiftsim.")
     if own and str(folder) not in sys.path:
         sys.path.append(str(folder))
-    _IMPORTING.append(module)
     try:
         found = import_module(name)
-    except (ImportError, ConfigError):
+    except ImportError:
         raise
-    except SystemExit as error:  # else the command would end as if all were well
-        raise ImportError(f"it leaves with SystemExit: {error.code}", name=name) from error
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         where = place_of(error)
         text = f"{type(error).__name__}: {error}{where and f' ({where})'}"
         raise ImportError(text, name=name) from error
-    finally:
-        _IMPORTING.pop()
     if module.endswith(".py") and not Path(module).samefile(found.__file__ or ""):
         raise ImportError(f"{name!r} is the name of {found.__file__}; rename the file", name=name)
     return found
@@ -204,19 +194,6 @@ def _module_of(file: Path) -> tuple[str, Path]:
     while (folder / "__init__.py").is_file():
         folder, name = folder.parent, f"{folder.name}.{name}"
     return name, folder
-
-
-def require_no_import() -> None:
-    """Refuse to start a run from a module that is being imported for one.
-
-    Raises:
-        ConfigError: There is such a module.
-    """
-    if _IMPORTING:
-        raise ConfigError(
-            f"{_IMPORTING[-1]!r} starts a run while it is imported",
-            hint="put what is to run as a script below: if __name__ == '__main__':",
-        )
 
 
 def place_of(error: BaseException) -> str:
@@ -242,18 +219,6 @@ def load_attribute(what: str, name: str, hint: str) -> Any:
         return getattr(import_named(module), attribute)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"{what} {name!r} cannot be imported: {error}", hint) from error
-
-
-def sources(paths: Iterable[Path]) -> dict[str, bytes]:
-    """Modules of ours, below `PACKAGE`, and all that they import: their text by path."""
-    waiting = [path.relative_to(PACKAGE).as_posix() for path in paths]
-    found = dict[str, bytes]()
-    while waiting:
-        name = waiting.pop()
-        if name not in found:
-            found[name], imported = read_module(name)
-            waiting += imported
-    return found
 
 
 @cache

@@ -46,7 +46,8 @@ class Process:
         ours, theirs = socket.socketpair()
         with ours, theirs:
             words = [*words, str(os.getpid()), str(theirs.fileno())]
-            options: dict[str, Any] = {"env": env}
+            # what is printed there is not output of the command
+            options: dict[str, Any] = {"env": env, "stdout": sys.__stderr__}
             if sys.platform == "win32":
                 options["creationflags"] = subprocess.CREATE_NEW_PROCESS_GROUP
                 self.popen = subprocess.Popen(words, stdin=subprocess.PIPE, **options)

@@ -20,10 +20,9 @@ import numpy as np
 from parity_cases import Cases, File, Scenes, read_file
 
 from shiftsim.data.nuplan.scenarios import find_maps
+from shiftsim.planners.learned.checkpoint import network_module
 from shiftsim.planners.learned.deterministic import deterministic_state, keyed_normals, rule_of
-from shiftsim.planners.learned.features import PLAN_POSES
-from shiftsim.planners.learned.match import network_module
-from shiftsim.planners.learned.plan_states import STEP
+from shiftsim.planners.learned.features import PLAN_POSES, STEP
 from shiftsim.sim.loop import Rollout
 from shiftsim.sim.planner import past_rows
 from shiftsim.world import state
@@ -35,6 +34,53 @@ FILE_COLUMNS = (*state.STATE_COLUMNS[:9], "angular_velocity", "angular_accelerat
 # how one official planner fails where it has no reference line; ours falls back there
 FAILURE = "ValueError: zero-size array to reduction operation maximum which has no identity"
 ANY = "*"  # ends a text of a manifest that may go on in any way
+PREFIXES = {"plantf": "model.", "pluto": "model.", "carl": ""}  # of names in published checkpoints
+_PERCEPTION = {
+    "dim": 128,
+    "state_channel": 6,
+    "polygon_channel": 6,
+    "history_channel": 9,
+    "history_steps": 21,
+    "future_steps": PLAN_POSES,
+    "encoder_depth": 4,
+    "drop_path": 0.2,
+    "state_dropout": 0.75,
+    "use_ego_history": False,
+    "state_attn_encoder": True,
+}
+HYPER_PARAMETERS = {
+    "plantf": {**_PERCEPTION, "num_heads": 8, "num_modes": 6},
+    "pluto": {
+        **_PERCEPTION,
+        "decoder_depth": 4,
+        "dropout": 0.1,
+        "num_heads": 4,
+        "num_modes": 12,
+        "use_hidden_proj": True,
+        "cat_x": True,
+        "ref_free_traj": True,
+    },
+    "carl": {
+        "image_encoder": "roach_ln2",
+        "in_channels": 9,
+        "image": [256, 256],
+        "use_layer_norm": True,
+        "use_layer_norm_policy_head": True,
+        "features_dim": 256,
+        "states_neurons": [256, 256],
+        "policy_head_arch": [256, 256],
+        "value_head_arch": [256, 256],
+        "obs_num_measurements": 10,
+        "num_value_measurements": 4,
+        "distribution": "beta",
+        "beta_min_a_b_value": 1.0,
+        "action_dim": 2,
+        "action_low": -1.0,
+        "action_high": 1.0,
+        "use_lstm": False,
+        "layer_norm_eps": 1e-5,
+    },
+}
 
 
 @cache
@@ -92,7 +138,7 @@ def compare_manifest(
                 "shape": tensor.shape,
                 "dtype": str(tensor.dtype),
                 "kind": "parameter" if name in trained else "buffer",
-                "ckpt_key": f"{module.PREFIXES[0]}{name}",
+                "ckpt_key": f"{PREFIXES.get(called, '')}{name}",
                 "rule": rules.get(name) or rule_of(name, tensor.ndim),
                 "value": tensor,
             }
@@ -124,7 +170,7 @@ def vector_manifest(module: Any, planner: Any, **features: object) -> dict[str, 
         for layer, head in getattr(module, "DRIVE_HEADS", {}).items()
     }
     return {
-        "hyper_parameters": module.RELEASED,
+        "hyper_parameters": HYPER_PARAMETERS[planner.name],
         "drive_overrides": {
             "meaning": ANY,
             "heads": heads,
@@ -132,7 +178,7 @@ def vector_manifest(module: Any, planner: Any, **features: object) -> dict[str, 
         },
         "checkpoint": {
             "weights_under": "state_dict",
-            "prefix": module.PREFIXES[0],
+            "prefix": PREFIXES[planner.name],
             **dict.fromkeys(("container", "loading", "other_entries"), ANY),
         },
         "feature_builder": {

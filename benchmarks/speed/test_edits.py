@@ -19,7 +19,7 @@ from shiftsim.metrics.interplan import driven_lanes
 from shiftsim.runs.scenarios import open_named_store
 
 GOLDEN = Path(__file__).resolve().parents[2] / "tests" / "golden"
-TOKEN = "03b23cc64ccf44cb"
+TOKEN = "01f13ee575198fdf"
 WINDOW = (20.0, 0.0, 0.5)  # s, s, share of the rows: of the cases of interPlan
 EDITS = {
     "spawn": {"spawn": {"at": {"ahead_m": 45.0, "left_m": -5.0}, "behavior": "stopped"}},

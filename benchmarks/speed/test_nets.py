@@ -23,9 +23,10 @@ import pytest
 from parity_cases import Scenes
 
 from shiftsim.benchmarks.speed import gpu
+from shiftsim.benchmarks.speed.city import bench_scene
 from shiftsim.benchmarks.speed.conftest import median_seconds
-from shiftsim.data.demo.store import bench_scene, demo_store
 from shiftsim.data.store.reading import open_store
+from shiftsim.data.synthetic.store import demo_store
 from shiftsim.planners.learned.owner import InferenceClient, InferenceServer, new_address
 from shiftsim.planners.registry import load_planner
 from shiftsim.processes import in_background

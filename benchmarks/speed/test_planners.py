@@ -20,7 +20,7 @@ LIGHTS_TARGET = 0.3e-3  # s
 @pytest.fixture(scope="module")
 def scenario():
     """A generated city with 100 agents around the ego."""
-    from shiftsim.data.demo.store import bench_scene
+    from shiftsim.benchmarks.speed.city import bench_scene
 
     return bench_scene(100, 0)
 
@@ -28,7 +28,7 @@ def scenario():
 @pytest.fixture(scope="module")
 def lit_scenario():
     """The same city with lights, and connectors of 150 vertices."""
-    from shiftsim.data.demo.store import bench_scene
+    from shiftsim.benchmarks.speed.city import bench_scene
 
     return bench_scene(100, 0, lights=True)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from parity_cases import Scenes
 
-from shiftsim.data.demo.store import bench_scene
+from shiftsim.benchmarks.speed.city import bench_scene
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.writing import StoreWriter

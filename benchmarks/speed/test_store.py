@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shiftsim.data.demo.store import bench_scene
+from shiftsim.benchmarks.speed.city import bench_scene
 from shiftsim.data.nuplan.map import read_map
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.data.store.map import read_map_file, write_map

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import shiftsim
-from shiftsim.data.demo.store import bench_scene
+from shiftsim.benchmarks.speed.city import bench_scene
 from shiftsim.data.store.reading import open_store
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import simulate

@@ -93,9 +93,9 @@ def make_samples(
             None if part is None else part[order] for part in (headings, velocities, sizes)
         )
         derived = None
-    _refuse_twice(name, track_ids, track, time_us)
+    if fault := find_twice(track_ids, track, time_us) or find_pause(time_us):
+        raise ConversionError(f"{name}: {fault[0]}", fault[1])
     stamps, frame = index_ids(time_us)
-    _refuse_pauses(name, stamps)
     time = (time_us - stamps[0]) / 1e6
     step = np.diff(time)[track[1:] == track[:-1]]
     period = float(np.median(step)) if len(step) else ROW_S
@@ -136,17 +136,39 @@ def make_samples(
     return samples
 
 
-def _refuse_pauses(name: str, stamps: IntArray) -> None:
-    """Every row of the recording takes memory, also those in which nothing is seen."""
+Fault = tuple[str, str] | None  # what is wrong, and the remedy
+
+
+def find_pause(time_us: IntArray) -> Fault:
+    """Times (A,) [us] that span too long, or with too long a pause: every row takes memory."""
+    stamps = np.unique(time_us)
     first = int(np.diff(stamps).argmax())
-    pause, span = np.diff(stamps).max() / 1e6, (stamps[-1] - stamps[0]) / 1e6
-    if pause > MAX_PAUSE_S or span > MAX_SPAN_S:
-        begin = (stamps[first] - stamps[0]) / 1e6
-        raise ConversionError(
-            f"{name}: the rows span {span:g} s, with none between {begin:g} s and"
-            f" {begin + pause:g} s; at most {MAX_SPAN_S:g} s, and {MAX_PAUSE_S:g} s without a row",
+    begin, end, span = ((stamps[[first, first + 1, -1]] - stamps[0]) / 1e6).tolist()
+    if end - begin > MAX_PAUSE_S:
+        return (
+            f"no object has a row between {begin:g} s and {end:g} s, at most {MAX_PAUSE_S:g} s",
+            "leave out rows with a wrong time; if the clock begins anew at midnight, add a day to"
+            " the times after it; if two recordings were joined, convert each by itself",
+        )
+    if span > MAX_SPAN_S:
+        return (
+            f"the rows span {span:g} s, more than {MAX_SPAN_S:g} s",
             "leave out rows with a wrong time, check its unit, or convert parts by themselves",
         )
+    return None
+
+
+def find_twice(ids: NDArray[Any], track: IntArray, time_us: IntArray) -> Fault:
+    """Two rows of one object at one time; rows (A,) are sorted by track and time."""
+    twice = np.flatnonzero((np.diff(track) == 0) & (np.diff(time_us) == 0))
+    if not len(twice):
+        return None
+    name, when = ids[track[twice[0]]].item(), (time_us[twice[0]] - time_us.min()) / 1e6
+    return (
+        f"object {name!r} has two rows at {when:g} s ({len(twice)} such rows): rows are repeated,"
+        " or one id names two objects",
+        "leave repeated rows out, give objects ids of their own, and check the unit of time",
+    )
 
 
 def on_common_clock(samples: TrackSamples) -> TrackSamples:
@@ -215,17 +237,6 @@ def order_of_rows(track: IntArray, time_us: IntArray) -> IntArray | None:
     if ((track[1:] > track[:-1]) | ((track[1:] == track[:-1]) & later)).all():
         return None
     return np.lexsort((time_us, track))
-
-
-def _refuse_twice(name: str, ids: NDArray[Any], track: IntArray, time_us: IntArray) -> None:
-    twice = np.flatnonzero((track[1:] == track[:-1]) & (time_us[1:] == time_us[:-1]))
-    if len(twice):
-        one = f"object {ids[track[twice[0]]].item()!r} has two rows"
-        when = f"at {time_us[twice[0]] / 1e6:.3f} s ({len(twice)} such rows)"
-        raise ConversionError(
-            f"{name}: {one} {when}",
-            "leave one of them out, or give two objects with one id ids of their own",
-        )
 
 
 def most_frequent(

@@ -124,7 +124,7 @@ class Dsc3dReader:
         points = samples.centers[is_vehicle & moves, :2]
         points = points[:: max(1, len(points) // _MAX_POINTS)] + self.download.offset[:2]
         found = place_on_map(self.site.road, points, self.config.min_drivable_share)
-        return asdict(found) | {"shift": found.shift.tolist()}
+        return found._asdict() | {"shift": found.shift.tolist()}
 
     def summarise(self, entries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         """Share of moving vehicles on drivable area; an error where map and tracks do not fit."""

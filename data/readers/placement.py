@@ -1,6 +1,6 @@
 """Do recorded vehicles lie on a map, and which shift would put them there?"""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,19 +13,13 @@ _MAX_POINTS = 2000  # moving vehicles looked at
 _MAX_CELLS = 1_000_000  # of the raster that finds a better placement
 
 
-@dataclass(frozen=True)
-class Placement:
+class Placement(NamedTuple):
     """How well moving vehicles and drivable area lie on each other."""
 
     num_points: int  # places that were looked at
     num_drivable: int  # how many of them are on drivable area
     shift: FloatArray  # (2,) what to add to the points for the best fit [m]
     best_share: float  # share of the points on drivable area then, as far as a raster tells
-
-    @property
-    def share(self) -> float:
-        """Share of the points on drivable area, 1 where there are none."""
-        return self.num_drivable / self.num_points if self.num_points else 1.0
 
 
 def place_on_map(road: VectorMap, points: FloatArray, enough: float) -> Placement:

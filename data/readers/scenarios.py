@@ -154,19 +154,15 @@ def convert_recording(source: SourceRecording) -> Converted:
         starts = np.array([span.start_s + span.history_s for span in own])
         poses = sample_run(samples, runs, run, starts).poses
         poses[:, :2] += offset
-        before = len(scenarios)
+        track, before = int(runs.track[run]), len(scenarios)
         for number, span, pose in zip(numbers, own, poses, strict=True):
-            if not starts_on_lane(road, pose, config):
-                rejected[LANE] += 1
-                continue
-            track = int(runs.track[run])
-            window = _scenario(samples, road, offset, config, track, number, span, trace)
+            window: Window | str = LANE
+            if starts_on_lane(road, pose, config):
+                window = _scenario(source, offset, config, track, number, span, trace)
             if isinstance(window, str):
                 rejected[window] += 1
             else:
-                metadata = {**window.metadata, **source.metadata}
-                kind = source.scenario_type
-                scenarios.append(replace(window, scenario_type=kind, metadata=metadata))
+                scenarios.append(window)
         if len(scenarios) > before:
             traces.append(trace)
     if source.lights is not None:
@@ -288,8 +284,7 @@ def _accepted_runs(
 
 
 def _scenario(
-    samples: TrackSamples,
-    road: VectorMap,
+    source: SourceRecording,
     offset: FloatArray,
     config: ConversionConfig,
     track: int,
@@ -298,6 +293,7 @@ def _scenario(
     trace: EgoTrace,
 ) -> Window | str:
     """The scenario of an ego in a window, or the rule that its route fails."""
+    samples, road = source.samples, source.map.road
     padding = rows_of(config.padding_s)
     first = rows_of(span.start_s)  # with the padding, one padding earlier than the window
     start = first + padding + rows_of(span.history_s)
@@ -328,7 +324,7 @@ def _scenario(
         metadata["duration_class"] = duration
     return Window(
         token=hashlib.blake2b(key.encode(), digest_size=8).hexdigest(),
-        scenario_type="unknown",
+        scenario_type=source.scenario_type,
         log_name=trace.log_name,
         ego=trace.name,
         first_row=first,
@@ -339,7 +335,7 @@ def _scenario(
         mission_goal=goal,
         mapping=(span.length_s - span.history_s, 0.0, 0.5),
         is_short=span.is_short,
-        metadata=metadata,
+        metadata={**metadata, **source.metadata},
     )
 
 

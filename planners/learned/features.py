@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.planners.learned.device import on_device
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.sim.planner import History, SceneInfo
 from shiftsim.world.state import (
     AY,
@@ -26,7 +25,6 @@ from shiftsim.world.state import (
 STEP = 0.1  # s, between poses of a plan
 SAMPLES = 21  # of a history of 2 s
 PLAN_POSES = 80
-EGO_LENGTH, EGO_WIDTH = PACIFICA.length, PACIFICA.width
 _WINDOW = np.arange(-2, 3)  # samples of the derivative filter, a parabola through five
 _SLOPE = _WINDOW / 10.0
 _BEND = (_WINDOW**2 - 2.0) / 7.0
@@ -62,14 +60,46 @@ def agent_features(history: History, center: FloatArray, max_agents: int) -> Age
 
     A history shorter than 2 s leaves its oldest samples invalid, the ego's included.
     """
-    tracks = history.tracks
+    tracks, ego = history.tracks, history.ego[-SAMPLES:]
     nearest = _nearest_agents(tracks, center, max_agents)
-    position, heading, velocity, shape, valid = _agent_histories(
-        history.ego, tracks.poses, tracks.velocities, tracks.sizes, tracks.valid, nearest
+    cos, sin, vx, vy = np.cos(ego[:, 2]), np.sin(ego[:, 2]), ego[:, 3], ego[:, 4]
+    own = (
+        ego[:, :3],
+        np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy]),
+        np.full((len(ego), 2), [PACIFICA.length, PACIFICA.width]),
+        np.ones(len(ego), np.bool_),
     )
+    others = (tracks.poses, tracks.velocities, tracks.sizes, tracks.valid)
+    poses, velocities, sizes, seen = (
+        np.concatenate([one[:, None], rows[-SAMPLES:, nearest]], axis=1)
+        for one, rows in zip(own, others, strict=True)
+    )
+
+    def filled(values: np.ndarray, kind: Any = np.float32) -> np.ndarray:
+        """(A, 21, ...) samples of rows (T, A, ...); 0 where nothing was seen."""
+        out = np.zeros((SAMPLES, *values.shape[1:]), kind)
+        out[SAMPLES - len(values) :][seen] = values[seen]
+        return out.swapaxes(0, 1)
+
     category = np.zeros(len(nearest) + 1, np.int64)
     category[1:] = tracks.kinds[nearest] + 1
-    return AgentFeatures(nearest, position, heading, velocity, shape, valid, category)
+    heading = float(ego[-1, HEADING])
+    return AgentFeatures(
+        tracks=nearest,
+        position=filled(turned(poses[..., :2] - ego[-1, :2], heading)),
+        heading=filled(poses[..., 2] - heading),
+        velocity=filled(turned(velocities, heading)),
+        shape=filled(sizes[..., ::-1]),
+        valid=filled(seen, np.bool_),
+        category=category,
+    )
+
+
+def turned(vectors: FloatArray, heading: float) -> FloatArray:
+    """Vectors (..., 2) in a frame that is turned to a heading [rad]: forward and left."""
+    cos, sin = np.cos(heading), np.sin(heading)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
 
 
 def _nearest_agents(tracks: Tracks, center: FloatArray, count: int) -> IntArray:
@@ -80,51 +110,6 @@ def _nearest_agents(tracks: Tracks, center: FloatArray, count: int) -> IntArray:
     away = tracks.poses[-1, by_kind, :2] - center[:2]
     order = np.argsort(np.sqrt(away[:, 0] ** 2 + away[:, 1] ** 2))
     return by_kind[order[:count]]
-
-
-@kernel
-def _agent_histories(
-    ego: FloatArray,
-    poses: FloatArray,
-    velocities: FloatArray,
-    sizes: FloatArray,
-    present: BoolArray,
-    chosen: IntArray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, BoolArray]:
-    """The arrays of `AgentFeatures` but the first and the last."""
-    rows = len(chosen) + 1
-    position = np.zeros((rows, SAMPLES, 2), np.float32)
-    turned = np.zeros((rows, SAMPLES), np.float32)
-    velocity = np.zeros((rows, SAMPLES, 2), np.float32)
-    shape = np.zeros((rows, SAMPLES, 2), np.float32)
-    valid = np.zeros((rows, SAMPLES), np.bool_)
-    last = len(ego) - 1
-    x, y, heading = ego[last, 0], ego[last, 1], ego[last, 2]
-    cos, sin = np.cos(heading), np.sin(heading)
-    for back in range(min(len(ego), SAMPLES)):
-        sample, row = SAMPLES - 1 - back, last - back
-        for index in range(rows):
-            if index == 0:
-                own_cos, own_sin = np.cos(ego[row, 2]), np.sin(ego[row, 2])
-                px, py, angle = ego[row, 0], ego[row, 1], ego[row, 2]
-                vx = own_cos * ego[row, 3] - own_sin * ego[row, 4]
-                vy = own_sin * ego[row, 3] + own_cos * ego[row, 4]
-                length, width = EGO_LENGTH, EGO_WIDTH
-            else:
-                track = chosen[index - 1]
-                if not present[row, track]:
-                    continue
-                px, py, angle = poses[row, track, 0], poses[row, track, 1], poses[row, track, 2]
-                vx, vy = velocities[row, track, 0], velocities[row, track, 1]
-                length, width = sizes[row, track, 0], sizes[row, track, 1]
-            position[index, sample, 0] = cos * (px - x) + sin * (py - y)
-            position[index, sample, 1] = cos * (py - y) - sin * (px - x)
-            turned[index, sample] = angle - heading
-            velocity[index, sample, 0] = cos * vx + sin * vy
-            velocity[index, sample, 1] = cos * vy - sin * vx
-            shape[index, sample, 0], shape[index, sample, 1] = width, length
-            valid[index, sample] = True
-    return position, turned, velocity, shape, valid
 
 
 def poses_of(plan: np.ndarray) -> FloatArray:
@@ -220,11 +205,13 @@ def _interpolate(at: FloatArray, knots: FloatArray, values: FloatArray) -> Float
 
 def stack_scenes(scenes: Sequence[Sequence[np.ndarray]], device: str) -> list[Any]:
     """Tensors (B, …) of the arrays of B scenes; where one has fewer rows, zeros follow."""
+    import torch
+
     out: list[Any] = []
     for arrays in zip(*scenes, strict=True):
         shape = np.max([array.shape for array in arrays], axis=0)
         batch = np.zeros((len(arrays), *shape), arrays[0].dtype)
         for row, array in zip(batch, arrays, strict=True):
             row[tuple(slice(size) for size in array.shape)] = array
-        out.append(on_device(batch, device))
+        out.append(torch.from_numpy(batch).to(device))
     return out

@@ -11,6 +11,7 @@ import shapely
 
 from shiftsim.geometry.polylines import point_on_polyline
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.planners.learned.features import turned
 from shiftsim.planners.per_map import PerMap
 from shiftsim.world.layers import Polylines, meeting, square_around
 from shiftsim.world.map import NONE, VectorMap
@@ -188,9 +189,15 @@ def road_features(
     square = square_around(float(center[0]), float(center[1]), radius)
     edges = meeting(road.edges.polygons, square)
     near = np.concatenate([edges, len(road.edges) + meeting(road.crosswalks.polygons, square)])
-    chosen, points, vectors, orientations, valid = _to_ego_frame(
-        known.lines, known.angles, near, ego[0], ego[1], ego[2], radius
-    )
+    heading = float(ego[2])
+    offsets = turned(known.lines[near, 0, :-1] - ego[:2], heading)
+    valid: BoolArray = np.all(np.abs(offsets) < radius, axis=-1)
+    seen = valid.any(axis=1)
+    chosen, valid = near[seen], valid[seen]
+    lines = known.lines[chosen]
+    points = turned(lines[:, :, :-1] - ego[:2], heading).astype(np.float32)
+    vectors = turned(np.diff(lines, axis=2), heading).astype(np.float32)
+    orientations = (known.angles[chosen] - heading).astype(np.float32)
     limit = known.limit[chosen]
     has_limit = ~np.isnan(limit)
     light = np.full(len(chosen), int(LightStatus.UNKNOWN))
@@ -205,46 +212,3 @@ def road_features(
         *(chosen, points, vectors, orientations, centers, valid, known.kind[chosen], routed, light),
         *(has_limit, np.where(has_limit, limit, 0.0).astype(np.float32)),
     )
-
-
-@kernel
-def _to_ego_frame(
-    lines: FloatArray,
-    angles: FloatArray,
-    near: IntArray,
-    x: float,
-    y: float,
-    heading: float,
-    radius: float,
-) -> tuple[IntArray, np.ndarray, np.ndarray, np.ndarray, BoolArray]:
-    """Objects with a valid point, moved and turned; invalid points are, too."""
-    cos, sin = np.cos(heading), np.sin(heading)
-    chosen = np.empty(len(near), np.int64)
-    valid = np.empty((len(near), POINTS), np.bool_)
-    count = 0
-    for row in near:
-        seen = False
-        for point in range(POINTS):
-            dx, dy = lines[row, 0, point, 0] - x, lines[row, 0, point, 1] - y
-            ahead, left = cos * dx + sin * dy, cos * dy - sin * dx
-            valid[count, point] = abs(ahead) < radius and abs(left) < radius
-            seen = seen or valid[count, point]
-        if seen:
-            chosen[count] = row
-            count += 1
-    points = np.empty((count, 3, POINTS, 2), np.float32)
-    vectors = np.empty((count, 3, POINTS, 2), np.float32)
-    orientations = np.empty((count, 3, POINTS), np.float32)
-    for index in range(count):
-        row = chosen[index]
-        for side in range(3):
-            line = lines[row, side]
-            for point in range(POINTS):
-                dx, dy = line[point, 0] - x, line[point, 1] - y
-                points[index, side, point, 0] = cos * dx + sin * dy
-                points[index, side, point, 1] = cos * dy - sin * dx
-                dx, dy = line[point + 1, 0] - line[point, 0], line[point + 1, 1] - line[point, 1]
-                vectors[index, side, point, 0] = cos * dx + sin * dy
-                vectors[index, side, point, 1] = cos * dy - sin * dx
-                orientations[index, side, point] = angles[row, side, point] - heading
-    return chosen[:count], points, vectors, orientations, valid[:count]

@@ -1,19 +1,18 @@
 """Commands about benchmark tracks: `bench` runs and reports one, `data` says what is missing."""
 
 import sys
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from shiftsim import cli
-from shiftsim.cli import Debug, Json, Quiet, plural, say, say_json, show, stdout_to_stderr, values
+from shiftsim.cli import Json, Quiet, plural, say, say_json, show, stdout_to_stderr
 from shiftsim.cli.run import DryRun, Live, progress_of, say_dry_run, say_provenance
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from shiftsim.benchmarks.bench import Plan
-    from shiftsim.benchmarks.inventory import Inventory, Missing
     from shiftsim.report.figures import Figure
     from shiftsim.report.groups import Group
 
@@ -46,7 +45,6 @@ def bench(
         str,
         typer.Argument(
             help="semantic-shift, state-drift or edits.",
-            autocompletion=values.among(*_MAIN_TABLE),
         ),
     ],
     settings: cli.Settings,
@@ -66,7 +64,6 @@ def bench(
     live: Live = False,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Run a benchmark track with all its traffic modes, noises and seeds, and report it.
 
@@ -186,7 +183,7 @@ def _pictures(groups: "Sequence[Group]", allow_partial: bool) -> "list[Figure]":
         return []
 
 
-def data(as_json: Json = False, debug: Debug = False) -> None:
+def data(as_json: Json = False) -> None:
     """Stores, maps, splits and checkpoints that are there, and what each benchmark row lacks."""
     from shiftsim.benchmarks.inventory import list_available_data
 
@@ -194,7 +191,7 @@ def data(as_json: Json = False, debug: Debug = False) -> None:
     show(found, _inventory_lines(found), as_json=as_json)
 
 
-def _inventory_lines(found: "Inventory") -> "Iterator[str]":
+def _inventory_lines(found: dict[str, Any]) -> "Iterator[str]":
     yield f"stores in {found['store_folder']} (SHIFTSIM_DATA)"
     for store in found["stores"]:
         if store["problem"]:
@@ -209,7 +206,7 @@ def _inventory_lines(found: "Inventory") -> "Iterator[str]":
     yield f"checkpoints in {found['checkpoint_folder']} (SHIFTSIM_CHECKPOINTS)"
     for planner, lack in found["checkpoints"].items():
         yield f" {planner:18} {'missing' if lack else 'ready'}"
-    missing: dict[str, Missing] = {}
+    missing: dict[str, dict[str, str]] = {}
     yield "benchmark"
     yield f" {'track':15} {'planner':18} {'Val14':16} {'own scenarios':16} planner"
     for row in found["rows"]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from shiftsim import cli
-from shiftsim.cli import Debug, Json, Quiet, new_app, plural, progress_bar, say, say_json, values
+from shiftsim.cli import Json, Quiet, new_app, plural, progress_bar, say, say_json
 
 if TYPE_CHECKING:
     from shiftsim.data.readers.convert import ConversionReport
@@ -23,9 +23,7 @@ _DATA, PARTIAL = 2, 3
 
 Store = Annotated[
     str,
-    typer.Option(
-        "--store", "-s", help="Name or folder of the store.", autocompletion=values.stores
-    ),
+    typer.Option("--store", "-s", help="Name or folder of the store."),
 ]
 _Window = Annotated[
     float | None, typer.Option(help="Length of a scenario with its history [s]. [18]")
@@ -55,7 +53,6 @@ def nuplan(
     ] = None,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Convert scenarios of nuPlan logs (.db) and maps (map.gpkg)."""
     from shiftsim.data.nuplan.convert import convert_nuplan
@@ -131,7 +128,6 @@ def dsc3d(
     settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Convert recordings in the layout of DSC3D.
 
@@ -190,7 +186,6 @@ def tracks(
     history_s: _History = None,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Convert tracks of any source: a table with one row per object and time, and its map.
 
@@ -279,7 +274,6 @@ def av2(
     settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Convert scenes of Argoverse 2 motion forecasting, train or val.
 
@@ -302,7 +296,6 @@ def py123d(
     settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Convert logs that py123d wrote: Waymo, nuScenes, Argoverse 2 Sensor, nuPlan.
 
@@ -323,7 +316,6 @@ def commonroad(
     settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Convert CommonRoad scenarios in XML: NGSIM, INTERACTION, inD, highD and others.
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from shiftsim.cli import Advance, Debug, Json, Quiet, progress_bar, say, show
+from shiftsim.cli import Advance, Json, Quiet, progress_bar, say, show
 
 _DATA = 2
 
@@ -27,7 +27,6 @@ def verify(
     require_all: Annotated[
         bool, typer.Option("--require-all", help="Exit with 3 if anything is not covered.")
     ] = False,
-    debug: Debug = False,
 ) -> None:
     """Compare results of your own from nuPlan with what shiftsim computes.
 
@@ -69,7 +68,6 @@ def doctor(
     ] = False,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Versions, cores and memory, and whether the kernels compute what they should."""
     kernels = None
@@ -81,24 +79,6 @@ def doctor(
     show(asdict(found), found.lines(), as_json=as_json)
     if not found.is_well:
         raise typer.Exit(_DATA)
-
-
-@dataclass(frozen=True)
-class Compiled:
-    """What `compile_kernels` left on disk."""
-
-    folder: str  # where the machine code is
-    files: int  # kernels, one for each combination of types
-    bytes: int  # their size
-    compiled: int  # of the files, those that were not there before
-    seconds: float  # from start to end [s]
-
-    def line(self) -> str:
-        """As text."""
-        return (
-            f"kernels: {self.files} ({self.bytes / 1e6:.1f} MB) in {self.folder}, "
-            f"{self.compiled} of them compiled in {self.seconds:.0f} s"
-        )
 
 
 @dataclass(frozen=True)
@@ -114,7 +94,7 @@ class Diagnosis:
     seconds: float  # how long the checks took, compilation included [s]
     cases: int  # reference values compared
     mismatches: tuple[str, ...]  # those that differ, in words
-    kernels: Compiled | None = None  # what was compiled before, where it was asked for
+    kernels: dict[str, Any] | None = None  # of `compile_kernels`, where it was asked for
 
     @property
     def is_well(self) -> bool:
@@ -126,18 +106,22 @@ class Diagnosis:
         packages = "  ".join(f"{name} {version}" for name, version in self.versions.items())
         memory = f"{self.memory / 1e9:.1f} GB memory" if self.memory else "memory unknown"
         equal = self.cases - len(self.mismatches)
+        compiled = (
+            " kernels: {files} ({bytes:.3g} bytes) in {folder}, {compiled} of them compiled in "
+            "{seconds:.0f} s"
+        )
         return [
             f" {packages}",
             f" torch: {self.torch}",
             f" {self.cores} cores, {memory}, suggested workers {self.workers}",
             f" kernel cache: {self.kernel_cache}",
-            *([f" {self.kernels.line()}"] if self.kernels else []),
+            *([compiled.format(**self.kernels)] if self.kernels else []),
             f" reference checks {equal}/{self.cases} equal in {self.seconds:.1f} s",
             *(f" MISMATCH {line}" for line in self.mismatches[:20]),
         ]
 
 
-def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
+def examine(advance: Advance = lambda *progress: None) -> Diagnosis:
     """Examine this installation; compiles the kernels that are not in the cache yet."""
     from shiftsim.kernels import CACHE_FOLDER
     from shiftsim.runs.config import default_workers
@@ -151,7 +135,7 @@ def examine(advance: Advance = lambda done, total, note: None) -> Diagnosis:
     for number, name in enumerate(CHECKS, start=1):
         advance(number, len(CHECKS) + 1, name)
         check_reference(name, report)
-    advance(len(CHECKS) + 1, len(CHECKS) + 1, "")
+    advance(len(CHECKS) + 1, len(CHECKS) + 1)
     return Diagnosis(
         versions=versions(),
         torch=torch,
@@ -183,14 +167,14 @@ def _torch() -> str:
     return f"{torch.__version__}, CUDA {torch.version.cuda}: {', '.join(names)}"
 
 
-def compile_kernels(advance: Advance) -> Compiled:
-    """Make small runs that together use every kernel of a run.
+def compile_kernels(advance: Advance) -> dict[str, Any]:
+    """Make small runs that together use every kernel of a run; what is on disk then.
 
     Raises:
         ShiftsimError: A run failed.
     """
     from shiftsim.api import run
-    from shiftsim.data.demo.store import demo_store
+    from shiftsim.data.synthetic.store import demo_store
     from shiftsim.kernels import CACHE_FOLDER, machine_code
 
     began, before = perf_counter(), len(machine_code())
@@ -201,15 +185,15 @@ def compile_kernels(advance: Advance) -> Compiled:
             advance(number, len(runs), f"{', '.join(planners)} in {settings['traffic']} traffic")
             settings |= {"store": str(store), "split": "demo-mini", "limit": 6, "workers": 1}
             run(planners, noise="ou-high", out=f"{folder}/run-{number}", **settings)
-        advance(len(runs), len(runs), "")
+        advance(len(runs), len(runs))
     files = machine_code()
-    return Compiled(
-        folder=CACHE_FOLDER,
-        files=len(files),
-        bytes=sum(path.stat().st_size for path in files),
-        compiled=len(files) - before,
-        seconds=perf_counter() - began,
-    )
+    return {
+        "folder": CACHE_FOLDER,
+        "files": len(files),
+        "bytes": sum(path.stat().st_size for path in files),
+        "compiled": len(files) - before,
+        "seconds": perf_counter() - began,
+    }
 
 
 def _compiling_runs() -> Iterator[tuple[Sequence[str], dict[str, Any]]]:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from shiftsim.cli import Debug, Json, new_app, plural, say, say_json
+from shiftsim.cli import Json, new_app, plural, say, say_json
 
 app = new_app("Edits of recorded scenarios: check them, look at them, import interPlan's.")
 
@@ -25,7 +25,6 @@ def check(
         typer.Option("--avoidable", help="Also whether braking or PDM-Closed avoids it."),
     ] = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Apply every edit to its scenarios, and say which cannot be applied and why."""
     from shiftsim.errors import ConfigError, ShiftsimError
@@ -72,7 +71,6 @@ def show(
     out: Annotated[
         Path, typer.Option("--out", "-o", help="A .pdf, .png or .svg: before and after.")
     ] = Path("edit.png"),
-    debug: Debug = False,
 ) -> None:
     """What an edit makes of a scenario: words, and a picture of before and after."""
     from shiftsim.errors import beginning
@@ -108,7 +106,6 @@ def import_edits(
     window: Annotated[
         float, typer.Option(help="Duration of the scenarios [s]; 0 keeps the recorded one.")
     ] = 30.0,
-    debug: Debug = False,
 ) -> None:
     """Edits that make interPlan's scenarios, from interPlan's own two files."""
     from shiftsim.data.nuplan.filter import read_yaml
@@ -135,7 +132,6 @@ def sample(
         bool, typer.Option("--even", help="As many easy, medium and hard ones.")
     ] = False,
     out: Annotated[Path, typer.Option("--out", "-o", help="The .toml file. [KIND.toml]")] = Path(),
-    debug: Debug = False,
 ) -> None:
     """Draw edits over a store: in the way, and avoided by braking at 4 m/s^2 or by PDM-Closed."""
     from collections import Counter

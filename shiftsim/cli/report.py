@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from shiftsim import cli
-from shiftsim.cli import Debug, Json, Quiet, plural, progress_bar, say, say_json
+from shiftsim.cli import Json, Quiet, plural, progress_bar, say, say_json
 
 if TYPE_CHECKING:
     from shiftsim.report.figures import Figure
@@ -55,7 +55,6 @@ def report(
     ] = False,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Tables and pictures of one or several runs, or of a benchmark's folder."""
     from shiftsim.benchmarks import known_sets
@@ -94,7 +93,7 @@ def report(
         say(f"{plural(len(files), 'file')} in {out}: {', '.join(path.name for path in files)}")
     if site is not None:
         with progress_bar(quiet=quiet) as advance:
-            _write_pages(site, title, opened, tables, drawn, lambda i, n: advance(i, n, ""))
+            _write_pages(site, title, opened, tables, drawn, advance)
         say(f"written: {site / 'index.html'}")
     if out is not None or site is not None:
         return
@@ -152,7 +151,6 @@ def explain(
     noise: Annotated[str | None, typer.Option(help="Only this noise.")] = None,
     seed: Annotated[int | None, typer.Option(help="Only this seed.")] = None,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Why a rollout has its score, or why a task failed."""
     from shiftsim.benchmarks.bench import open_runs
@@ -189,7 +187,6 @@ def diff(
     second: Annotated[Path, typer.Argument(metavar="RUN_B", help="Another one.")],
     limit: Annotated[int, typer.Option(help="Look into the N largest changes.")] = 10,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Scenarios whose score differs between two runs, and where the rollouts part."""
     from shiftsim.benchmarks.bench import paired_runs

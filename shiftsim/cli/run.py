@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from shiftsim import cli
-from shiftsim.cli import Debug, Json, Quiet, plural, progress_bar, say, say_json, stdout_to_stderr
+from shiftsim.cli import Json, Quiet, plural, progress_bar, say, say_json, stdout_to_stderr
 from shiftsim.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -47,7 +47,6 @@ def run(
     live: Live = False,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Simulate and score planners on scenarios."""
     from shiftsim.files import read_toml
@@ -318,7 +317,6 @@ def score(
     settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Score stored rollouts again, under another threshold profile, without simulating."""
     from shiftsim.runs.derive import rescore
@@ -330,7 +328,7 @@ def score(
         finished = rescore(
             run,
             **{"thresholds": run.manifest["config"]["thresholds"], **settings},
-            on_progress=lambda progress: advance(progress.done, progress.total, ""),
+            on_progress=lambda progress: advance(progress.done, progress.total),
             argv=sys.argv,
         )
     leave_with(finished, allow_partial=allow_partial, as_json=as_json)
@@ -345,7 +343,6 @@ def merge(
         bool, typer.Option("--allow-partial", help="Accept missing shards; labelled so.")
     ] = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Join runs made with --shard: the same tables as without."""
     from shiftsim.runs.derive import merge_runs
@@ -367,7 +364,6 @@ def demo(
     *,
     settings: cli.Settings,
     quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Generate small recordings, convert them, run three planners clean and disturbed.
 
@@ -378,7 +374,7 @@ def demo(
         return
     if seed is not None:
         raise ConfigError("--seed is of random towns only", hint="say how many with --towns")
-    from shiftsim.data.demo.store import DEMO_SPLIT, demo_store
+    from shiftsim.data.synthetic.store import DEMO_SPLIT, demo_store
     from shiftsim.files import store_path
     from shiftsim.runs.config import DEFAULT_STORE
 
@@ -412,7 +408,7 @@ def _make_towns(
     """Generate, convert and filter random towns."""
     if "limit" in settings:
         raise ConfigError("--limit is of runs, --towns runs nothing", hint="leave one of them out")
-    from shiftsim.data.towns.store import write_towns
+    from shiftsim.data.synthetic.store import write_towns
     from shiftsim.files import store_path
     from shiftsim.runs.config import default_workers
     from shiftsim.runs.filter import filter_store
@@ -426,9 +422,7 @@ def _make_towns(
         write_towns(folder, towns=towns, seed=seed, spread=spread, progress=advance)
     say("driving every scenario as recorded, to leave out those that cannot be driven so")
     with progress_bar(quiet=quiet) as advance:
-        found = filter_store(
-            folder, workers=workers, on_progress=lambda done, total: advance(done, total, "")
-        )
+        found = filter_store(folder, workers=workers, on_progress=advance)
     counts = found.counts()
     say(f" {counts['accepted']} of {plural(len(found.rows), 'scenario')} accepted → {folder}")
     say(f" next: shiftsim run --planner log-future --store {folder} --limit 20")

@@ -7,7 +7,6 @@ import typer
 
 from shiftsim import cli
 from shiftsim.cli import (
-    Debug,
     Json,
     Quiet,
     new_app,
@@ -15,7 +14,6 @@ from shiftsim.cli import (
     progress_bar,
     say,
     say_json,
-    values,
 )
 
 if TYPE_CHECKING:
@@ -32,14 +30,13 @@ export = new_app("Write scenarios in the formats of others.", no_args_is_help=Tr
 
 Store = Annotated[
     str,
-    typer.Argument(metavar="STORE", help="Store, by name or folder.", autocompletion=values.stores),
+    typer.Argument(metavar="STORE", help="Store, by name or folder."),
 ]
 
 
 def check(
     store: Store,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Validate a store: files, units, motion, maps and routes; lists every problem.
 
@@ -103,7 +100,6 @@ def filter_scenarios(
     settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Drive every scenario as recorded; drop those with a collision, off the road or standing.
 
@@ -125,7 +121,7 @@ def filter_scenarios(
             folder,
             config,
             workers=settings.get("workers", 0),
-            on_progress=lambda done, total: advance(done, total, ""),
+            on_progress=advance,
         )
     if as_json:
         say_json({"config": found.config, "counts": found.counts(), "verdicts": found.rows})
@@ -191,7 +187,6 @@ def make_split(
     *,
     settings: cli.Settings,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Write a list of scenarios that --split takes, the same however often it is written.
 
@@ -223,7 +218,6 @@ def export_to_nuplan(
     settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Write scenarios as nuPlan logs (.db) and maps (map.gpkg), one log per scenario.
 
@@ -281,7 +275,6 @@ def show_stats(
     settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Scenarios, agents, speeds, lengths and interactions, per city and in all."""
     from shiftsim.data.store.statistics import store_stats
@@ -294,7 +287,7 @@ def show_stats(
     tokens = _chosen(opened, settings)
     with progress_bar(quiet=quiet or as_json) as advance:
         found = store_stats(
-            opened, tokens, progress=lambda done, total, token: advance(done, total, "")
+            opened, tokens, progress=lambda done, total, token: advance(done, total)
         )
     text = stats_table(found, by=by, style=style)
     if figure is not None:

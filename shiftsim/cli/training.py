@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from shiftsim.cli import Debug, Json, Quiet, new_app, say, show, values
+from shiftsim.cli import Json, Quiet, new_app, say, show
 
 app = new_app("Train networks.")
 
@@ -15,14 +15,11 @@ app = new_app("Train networks.")
 @app.command()
 def carl(
     out: Annotated[Path, typer.Option(help="Folder for networks, curves and what was collected.")],
-    store: Annotated[
-        str, typer.Option(help="Store by name, path or URL.", autocompletion=values.stores)
-    ] = "demo",
+    store: Annotated[str, typer.Option(help="Store by name, path or URL.")] = "demo",
     split: Annotated[
         str,
         typer.Option(
             help="Split of the store; all its scenarios if empty.",
-            autocompletion=values.splits,
         ),
     ] = "",
     checkpoint: Annotated[
@@ -41,7 +38,6 @@ def carl(
     ppo_samples: Annotated[int, typer.Option(help="Steps of PPO afterwards.")] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on where it was ended.")] = False,
     quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Train CaRL's network to drive as PDM-Closed does."""
     from shiftsim.planners.learned.device import require_torch
@@ -83,7 +79,6 @@ def traffic(
     epochs: Annotated[int, typer.Option(help="Of each round.")] = 8,
     tests: Annotated[int, typer.Option(help="Scenarios that the result is measured on.")] = 100,
     quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Train traffic to move as recorded agents do."""
     from shiftsim.planners.learned.device import require_torch
@@ -111,7 +106,6 @@ def realism(
     seconds: Annotated[float, typer.Option(min=0.5, help="That agents are driven for.")] = 5.0,
     limit: Annotated[int, typer.Option(help="Only so many scenarios of each store.")] = 0,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """How like the recorded ones agents of each kind of traffic are, some seconds on."""
     from shiftsim.runs.scenarios import open_named_store

@@ -6,15 +6,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from shiftsim.cli import Debug, Quiet, plural, progress_bar, say, show_in_browser
+from shiftsim.cli import Quiet, plural, progress_bar, say, show_in_browser
+from shiftsim.cli.report import RunFolder
 from shiftsim.errors import ConfigError
 
 if TYPE_CHECKING:
     from shiftsim.view.build import Gallery
 
-RunFolder = Annotated[
-    Path, typer.Argument(metavar="RUN", help="A run folder, or that of a benchmark.")
-]
 Others = Annotated[
     list[Path] | None,
     typer.Option("--with", help="Another run on the same store, shown together; repeatable."),
@@ -49,7 +47,6 @@ def view(
         bool, typer.Option("--open/--no-open", help="Open the page in the browser.")
     ] = True,
     quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Replay rollouts in the browser: pages that need no server and no network."""
     from shiftsim.files import safe_join
@@ -69,7 +66,7 @@ def view(
                 found,
                 title=f"Replays of {run.name}",
                 limit=limit,
-                on_progress=lambda done, total: advance(done, total, ""),
+                on_progress=advance,
             )
         left = sum(len(gallery.tokens) for gallery in found) - count
         say(f"{plural(count, 'replay')}{f', {left} more with --limit 0' if left else ''}")
@@ -96,7 +93,6 @@ def plot(
     noise: Noises = None,
     seed: Seeds = None,
     store: Store = None,
-    debug: Debug = False,
 ) -> None:
     """The driven paths of several rollouts over the map, as a still or a film."""
     from shiftsim.view.still import save_figure
@@ -124,7 +120,6 @@ def inspect(
     browser: Annotated[
         bool, typer.Option("--open/--no-open", help="Open the page in the browser.")
     ] = True,
-    debug: Debug = False,
 ) -> None:
     """Review scenarios in the browser: accept, reject, comment, correct the route."""
     from shiftsim.data.store.tables import REVIEW

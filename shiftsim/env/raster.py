@@ -37,7 +37,6 @@ class Canvas:
     def __init__(self, episode: Episode) -> None:
         scene = episode.scene
         self._roads = _roads(scene.map)
-        self._scratch = view.make_scratch(self._roads)
         self._on_route: BoolArray = np.zeros(len(scene.map.blocks), np.bool_)
         self._on_route[route_blocks(scene)] = True
         self._lights = LightLookup(scene.map, LightStatus.ABSENT)
@@ -46,8 +45,8 @@ class Canvas:
         """The present raster (9, 256, 256)."""
         log, row, raster = episode.log, episode.iteration, np.zeros(SHAPE, np.uint8)
         status = self._lights.at(log.traffic_lights.rows(slice(row, row + 1)))
-        roads, scratch = self._roads, self._scratch
-        draw(raster, roads, scratch, log.ego[row], log.tracks, row, self._on_route, status)
+        roads = self._roads
+        draw(raster, roads, log.ego[row], log.tracks, row, self._on_route, status)
         return raster
 
 

@@ -50,11 +50,6 @@ def merge_runs(runs: Sequence[Run], *, out: str | None = None, allow_partial: bo
     with closing(RunWriter(target, manifest)) as writer:
         for run in runs:
             for result in stored_results(run.path):
-                if result.task in writer.ended:
-                    raise ConfigError(
-                        f"task {tuple(result.task)!r} of {str(run.path)!r} is in another shard too",
-                        hint="name every shard once",
-                    )
                 writer.add(result)
         errors = {task: error for run in runs for task, error in _without_result(run)}
         return writer.finish(
@@ -65,35 +60,29 @@ def merge_runs(runs: Sequence[Run], *, out: str | None = None, allow_partial: bo
 
 
 def _check_shards(runs: Sequence[Run], *, allow_partial: bool) -> list[str]:
-    first = runs[0]
-    numbers: dict[int, Run] = {}
-    for run in runs:
-        shard = run.manifest["shard"]
+    first, shards = runs[0], [run.manifest["shard"] for run in runs]
+    for run, shard in zip(runs, shards, strict=True):
         if not shard:
             raise ConfigError(
                 f"{str(run.path)!r} is not a shard", hint="merge joins runs made with --shard i/n"
             )
         differing = difference(run.manifest, first.manifest["determining"], shard)
-        if differing or parse_shard(shard)[1] != parse_shard(first.manifest["shard"])[1]:
+        if differing or parse_shard(shard)[1] != parse_shard(shards[0])[1]:
             raise ConfigError(
                 f"{str(run.path)!r} and {str(first.path)!r} are not of the same run: "
-                f"{differing or 'their shards are ' + shard + ' and ' + first.manifest['shard']}",
+                f"{differing or f'their shards are {shard} and {shards[0]}'}",
                 hint="name the shards of one run",
             )
-        number, count = parse_shard(shard)
-        if number in numbers:
-            raise ConfigError(
-                f"{str(run.path)!r} and {str(numbers[number].path)!r} are both shard {shard}",
-                hint="name every shard once",
-            )
-        numbers[number] = run
-    missing = [f"{number}/{count}" for number in range(1, count + 1) if number not in numbers]
+        if shards.count(shard) > 1:
+            raise ConfigError(f"shard {shard} is there twice", hint="name every shard once")
+    _, count = parse_shard(shards[0])
+    missing = {f"{number}/{count}" for number in range(1, count + 1)}.difference(shards)
     if missing and not allow_partial:
         raise ConfigError(
-            f"shards are missing: {', '.join(missing)}",
+            f"shards are missing: {', '.join(sorted(missing))}",
             hint="name all of them, or --allow-partial for a result that is labelled so",
         )
-    return [run.manifest["shard"] for run in runs]
+    return shards
 
 
 def _expected(manifest: dict[str, Any]) -> list[Task]:

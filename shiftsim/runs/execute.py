@@ -1,15 +1,13 @@
 """Carry out a run: do its tasks, in worker processes or in this one, into one run folder."""
 
 import logging
-import os
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
 from operator import attrgetter
-from threading import get_ident
-from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from shiftsim.errors import DataError
 from shiftsim.runs.folder import RunWriter
@@ -184,7 +182,7 @@ def _results(plan: RunPlan, batches: Sequence[Batch]) -> Generator[list[TaskResu
     """The results of each batch, in whatever order they end."""
     with _networks_in_background(plan) if plan.shared else nullcontext(plan) as plan:
         if plan.is_serial:
-            with closing(plan.runner()()) as run_batch, _no_exit():
+            with closing(plan.runner()()) as run_batch:
                 yield from map(run_batch, batches)
             return
         options: dict[str, Any] = {
@@ -221,27 +219,6 @@ def _networks_in_background(plan: RunPlan) -> Iterator[RunPlan]:
             planners={name: known[name] for name in plan.planners},
             traffic=known.get(plan.config.traffic, plan.traffic),
         )
-
-
-@contextmanager
-def _no_exit() -> Iterator[None]:
-    """Have a planner that calls `os._exit` fail its task, as it does where a worker dies of it.
-
-    Else the command would end without a word or a table, and with the code that the planner chose.
-    Other threads, and processes that a planner forks, leave as they like.
-    """
-    leave, here = os._exit, (os.getpid(), get_ident())
-
-    def refuse(status: int) -> NoReturn:
-        if (os.getpid(), get_ident()) != here:
-            leave(status)
-        raise SystemExit(f"os._exit({status})")
-
-    os._exit = refuse
-    try:
-        yield
-    finally:
-        os._exit = leave
 
 
 def results_of(outcome: "Outcome[Batch, list[TaskResult]]") -> list[TaskResult]:

@@ -3,8 +3,6 @@
 import hashlib
 import os
 import platform
-import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -17,23 +15,24 @@ from typing import Any, Literal, TypeAlias
 
 from shiftsim._version import __version__
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.files import PACKAGE, sources
+from shiftsim.files import PACKAGE
 from shiftsim.runs.config import RunConfig
 from shiftsim.runs.journal import has_entries
 from shiftsim.runs.results import FORMAT_VERSION, JOURNAL, read_manifest
 
 _PACKAGES = ("numpy", "numba", "scipy", "shapely", "pyarrow", "torch")
-# what computes a result: a task, and everything that may be named by a setting
-_ROOTS = ("runs/task.py", "planners/**/*.py", "sim/traffic/**/*.py")
+# what computes a result, and everything that may be named by a setting
+_SOURCES = (
+    "kernels.py",
+    "data/store/*.py",
+    *(
+        f"{name}/**/*.py"
+        for name in "compat edits geometry metrics planners runs sim world".split()
+    ),
+)
 
 State: TypeAlias = Literal["new", "unfinished", "failed", "complete"]
-_MAX_MESSAGE = 600  # characters
-_DIGEST = re.compile("[0-9a-f]{16,64}")
 _NAMES = {"tokens": "scenarios", "review": "reviews"}  # in messages
-_DIGESTS = ("store", "tokens", "filter", "review", "code")
-# on disk when a run ends, of 15 s in non-reactive traffic with few others, so rather too little
-_BYTES_PER_TASK = 15e3
-_BYTES_PER_ROLLOUT = 73e3
 
 
 def make_manifest(
@@ -80,9 +79,9 @@ def now() -> str:
 def code_digest() -> str:
     """Digest of all sources that results depend on: two versions of them are not mixed."""
     digest = hashlib.blake2b(digest_size=8)
-    roots = [path for pattern in _ROOTS for path in PACKAGE.glob(pattern)]
-    for name, source in sorted(sources(roots).items()):
-        digest.update(f"{name}\n".encode() + source)
+    for path in sorted(path for pattern in _SOURCES for path in PACKAGE.glob(pattern)):
+        name = path.relative_to(PACKAGE).as_posix()
+        digest.update(f"{name}\n".encode() + path.read_bytes())
     return digest.hexdigest()
 
 
@@ -155,40 +154,18 @@ def check_target(folder: Path, fingerprint: dict[str, Any], *, shard: str = "") 
     differs = difference(read_manifest(folder), fingerprint, shard)
     if differs:
         raise ConfigError(
-            f"{str(folder)!r} holds another run: {differs}"[:_MAX_MESSAGE],
+            f"{str(folder)!r} holds another run: {differs}",
             hint="choose another --out, or remove that folder",
         )
     return state
 
 
 def difference(manifest: dict[str, Any], fingerprint: dict[str, Any], shard: str = "") -> str:
-    """What tells a run from the one of a manifest, in words; empty when nothing does."""
+    """The settings that differ from those of a manifest, in words; empty when none does."""
     before = {**manifest.get("determining", {}), "shard": manifest.get("shard", "")}
     after = {**fingerprint, "shard": shard}
     names = [n for n in sorted({*before, *after}) if before.get(n) != after.get(n)]
-    if not names:
-        return ""
-    first = _in_words(names[0], before.get(names[0]), after.get(names[0]))
-    listed = ", ".join(_NAMES.get(name, name) for name in names)
-    return f"{listed} differ{first and f' ({first})'}"
-
-
-def _in_words(name: str, old: Any, new: Any) -> str:
-    """How one setting differs; empty for digests, which say nothing."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        if old.keys() == new.keys():
-            inner = next(key for key in old if old[key] != new[key])
-            return _in_words(f"{name} {inner}", old[inner], new[inner])
-        old, new = list(old), list(new)
-    if any(isinstance(value, str) and _DIGEST.fullmatch(value) for value in (old, new)):
-        return "" if name in _DIGESTS else f"{name} is another"
-    return f"{name}: {_value(old)}, not {_value(new)}"
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, list):
-        return ", ".join(map(str, value)) or "none"
-    return "none" if value in (None, "", {}) else str(value)
+    return f"{', '.join(_NAMES.get(name, name) for name in names)} differ" if names else ""
 
 
 def check_resumable(folder: Path, fingerprint: dict[str, Any], *, shard: str = "") -> None:
@@ -206,26 +183,7 @@ def check_resumable(folder: Path, fingerprint: dict[str, Any], *, shard: str = "
         except (DataError, KeyError):
             continue
         differs = difference(manifest, fingerprint, shard)
-        text = f"no unfinished run with these settings; {str(other)!r} is another one: {differs}"
         raise ConfigError(
-            text[:_MAX_MESSAGE], hint="give its settings, or leave out --resume to begin anew"
-        )
-
-
-def check_space(folder: Path, num_tasks: int, *, with_rollouts: bool) -> None:
-    """Refuse a run that cannot end in its folder, which need not exist yet.
-
-    Raises:
-        ConfigError: The disk has too little space.
-    """
-    place = folder.absolute()
-    while not place.exists():
-        place = place.parent
-    needed = num_tasks * (_BYTES_PER_TASK + _BYTES_PER_ROLLOUT * with_rollouts)
-    free = shutil.disk_usage(place).free
-    if needed > free:
-        raise ConfigError(
-            f"{num_tasks} tasks need about {needed / 1e9:.1f} GB, "
-            f"{str(place)!r} has {free / 1e9:.1f} GB free",
-            hint="choose another --out" + ", or --save-rollouts failed" * with_rollouts,
+            f"no unfinished run with these settings; {str(other)!r} is another one: {differs}",
+            hint="give its settings, or leave out --resume to begin anew",
         )

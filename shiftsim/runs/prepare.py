@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from shiftsim._version import __version__
 from shiftsim.errors import ConfigError, one_of
-from shiftsim.files import require_no_import
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.planners.registry import (
     PLANNERS,
@@ -24,7 +23,7 @@ from shiftsim.planners.registry import (
     takes_argument,
 )
 from shiftsim.runs.config import RunConfig, Value, default_workers, parse_shard
-from shiftsim.runs.manifest import State, check_resumable, check_space, check_target, code_digest
+from shiftsim.runs.manifest import State, check_resumable, check_target, code_digest
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.scenarios import Selection, open_named_store, select_scenarios
 from shiftsim.runs.task import Batch, TaskRunner
@@ -98,7 +97,6 @@ def prepare(
     Raises:
         ShiftsimError: Something is unknown, missing or contradictory.
     """
-    require_no_import()
     # `all` stands for the seven of the benchmark
     names = [
         name for given in config.noise for name in (NOISE_NAMES if given == "all" else [given])
@@ -134,9 +132,6 @@ def prepare(
     tasks = [Task(*run, token) for token in selection.present for run in runs]
     missing = [Batch((Task(*run, token),)) for token in selection.missing for run in runs]
     batches = _of_shard(config.shard, _batches(grouped, tasks, config.batch_size))
-    if before == "new":
-        count = sum(len(batch.tasks) for batch in batches)
-        check_space(folder, count, with_rollouts=config.save_rollouts == "all")
     shared = _on_gpu(config, entries, traffic)
     workers = _workers(config, entries, len(batches), shared)
     plan = RunPlan(

@@ -4,17 +4,17 @@ import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
 
 from shiftsim.errors import ConfigError, DataError
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from shiftsim.runs.rollouts import Task
-    from shiftsim.runs.rollouts.files import Place, RolloutReader
-    from shiftsim.sim.log import SimulationLog
-    from shiftsim.world.scenario import Scenario
+from shiftsim.runs.rollouts import Task, complete_rollout, describe
+from shiftsim.runs.rollouts.files import Place, RolloutReader
+from shiftsim.runs.tables import LOCATION, OK, damaged, read_table, stored_location
+from shiftsim.sim.log import SimulationLog
+from shiftsim.world.scenario import Scenario
 
 FORMAT_VERSION = 5
 JOURNAL = "unfinished.sqlite"  # of a run under way
@@ -41,12 +41,8 @@ class Run:
     manifest: dict[str, Any]
 
     @cached_property
-    def scores(self) -> "pa.Table":
+    def scores(self) -> pa.Table:
         """One row per finished task: closed-loop score and metric scores."""
-        import pyarrow.compute as pc
-
-        from shiftsim.runs.tables import OK, damaged, read_table
-
         path, key = self.path / "scores.parquet", ["planner", "noise", "seed", "token"]
         scores, is_done = read_table(path), pc.equal(self.tasks["status"], OK)
         if not scores.select(key).equals(self.tasks.filter(is_done).select(key)):
@@ -54,25 +50,18 @@ class Run:
         return scores
 
     @cached_property
-    def metrics(self) -> "pa.Table":
+    def metrics(self) -> pa.Table:
         """One row per finished task and metric: value, threshold, first violation."""
-        from shiftsim.runs.tables import read_table
-
         return read_table(self.path / "metrics.parquet")
 
     @cached_property
-    def tasks(self) -> "pa.Table":
+    def tasks(self) -> pa.Table:
         """One row per task: status, error, durations."""
-        from shiftsim.runs.tables import read_table
-
         return read_table(self.path / "tasks.parquet")
 
     @cached_property
-    def rollout_places(self) -> "dict[Task, Place | None]":
+    def rollout_places(self) -> dict[Task, Place | None]:
         """Where every rollout is stored; None where there is none."""
-        from shiftsim.runs.rollouts import Task
-        from shiftsim.runs.tables import LOCATION, stored_location
-
         keys, places = (
             zip(*(self.tasks[name].to_pylist() for name in names), strict=True)
             for names in (Task._fields, LOCATION)
@@ -82,24 +71,20 @@ class Run:
             for key, place in zip(keys, places, strict=True)
         }
 
-    def rollout(self, task: "Task", scenario: "Scenario") -> "SimulationLog":
+    def rollout(self, task: Task, scenario: Scenario) -> SimulationLog:
         """One stored rollout; its scenario is that of the store the run was made with.
 
         Raises:
             DataError: It was not stored, cannot be read, or the scenario is another one.
         """
-        from shiftsim.runs.rollouts import complete_rollout
-
         return complete_rollout(self.rollout_rows(task), scenario, task)
 
-    def rollout_rows(self, task: "Task") -> "pa.RecordBatch":
+    def rollout_rows(self, task: Task) -> pa.RecordBatch:
         """One stored rollout as it lies on disk, a row per sample.
 
         Raises:
             DataError: It was not stored, or cannot be read.
         """
-        from shiftsim.runs.rollouts import describe
-
         place = self.rollout_places.get(task)
         if place is None:
             raise DataError(
@@ -109,9 +94,7 @@ class Run:
         return self._reader.read(place)
 
     @cached_property
-    def _reader(self) -> "RolloutReader":
-        from shiftsim.runs.rollouts.files import RolloutReader
-
+    def _reader(self) -> RolloutReader:
         return RolloutReader()
 
     @property

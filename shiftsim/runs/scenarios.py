@@ -37,7 +37,7 @@ def open_named_store(name: str) -> ScenarioStore:
         return open_store(name)
     path = store_path(name)
     if name == DEFAULT_STORE and not path.exists():
-        from shiftsim.data.demo.store import demo_store
+        from shiftsim.data.synthetic.store import demo_store
 
         path = demo_store(path)
     if not path.exists():

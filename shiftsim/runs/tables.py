@@ -123,16 +123,9 @@ class TaskResult:
         }
 
 
-def stored_location(
-    run: Path, rollout: str | None, rollout_row: int | None, rollout_rows: int | None
-) -> Place | None:
+def stored_location(run: Path, rollout: str | None, row: Any, rows: Any) -> Place | None:
     """Where a rollout of a run is, by the columns of `tasks.parquet`."""
-    if not rollout:
-        return None
-    if rollout_row is None or rollout_rows is None:
-        what = f"'rollout_row' or 'rollout_rows' is empty where 'rollout' is {rollout!r}"
-        raise damaged(run / "tasks.parquet", what)
-    return Place(part_file(run / FOLDER, rollout), rollout_row, rollout_rows)
+    return Place(part_file(run / FOLDER, rollout), row, rows) if rollout else None
 
 
 def stored_results(run: Path) -> Iterator[TaskResult]:

@@ -39,7 +39,7 @@ class SimulationLog:
 
     Example:
         ```python
-        log = shiftsim.simulate(shiftsim.open_store("demo")["03b23c"], "idm")
+        log = shiftsim.simulate(shiftsim.open_store("demo")["01f13e"], "idm")
         print(log.ego[-1, :2], log.commands[:, 0].min())
         ```
     """

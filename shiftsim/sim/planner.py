@@ -142,7 +142,7 @@ class Planner(Protocol):
                 return shiftsim.Command(acceleration=-0.5, steering_rate=0.0)
 
 
-        print(shiftsim.simulate(shiftsim.open_store("demo")["03b23c"], Coast()))
+        print(shiftsim.simulate(shiftsim.open_store("demo")["01f13e"], Coast()))
         ```
     """
 

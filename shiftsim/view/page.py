@@ -52,7 +52,7 @@ def show(scenario: Scenario, **logs: SimulationLog) -> Page:
 
     Example:
         ```python
-        scenario = shiftsim.open_store("demo")["03b23c"]
+        scenario = shiftsim.open_store("demo")["01f13e"]
         logs = {name: shiftsim.simulate(scenario, name) for name in ("idm", "log-future")}
         shiftsim.show(scenario, **logs).save("replay.html")
         ```

@@ -58,7 +58,7 @@ class Scenario:
 
     Example:
         ```python
-        scenario = shiftsim.open_store("demo")["03b23c"]
+        scenario = shiftsim.open_store("demo")["01f13e"]
         print(scenario.num_iterations, scenario.expert[:, :2], scenario.route)
         ```
     """

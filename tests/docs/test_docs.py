@@ -37,10 +37,10 @@ from track_files import table_of, write_tracks
 
 import shiftsim
 from shiftsim.benchmarks import load_track
-from shiftsim.data.demo import store as synthetic
 from shiftsim.data.readers.dsc3d import open_site
 from shiftsim.data.store import map as store_map
 from shiftsim.data.store import schema
+from shiftsim.data.synthetic import store as synthetic
 from shiftsim.metrics import MULTIPLIERS, PROFILES, SHORT_NAMES, WEIGHTS
 from shiftsim.planners.registry import PLANNERS
 from shiftsim.report.words import LONG
@@ -90,11 +90,11 @@ def material(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The demo store, recordings, logs, tables and maps that the pages speak of."""
     folder = tmp_path_factory.mktemp("material")
     synthetic.write_demo(folder / "towns")
-    synthetic.convert_demo(folder / "towns", folder / "shiftsim-data" / "demo")
+    synthetic.demo_store(folder / "shiftsim-data" / "demo")
     (folder / "dsc3d").mkdir()
     (folder / "towns" / "junction").rename(folder / "dsc3d" / "sindelfingen")
+    _write_tracks(folder, folder / "towns" / "parking")
     shutil.rmtree(folder / "towns")
-    _write_tracks(folder, folder / "dsc3d" / "sindelfingen")
     golden = REPOSITORY / "tests" / "golden" / "nuplan_format"
     for name in ("logs", "maps"):
         shutil.copytree(golden / name, folder / "nuplan" / name)

@@ -7,8 +7,8 @@ from episodes import expert_account, replay, totals
 from parity_cases import Scenes
 from rollouts import WORLDS, load_world
 
-from shiftsim.data.demo.store import demo_store
 from shiftsim.data.store.reading import open_store
+from shiftsim.data.synthetic.store import demo_store
 from shiftsim.env.driving import DrivingEnv
 from shiftsim.metrics import measure
 from shiftsim.sim.log import as_recorded

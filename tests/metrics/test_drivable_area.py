@@ -12,9 +12,10 @@ import shapely
 from hypothesis import given
 from strategies import seeds
 
-from shiftsim.data.demo.scenes import demo_sites
 from shiftsim.data.maps.opendrive.map import build_road_map
 from shiftsim.data.maps.opendrive.reading import read_opendrive
+from shiftsim.data.synthetic.recordings import generate_town
+from shiftsim.data.synthetic.store import DEMO_TOWNS
 from shiftsim.errors import MapError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.metrics.drivable_area import DrivableArea, evaluate, measure
@@ -236,8 +237,9 @@ def check_files(paths: list[Path], count: int) -> int:
 
 @pytest.mark.slow
 def test_ten_thousand_boxes_in_the_towns_of_the_demo_agree_with_shapely(tmp_path):
-    for site in demo_sites():
-        (tmp_path / f"{site.name}.xodr").write_text(site.town().network.xml(), "utf-8")
+    for town in DEMO_TOWNS:
+        xml = generate_town(town)[0].network.xml()
+        (tmp_path / f"{town.name}.xodr").write_text(xml, "utf-8")
     check_files(sorted(tmp_path.glob("*.xodr")), 10_000)
 
 

@@ -19,6 +19,7 @@ from parity_cases import (
 from parity_nets import (
     ANY,
     FILE_COLUMNS,
+    HYPER_PARAMETERS,
     Loop,
     compare_manifest,
     loop_steps,
@@ -54,7 +55,10 @@ def outputs(network: Any, *inputs: np.ndarray) -> tuple[dict[str, Any], dict[str
         features = encoder(pictures, measured)
         policy = network.policy(features)
         beta: Any = Beta(policy.alpha, policy.beta)
-        encoded = {"cnn_flat": encoder.see(pictures), "state_latent": encoder.feel(measured)}
+        encoded = {
+            "cnn_flat": encoder.encode_raster(pictures),
+            "state_latent": encoder.state_linear(measured),
+        }
         heads = {
             "action": policy.action,
             "alpha": policy.alpha,
@@ -162,7 +166,7 @@ WEIGHTS = {
 def manifest(network: Any) -> dict[str, Any]:
     return {
         "checkpoint": dict.fromkeys(("file", "container", "prefix", "loading", "config"), ANY),
-        "hyper": network.RELEASED,
+        "hyper": HYPER_PARAMETERS["carl"],
         "drive_overrides": {
             "dist_mu.0.weight, dist_sigma.0.weight": (
                 "base value, then row 0 times 4 and row 1 times 0.05"

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import places
 import pytest
+import shapely
 from parity_cases import (
     Cases,
     File,
@@ -37,11 +38,12 @@ from parity_nets import (
 
 torch = pytest.importorskip("torch")
 
+from parity_guidance import with_guidance  # noqa: E402
+
 from shiftsim.planners.learned.deterministic import keyed_normals  # noqa: E402
 from shiftsim.planners.learned.diffusion import features as builder  # noqa: E402
-from shiftsim.planners.learned.diffusion import kernels  # noqa: E402
-from shiftsim.planners.learned.diffusion.network import DEFAULT_ARGS, sampler  # noqa: E402
-from shiftsim.planners.learned.diffusion.network.guidance import with_guidance  # noqa: E402
+from shiftsim.planners.learned.diffusion import network_sampler as sampler  # noqa: E402
+from shiftsim.planners.learned.diffusion.network import DEFAULT_ARGS  # noqa: E402
 from shiftsim.planners.learned.diffusion.planner import (  # noqa: E402
     INPUTS,
     NOISE_SHAPE,
@@ -137,7 +139,7 @@ def test_forward(path: Path, cases: Cases) -> None:
     network = make_planner(KeyedPlanner, "base").network
     with torch.no_grad():
         scene = network.normalise(inputs)
-        route = network.dit[0].route_encoder(scene["route_lanes"])
+        route = network.dit.route_encoder(scene["route_lanes"])
         encoded = {"encoding": network.encode(scene), "route_encoding": route}
     normalised = {name: scene[name] for name in network.normalisers}
     file.below("norm.").match(file.name, normalised, NORMALISED, quantity=f"{NAME} normalised")
@@ -163,12 +165,12 @@ def sample(
     """
     network = make_planner(KeyedPlanner, variant).network
     current, absent = network.present(scene)
-    prepared, noise = network.prepare(scene, absent), torch.from_numpy(start)
+    context, noise = network.context(scene, absent), torch.from_numpy(start)
     egos, outputs = [], []
 
     def call(x: Any, number: int) -> Any:
         egos.append(x[0, 0].clone())
-        outputs.append(prepared(x, number))
+        outputs.append(network.dit(x, number, context))
         return outputs[-1]
 
     def sampled(function: Callable[[Any, int], Any]) -> Any:
@@ -220,7 +222,7 @@ def test_many_agents(path: Path, cases: Cases) -> None:
     """Which agents and objects are kept where there are too many, and their histories."""
     file = read_file(path, cases, path.stem)
     match_meta(file, NAME, frame_columns=["track", *TRACK_COLUMNS[1:]])
-    if f"in.frame{kernels.SAMPLES:02d}" in file:
+    if f"in.frame{builder.SAMPLES:02d}" in file:
         file.note("older than what the network reads; says no more than the types", "in.frame00")
     found = builder.agent_features(recorded_tracks(file), file.take("in.anchor", 3))
     ours = dict(zip(("agents", "static", "selected"), found, strict=True))
@@ -257,12 +259,12 @@ def test_many_lanes(path: Path, cases: Cases) -> None:
     index = {name: block for block, name in enumerate(dict.fromkeys(owner))}
     limits = np.where(file["in.has_limit"], file["in.limit"].astype(np.float64), np.nan)
     blocks = np.array([index[name] for name in owner], np.int64)
-    resampled = kernels.resample_lanes(lines, left, right)
-    lanes = kernels.LaneLines(resampled, kernels.line_bounds(lines), limits, blocks)
+    resampled = builder.resample_lanes(lines, left, right)
+    lanes = builder.LaneLines(resampled, limits, blocks, shapely.STRtree([]))
     # the lanes come in the order of the distance to their areas, which are not there
     point = make_polygons([[anchor[:2] + np.array([[0, 0], [1, 0], [0, 1.0]])]] * len(owner))
     rows = np.arange(len(owner))
-    edges = kernels.nearest_lanes(rows, point, lines, anchor[0], anchor[1], builder.LANES)
+    edges = builder.nearest_lanes(rows, point, lines, anchor[0], anchor[1], builder.LANES)
     lights = file.take("in.light", len(owner), 4)
     once = np.ones(len(owner), np.int64)
     cases.compare(f"{NAME} lights", file.name, lights.sum(axis=1), once)
@@ -286,7 +288,7 @@ def manifest(network: Any) -> dict[str, Any]:
         "'<scenario token>:<iteration>' in closed loop",
         "checkpoint": {
             **{"file": ANY, "container": ANY},
-            "prefix": f"{network.PREFIXES[0]}{ANY}",
+            "prefix": f"module.{ANY}",
             "used_key": f"ema_state_dict {ANY}",
         },
         "drive_overrides": {

@@ -25,22 +25,12 @@ from parity_cases import (
 from shiftsim.data.maps.opendrive.lanes import LaneKey
 from shiftsim.data.maps.opendrive.map import Origin, build_road_map
 from shiftsim.data.maps.opendrive.reading import read_opendrive
-from shiftsim.data.readers.deepplan.recording import Converted, convert_recording
-from shiftsim.data.readers.deepplan.states import rows_between, sample_runs
-from shiftsim.data.readers.deepplan.windows import (
-    EGO,
-    ROW_S,
-    ConversionConfig,
-    find_runs,
-    judge_windows,
-)
-from shiftsim.data.readers.dsc3d.recording import (
-    Annotations,
-    Site,
-    find_map,
-    open_site,
-    read_recording,
-)
+from shiftsim.data.readers.annotations import Annotations, Site, read_recording
+from shiftsim.data.readers.dsc3d import find_map, open_site
+from shiftsim.data.readers.reader import SourceRecording, site_map
+from shiftsim.data.readers.samples import ROW_S, find_runs, rows_between, sample_run
+from shiftsim.data.readers.scenarios import Converted, convert_recording
+from shiftsim.data.readers.windows import EGO, ConversionConfig, evaluate_windows, window_spans
 from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.metrics.route import driven_route
 from shiftsim.world.state import center_poses
@@ -137,10 +127,11 @@ def compare_samples(file: File, recording: Annotations) -> None:
     run = np.repeat(np.arange(len(first)), last - first + 1)
     step = np.concatenate([*map(np.arange, first, last + 1)])
     time = step * ROW_S
-    samples = sample_runs(recording, runs, run, time)
+    parts = [sample_run(recording, runs, i, time[run == i]) for i in range(len(first))]
+    poses, velocities, _ = map(np.concatenate, zip(*parts, strict=True))
     ours = {"track_id": recording.track_ids[runs.track[run]], "step": step, "t": time}
-    ours |= dict(zip(("x", "y", "yaw"), samples.poses.T, strict=True))
-    ours |= dict(zip(("vx", "vy"), samples.velocities.T, strict=True))
+    ours |= dict(zip(("x", "y", "yaw"), poses.T, strict=True))
+    ours |= dict(zip(("vx", "vy"), velocities.T, strict=True))
     file.match("recording", ours, ATOL)
     file.finish()
 
@@ -221,7 +212,11 @@ def compare_scripted(folder: Path, maps: Path, cases: Cases) -> None:
     here = [maps / expected["map"], folder / "data/map/map.xodr"]
     if found := next(filter(Path.is_file, here), None):
         lanes = Lanes(found, site)
-        converted = convert_recording(recording, lanes.road, lanes.offset, CONFIG)
+        spans = window_spans(recording.duration, CONFIG)
+        source = SourceRecording(
+            recording, site_map(lanes.road, {}), config=CONFIG, spans=spans, offset=lanes.offset
+        )
+        converted = convert_recording(source)
         compare_converted(folder, converted, lanes, lanes_from, cases)
     else:
         cases.skip(f"lane sequences and poses: map {expected['map']} not found (--maps)")
@@ -233,7 +228,8 @@ def compare_scripted(folder: Path, maps: Path, cases: Cases) -> None:
 def compare_windows(expected: File, recording: Annotations, name: str) -> dict[Any, Any]:
     """Windows and verdicts; what the file says of lanes, by window and ego."""
     cases, track_ids, lanes_from = expected.report, recording.track_ids.tolist(), {}
-    windows = judge_windows(recording, find_runs(recording, CONFIG.max_hole_s), CONFIG)
+    runs, spans = find_runs(recording, CONFIG.max_hole_s), window_spans(recording.duration, CONFIG)
+    windows = evaluate_windows(recording, runs, CONFIG, spans)
     wanted = expected.each("windows")
     cases.compare("windows", name, len(windows), len(wanted))
     for window, theirs in zip(windows, wanted, strict=False):

@@ -35,15 +35,13 @@ from parity_nets import (
 
 torch = pytest.importorskip("torch")
 
-from shiftsim.planners.learned import features as builder  # noqa: E402
+from shiftsim.planners.learned.checkpoint import network_module  # noqa: E402
+from shiftsim.planners.learned.features import STEP, plan_of_poses  # noqa: E402
 from shiftsim.planners.learned.map_features import CROSSWALK  # noqa: E402
-from shiftsim.planners.learned.match import network_module  # noqa: E402
-from shiftsim.planners.learned.plan_states import STEP, plan_of_poses  # noqa: E402
 from shiftsim.planners.learned.plantf.planner import PlanTF, make_batch  # noqa: E402
-from shiftsim.planners.learned.pluto import brake, scoring  # noqa: E402
-from shiftsim.planners.learned.pluto import inputs as pluto_inputs  # noqa: E402
-from shiftsim.planners.learned.pluto.planner import Pluto  # noqa: E402
-from shiftsim.planners.learned.pluto.proposals import headings_of  # noqa: E402
+from shiftsim.planners.learned.pluto import planner as pluto_planner  # noqa: E402
+from shiftsim.planners.learned.pluto import scoring  # noqa: E402
+from shiftsim.planners.learned.pluto.planner import Pluto, headings_of  # noqa: E402
 from shiftsim.world.state import NUM_STATE, PACIFICA, VX, VY  # noqa: E402
 
 pytestmark = [pytest.mark.golden, pytest.mark.learned, pytest.mark.slow]
@@ -102,7 +100,7 @@ def likeliest(trajectory: Any, probability: Any) -> Any:
 
 def plantf_outputs(network: Any, inputs: Any) -> dict[str, Any]:
     with torch.no_grad():
-        said = network(inputs, predict=True)._asdict()
+        said = network(inputs)._asdict()
     made = {name: value.numpy() for name, value in said.items()}
     poses = likeliest(made["trajectory"], made["probability"])
     names = ("probability", "prediction", "trajectory")
@@ -221,7 +219,7 @@ def compare_inputs(stored: File, planner: str, radius: float, codes: set[str]) -
     names = ("position", "heading", "velocity", "shape")
     position, heading, velocity, shape = (given[f"agent.{name}"] for name in names)
     ours["agent.position"][:, 0, -1] = ours["agent.heading"][:, 0, -1] = 0.0
-    ours["agent.shape"][:, 0] = builder.EGO_WIDTH, builder.EGO_LENGTH
+    ours["agent.shape"][:, 0] = PACIFICA.width, PACIFICA.length
     ours["agent.category"][:, 0], ours["agent.valid_mask"][:, 0] = 0.0, 1.0
     ours["current_state"][:, :3], ours["current_state"][:, 3] = 0.0, velocity[:, 0, -1, 0]
     for name in {"agent.target", "reference_line.future_projection"} & set(ours):
@@ -361,18 +359,16 @@ def compare_choice(loop: Loop) -> None:
 
 def compare_stored(loop: Loop) -> None:
     """Features, raw outputs, and what the scores of the stored proposals are."""
-    from shiftsim.planners.learned.pluto.network import Inputs
-
     compare_pluto_features(loop)
     choice, stored = loop.planner.choice, loop.stored.below("post/")
-    batch = Inputs(*pluto_inputs.stack([loop.features], "cpu"))
+    batch = pluto_planner.make_batch([loop.features], "cpu")
     compare_network(loop, pluto_outputs, batch)
     agents, proposals = choice.agents, np.ascontiguousarray(stored["cand"])
     agents = agents._replace(poses=stored["agents_pred"], speeds=stored["agents_vel"])
     scores = loop.planner.rate(loop.seen, proposals, stored["lscore"], agents).scores
-    sight = loop.planner.sight
-    line = scoring.nearest_line(sight.lines, loop.seen.history.ego[-1])
-    tokens = [loop.tracks.tokens[i] for i in sight.agents.tracks]
+    seen = loop.planner.surroundings
+    line = scoring.nearest_line(seen.lines, loop.seen.history.ego[-1])
+    tokens = [loop.tracks.tokens[i] for i in seen.agents.tracks]
     loop.match(stored, {"agents_tok": tokens, "baseline": line}, SCORED)
     ours = {
         "rule": scores.rule,
@@ -389,8 +385,8 @@ def compare_stored(loop: Loop) -> None:
 
 def compare_pluto_features(loop: Loop) -> None:
     """Compare what was made before the network."""
-    sight, given, road = loop.planner.sight, loop.features, loop.road
-    near, lines = sight.road, sight.lines
+    seen, given, road = loop.planner.surroundings, loop.features, loop.road
+    near, lines = seen.road, seen.lines
     blocks = [
         0 if kind == CROSSWALK else int(road.blocks.ids[road.block_of[row]])
         for row, kind in zip(near.objects.tolist(), near.kind.tolist(), strict=True)
@@ -405,7 +401,7 @@ def compare_pluto_features(loop: Loop) -> None:
         "reference_line.valid_mask": given.line_valid,
         "reference_line.future_projection": np.zeros((len(lines), 8, 2)),
     }
-    compare_features(loop, sight.agents, near, loop.planner.route.blocks, more)
+    compare_features(loop, seen.agents, near, loop.planner.route.blocks, more)
     stored = loop.stored.below("reference_line_")
     loop.compare("reference lines", len(lines), len(list(stored)))
     numbered = {str(number): line for number, line in enumerate(lines)}
@@ -435,9 +431,9 @@ def test_emergency_brake(path: Path, cases: Cases) -> None:
     for number, case in enumerate(rows := file.array_rows()):
         ego, time = case.take("ego", NUM_STATE), float(case["fault_time"])
         speed = float(np.hypot(ego[VX], ego[VY]))
-        braked, states = brake.must_brake(speed, time), np.full((81, NUM_STATE), np.nan)
+        braked, states = scoring.must_brake(speed, time), np.full((81, NUM_STATE), np.nan)
         if braked:
-            states = brake.brake(case["candidate"], ego, time, PACIFICA)
+            states = scoring.brake(case["candidate"], ego, time, PACIFICA)
         ours = {"speed": speed, "braked": braked, "states": states}
         case.match(f"case {number}", ours, {"speed": LINE, "": STATE})
     rows[-1].finish()

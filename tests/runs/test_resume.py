@@ -252,30 +252,6 @@ def test_a_full_disk_keeps_what_is_finished(toy, tmp_path, undisturbed, monkeypa
     assert content(run) == content(undisturbed)
 
 
-@pytest.mark.parametrize(
-    ("kept", "free", "message"),
-    [
-        ("all", 500e3, r"12 tasks need about 0\.0 GB, '.*' has 0\.0 GB free"),
-        ("none", 50e3, "12 tasks need about"),
-        ("none", 500e3, ""),
-        ("all", 2e6, ""),
-    ],
-)
-def test_a_run_that_the_disk_cannot_hold_is_refused(
-    toy, tmp_path, monkeypatch, kept, free, message
-):
-    usage = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=free))
-    config = settings(toy, tmp_path / "not" / "yet" / "run", save_rollouts=kept, **NOISY)
-    if not message:
-        prepare(config)
-        return
-    with pytest.raises(ConfigError, match=message) as caught:
-        prepare(config)
-    assert ("--save-rollouts failed" in caught.value.hint) == (kept == "all")
-    assert not (tmp_path / "not").exists()
-
-
 def test_a_result_that_does_not_fit_on_the_disk_is_taken_back(tmp_path):
     writer = RunWriter(tmp_path / "run", {"format": 3})
     writer.add(TaskResult(Task("p", "none", 0, "a"), "ok", rollout=b"some bytes of a rollout"))

@@ -116,19 +116,11 @@ def test_a_mirrored_raster_is_that_of_the_mirrored_world(rng):
     frame = np.array([0.0, 0.0, 1.0, 0.0])
     left, right = np.zeros((2, 9, 256, 256), np.uint8)
     for raster, sign in ((left, 1.0), (right, -1.0)):
-        scratch = np.zeros((4, 2), np.int64)
         box = (10.3, sign * 7.21, sign * 0.4, 4.6, 2.1)
-        draw_box(raster[view.VEHICLES], frame, box, scratch)
+        view.draw_box(raster[view.VEHICLES], frame, *box, 200)
     # the corners of a box are cut to whole pixels, of which some lie one aside
     assert (left[:, ::-1] != right).sum() <= 8
     assert (right != 0).sum() > 40
-
-
-def draw_box(raster, frame, box, ring):
-    from shiftsim.planners.learned.carl.raster import make_crossings
-
-    scratch = view.Scratch(ring, make_crossings(256, 4), np.zeros(1, bool), np.zeros(1, bool))
-    view.draw_box(raster, frame, *box, 200, scratch)
 
 
 def test_mirrored_measurements_are_those_of_the_mirrored_ego(rng):

@@ -14,18 +14,10 @@ import numpy as np
 from shiftsim.data.readers.codes import KINDS, normalise_category
 from shiftsim.errors import ConfigError, ConversionError, nearest, one_of
 
-TIME, FRAME, POSITION, HEADING, SIZE, VELOCITY = (
-    "time",
-    "frame",
-    "position",
-    "heading",
-    "size",
-    "velocity",
-)
 # our name -> quantity, and names in other files, the surest first
 _ROLES = {
-    "time": (TIME, "time timestamp timestampus t timesteptime globaltime seconds simtime"),
-    "frame": (FRAME, "frame frameid row framenumber frameindex timestep step"),
+    "time": ("time", "time timestamp timestampus t timesteptime globaltime seconds simtime"),
+    "frame": ("frame", "frame frameid row framenumber frameindex timestep step"),
     "id": (
         "",
         "trackid track objectid objid agentid vehicleid tracktoken participantid actorid carid id",
@@ -34,25 +26,25 @@ _ROLES = {
         "",
         "kind category class agenttype objecttype objectclass vehicleclass vehicletype type label",
     ),
-    "x": (POSITION, "xcenter centerx x positionx posx translationx vehiclex utmx easting"),
-    "y": (POSITION, "ycenter centery y positiony posy translationy vehicley utmy northing"),
-    "heading": (HEADING, "heading yaw psi orientation hdg theta headingangle vehicleangle angle"),
-    "length": (SIZE, "length vehiclelength len dimensionx l vlength"),
-    "width": (SIZE, "width vehiclewidth dimensiony w vwidth"),
-    "vx": (VELOCITY, "vx xvelocity velocityx velx xspeed speedx"),
-    "vy": (VELOCITY, "vy yvelocity velocityy vely yspeed speedy"),
-    "speed": (VELOCITY, "speed v vel velocity vvel absvelocity vehiclespeed"),
+    "x": ("position", "xcenter centerx x positionx posx translationx vehiclex utmx easting"),
+    "y": ("position", "ycenter centery y positiony posy translationy vehicley utmy northing"),
+    "heading": ("heading", "heading yaw psi orientation hdg theta headingangle vehicleangle angle"),
+    "length": ("size", "length vehiclelength len dimensionx l vlength"),
+    "width": ("size", "width vehiclewidth dimensiony w vwidth"),
+    "vx": ("velocity", "vx xvelocity velocityx velx xspeed speedx"),
+    "vy": ("velocity", "vy yvelocity velocityy vely yspeed speedy"),
+    "speed": ("velocity", "speed v vel velocity vvel absvelocity vehiclespeed"),
 }
 ROLES = tuple(_ROLES)
 # what a unit is multiplied by to become ours
 UNITS: dict[str, dict[str, float]] = {
-    TIME: {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3},  # to us
-    POSITION: {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "km": 1000.0},
-    HEADING: {"rad": 1.0, "deg": np.pi / 180.0, "compass": np.pi / 180.0},
-    VELOCITY: {"mps": 1.0, "kmh": 1 / 3.6, "mph": 0.44704, "cmps": 0.01, "ftps": 0.3048},
+    "time": {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3},  # to us
+    "position": {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "km": 1000.0},
+    "heading": {"rad": 1.0, "deg": np.pi / 180.0, "compass": np.pi / 180.0},
+    "velocity": {"mps": 1.0, "kmh": 1 / 3.6, "mph": 0.44704, "cmps": 0.01, "ftps": 0.3048},
 }
-UNITS[SIZE] = UNITS[POSITION]
-_USUAL = {TIME: "s", POSITION: "m", HEADING: "rad", SIZE: "m", VELOCITY: "mps"}
+UNITS["size"] = UNITS["position"]
+_USUAL = {"time": "s", "position": "m", "heading": "rad", "size": "m", "velocity": "mps"}
 _SPELLINGS = {"m/s": "mps", "km/h": "kmh", "kph": "kmh", "kmph": "kmh", "sec": "s", "msec": "ms"}
 _SPELLINGS |= {"µs": "us", "feet": "ft", "degrees": "deg", "degree": "deg", "radians": "rad"}
 _SPELLINGS |= {"cm/s": "cmps", "ft/s": "ftps", "meters": "m", "metres": "m"}

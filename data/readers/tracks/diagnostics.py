@@ -6,12 +6,12 @@ on the map. Every explanation that is known is tried; the one that makes the num
 
 import numpy as np
 
-from shiftsim.data.readers.build import MAX_PAUSE_S, MAX_SPAN_S, index_ids
+from shiftsim.data.readers.build import find_pause, find_twice
 from shiftsim.data.readers.codes import KINDS
 from shiftsim.data.readers.motion import contradiction
 from shiftsim.data.readers.tracks.axes import check_headings, check_reference, check_velocities
 from shiftsim.data.readers.tracks.columns import UNITS, Columns
-from shiftsim.data.readers.tracks.map_fit import Fit, fit_map
+from shiftsim.data.readers.tracks.map_fit import MIN_ALONG, Fit, fit_map
 from shiftsim.data.readers.tracks.statistics import (
     FAST,
     LEAST_CONTRADICTING,
@@ -19,7 +19,7 @@ from shiftsim.data.readers.tracks.statistics import (
     TrackStatistics,
 )
 from shiftsim.data.readers.tracks.table import TrackTable
-from shiftsim.kernels import BoolArray, FloatArray
+from shiftsim.kernels import BoolArray
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AgentKind
 
@@ -54,21 +54,19 @@ def diagnose(table: TrackTable, road: VectorMap, min_share: float) -> Diagnostic
             f" known are {', '.join(sorted(KINDS))}",
         )
         return out
-    vehicles = [KINDS.get(name) == AgentKind.VEHICLE for name in table.categories]
-    is_vehicle = np.array(vehicles, np.bool_)[table.category]
-    if not is_vehicle.any():
+    time = (table.time_us - table.time_us.min()) / 1e6
+    same = np.diff(table.track) == 0
+    step = np.diff(table.time_us)[same] / 1e6
+    stats = TrackStatistics(table, time, float(np.median(step)) if len(step) else 0.0)
+    if not stats.is_vehicle.any():
         out.error(
             f"none of the {len(table.track_ids)} objects is a vehicle, so none can be the ego:"
             f" kinds {', '.join(map(repr, table.categories))}",
             "check the column of kinds, or map them: [kinds]",
         )
         return out
-    same = np.diff(table.track) == 0
-    step = np.diff(table.time_us)[same] / 1e6
-    if not _check_times(table, step, out):
+    if not _check_times(stats, out):
         return out
-    time = (table.time_us - table.time_us.min()) / 1e6
-    stats = TrackStatistics(table, is_vehicle, time, float(np.median(step)))
     if not (_check_jumps(stats, same, out) and _check_speeds(stats, out)):
         return out
     moving = stats.rows(_MOVING)
@@ -97,34 +95,23 @@ def diagnose(table: TrackTable, road: VectorMap, min_share: float) -> Diagnostic
     return out
 
 
-def _check_times(table: TrackTable, step: FloatArray, out: Diagnostics) -> bool:
+def _check_times(stats: TrackStatistics, out: Diagnostics) -> bool:
     """Whether the motion of objects can be determined at all."""
-    if not len(step):
+    table, period = stats.table, stats.period
+    if len(stats.ends) == len(table.track) + 1:
         out.error(
             f"each of the {len(table.track_ids)} objects has one row only",
             "check the column of ids: an object needs the same id in all its rows",
         )
         return False
-    twice = np.flatnonzero((np.diff(table.track) == 0) & (np.diff(table.time_us) == 0))
-    if len(twice):
-        name = table.track_ids[table.track[twice[0]]].item()
-        when = (table.time_us[twice[0]] - table.time_us.min()) / 1e6
-        out.error(
-            f"object {name!r} has two rows at {when:g} s ({len(twice)} such rows): rows are"
-            " repeated, or one id names two objects",
-            "leave repeated rows out, give objects ids of their own, and check the unit of time",
-        )
+    if fault := find_twice(table.track_ids, table.track, table.time_us):
+        out.error(*fault)
         return False
-    period = float(np.median(step))
     slow, fast = _RATES
-    span = float(np.ptp(table.time_us)) / 1e6
     if 0.99 / fast <= period <= 1.01 / slow:
-        if span > MAX_SPAN_S:
-            out.error(
-                f"the rows span {span:g} s, more than {MAX_SPAN_S:g} s",
-                "leave out rows with a wrong time, check its unit, or convert parts by themselves",
-            )
-        return span <= MAX_SPAN_S
+        if fault := find_pause(table.time_us):
+            out.error(*fault)
+        return fault is None
     column = table.columns.found.get("time")
     remedy = "check the unit of time: [units] time = 's', 'ms', 'us' or 'ns'"
     if column is not None and table.hz is None:
@@ -145,21 +132,13 @@ def _check_times(table: TrackTable, step: FloatArray, out: Diagnostics) -> bool:
 
 
 def _check_gaps(table: TrackTable, out: Diagnostics) -> None:
-    stamps, _ = index_ids(table.time_us)
-    gaps = np.flatnonzero(np.diff(stamps) > _MAX_GAP * 1e6)
-    if len(gaps):
-        first = gaps[np.diff(stamps)[gaps].argmax()]
-        begin, end = (stamps[first : first + 2] - stamps[0]) / 1e6
-        if end - begin > MAX_PAUSE_S:
-            out.error(
-                f"no object has a row between {begin:g} s and {end:g} s, at most {MAX_PAUSE_S:g} s",
-                "if the clock begins anew at midnight, add a day to the times after it; if two"
-                " recordings were joined, convert each by itself",
-            )
-            return
+    stamps = np.unique(table.time_us) / 1e6
+    gaps = np.diff(stamps)
+    if gaps.max() > _MAX_GAP:
+        begin, end = stamps[gaps.argmax() :][:2] - stamps[0]
         out.warn(
-            f"no object has a row between {begin:g} s and {end:g} s ({len(gaps)} such gaps of more"
-            f" than {_MAX_GAP:g} s)",
+            f"no object has a row between {begin:g} s and {end:g} s"
+            f" ({np.count_nonzero(gaps > _MAX_GAP)} such gaps of more than {_MAX_GAP:g} s)",
             "no scenario reaches over it; if two recordings were joined, convert each by itself",
         )
 
@@ -269,8 +248,7 @@ def _check_accelerations(stats: TrackStatistics, out: Diagnostics) -> None:
 
 def _check_walkers(stats: TrackStatistics, out: Diagnostics) -> None:
     """How fast pedestrians walk while they do, the same whatever a clock counts."""
-    walks = [KINDS.get(name) == AgentKind.PEDESTRIAN for name in stats.table.categories]
-    is_walker = np.array(walks, np.bool_)[stats.table.category[stats.ends[:-1]]]
+    is_walker = stats.is_of(AgentKind.PEDESTRIAN)[stats.ends[:-1]]
     speeds = []
     for first, stop in zip(stats.ends[:-1][is_walker], stats.ends[1:][is_walker], strict=True):
         way = stats.table.xy[stop - 1] - stats.table.xy[first]
@@ -299,7 +277,7 @@ def _check_fit(fit: Fit, columns: Columns, min_share: float, out: Diagnostics) -
     else:
         what = (
             f"only {fit.along:.0%} of the moving vehicles drive along the lane they are on, need"
-            f" {fit.min_along:.0%}"
+            f" {MIN_ALONG:.0%}"
         )
     if fit.best is None:
         out.error(
@@ -347,8 +325,7 @@ def _check_sizes(stats: TrackStatistics, out: Diagnostics) -> None:
             "all lengths and widths are negative",
             "turn the signs: [columns] length = '-NAME', width = '-NAME'; or leave the columns out",
         )
-    walks = [KINDS.get(name) == AgentKind.PEDESTRIAN for name in stats.table.categories]
-    lengths = sizes[np.array(walks, np.bool_)[stats.table.category], 0]
+    lengths = sizes[stats.is_of(AgentKind.PEDESTRIAN), 0]
     lengths = lengths[lengths > 0.0]
     if len(lengths) and np.median(lengths) > _LONGEST_WALKER:
         out.error(

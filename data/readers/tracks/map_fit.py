@@ -13,7 +13,7 @@ from shiftsim.data.readers.placement import (
 from shiftsim.kernels import FloatArray
 from shiftsim.world.map import VectorMap
 
-_MIN_ALONG = 0.7  # share of the vehicles on a lane that drive along one
+MIN_ALONG = 0.7  # share of the vehicles on a lane that drive along one
 _MAX_POINTS = 2000
 _MAX_EDGES = 16  # lanes looked at per point
 _ENOUGH = 0.85  # of both shares, for another unit, axis or origin to be believed
@@ -84,7 +84,6 @@ class Fit:
     is_good: bool
     best: Guess | None = None  # what fits, where the tracks as they are do not
     overspeed: float = 0.0  # speed by the limit of the lane, which a tenth of the vehicles exceeds
-    min_along: float = _MIN_ALONG
 
     def turned(self, vectors: FloatArray) -> FloatArray:
         """Vectors (n, 2) in the axes and units of the map, as far as these are known."""
@@ -111,7 +110,7 @@ def fit_map(
     points = np.ascontiguousarray(places[::every])
     ways = np.ascontiguousarray(velocities[::every])
     share, along, limits = _shares(road, points, ways)
-    if share >= min_share and along >= _MIN_ALONG:
+    if share >= min_share and along >= MIN_ALONG:
         limited = limits > 0.0
         speeds = np.hypot(*ways[limited].T) / limits[limited]
         over = float(np.percentile(speeds, 90)) if limited.any() else 0.0
@@ -123,21 +122,16 @@ def fit_map(
             continue
         for shifted in (False, True):
             for name, axes in _AXES.items():
-                guess = _try(road, points @ (scale * axes).T, ways @ axes.T, name, unit, shifted)
+                placed = points @ (scale * axes).T
+                shift = place_on_map(road, placed, 1.1).shift if shifted else np.zeros(2)
+                shares = _shares(road, placed + shift, ways @ axes.T)[:2]
+                guess = Guess(name, unit, shift, *shares)
                 found = guess.share * guess.along
                 if min(guess.share, guess.along) >= _ENOUGH and found > value + _GAIN:
                     best, value = guess, found
         if best is not None:
             break
     return Fit(share, along, False, best)
-
-
-def _try(
-    road: VectorMap, points: FloatArray, ways: FloatArray, axes: str, unit: str, shifted: bool
-) -> Guess:
-    shift = place_on_map(road, points, 1.1).shift if shifted else np.zeros(2)
-    share, along, _ = _shares(road, points + shift, ways)
-    return Guess(axes, unit, shift, share, along)
 
 
 def _shares(

@@ -6,9 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from shiftsim.data.readers.codes import KINDS
 from shiftsim.data.readers.motion import fitted_velocities, track_ends, track_medians
 from shiftsim.data.readers.tracks.table import TrackTable
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
+from shiftsim.world.state import AgentKind
 
 FAST = 2.0  # m/s, above which a direction of motion is sure
 # share of the moving vehicles whose velocities contradict their positions; more than the first is
@@ -48,9 +50,18 @@ class TrackStatistics:
     """A table and how its objects move. A rows, N objects."""
 
     table: TrackTable
-    is_vehicle: BoolArray  # (A,)
     time: FloatArray  # (A,) [s]
     period: float  # s
+
+    @cached_property
+    def is_vehicle(self) -> BoolArray:
+        """(A,) whether a row is of a vehicle."""
+        return self.is_of(AgentKind.VEHICLE)
+
+    def is_of(self, kind: AgentKind) -> BoolArray:
+        """(A,) whether a row is of an object of a kind."""
+        known = [KINDS.get(name) == kind for name in self.table.categories]
+        return np.array(known, np.bool_)[self.table.category]
 
     @cached_property
     def ends(self) -> IntArray:

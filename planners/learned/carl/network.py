@@ -11,7 +11,6 @@ from torch.nn.functional import softplus
 from shiftsim.planners.learned.deterministic import State
 from shiftsim.planners.learned.network import Linear
 
-PREFIXES = ("",)  # of the names in the published checkpoint
 CHANNELS, SIZE = 9, 256  # of the raster
 MEASUREMENTS, VALUE_MEASUREMENTS, ACTIONS = 10, 4, 2
 FEATURES, HIDDEN = 256, 512
@@ -21,26 +20,6 @@ CONVOLUTIONS = (  # channels out, kernel, stride
 )
 RASTERS_AT_ONCE = 4  # on a CPU: what is computed of more does not fit its caches
 FLAT = 1024  # numbers that the convolutions leave
-RELEASED = {
-    "image_encoder": "roach_ln2",
-    "in_channels": CHANNELS,
-    "image": [SIZE, SIZE],
-    "use_layer_norm": True,
-    "use_layer_norm_policy_head": True,
-    "features_dim": FEATURES,
-    "states_neurons": [FEATURES, FEATURES],
-    "policy_head_arch": [FEATURES, FEATURES],
-    "value_head_arch": [FEATURES, FEATURES],
-    "obs_num_measurements": MEASUREMENTS,
-    "num_value_measurements": VALUE_MEASUREMENTS,
-    "distribution": "beta",
-    "beta_min_a_b_value": 1.0,
-    "action_dim": ACTIONS,
-    "action_low": -1.0,
-    "action_high": 1.0,
-    "use_lstm": False,
-    "layer_norm_eps": 1e-5,
-}
 LEAST = 1.0  # of both parameters of the distribution
 _CONSTANTS = {  # stored in the checkpoint, never trained
     "action_space_low": [-1.0, -1.0],

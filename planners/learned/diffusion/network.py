@@ -16,7 +16,6 @@ from shiftsim.planners.learned.diffusion.network_layers import Context, DiT, Sce
 from shiftsim.planners.learned.diffusion.network_sampler import SCHEDULE, STATE, sample
 from shiftsim.world.ranges import CHECKPOINT, require
 
-PREFIXES = ("module.",)  # of the official file; left by distributed training
 _XY = ([10.0, 0.0], [20.0, 20.0])  # mean and std [m]
 
 

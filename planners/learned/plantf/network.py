@@ -11,24 +11,8 @@ from shiftsim.planners.learned import network as layers
 from shiftsim.planners.learned.deterministic import DriveHead, State, override_head
 from shiftsim.planners.learned.network import DIM, Linear, head, perceptron
 
-PREFIXES = ("model.",)  # of the names in the published checkpoint
 POLYGON_CHANNELS = 6
 DEPTH, HEADS, MODES, STEPS = 4, 8, 6, 80
-RELEASED = {
-    "dim": DIM,
-    "state_channel": layers.STATE_CHANNELS,
-    "polygon_channel": POLYGON_CHANNELS,
-    "history_channel": layers.HISTORY_CHANNELS,
-    "history_steps": 21,
-    "future_steps": STEPS,
-    "encoder_depth": DEPTH,
-    "drop_path": 0.2,  # training only
-    "num_heads": HEADS,
-    "num_modes": MODES,
-    "state_dropout": 0.75,  # training only
-    "use_ego_history": False,
-    "state_attn_encoder": True,
-}
 DRIVE_HEADS = {
     "trajectory_decoder.loc.3": DriveHead(
         gain=(20, 2, 0.05, 0.05), exponent=(1, 1, 1, 1), const=(0, 0, 1, 0), slope=(40, 0, 0, 0)

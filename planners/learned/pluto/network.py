@@ -11,31 +11,10 @@ from shiftsim.planners.learned import network as layers
 from shiftsim.planners.learned.deterministic import DriveHead, State, override_head
 from shiftsim.planners.learned.network import DIM, Attention, Linear, Scenes, head, key_mask
 
-PREFIXES = ("model.",)  # of the names in the published checkpoint
 POLYGON_CHANNELS, LINE_CHANNELS = 10, 6
 DEPTH, HEADS, MODES, STEPS = 4, 4, 12, 80
 NUM_FREQUENCIES = 64
 NEVER = -1e6  # logit of a reference line without points
-RELEASED = {
-    "dim": DIM,
-    "state_channel": layers.STATE_CHANNELS,
-    "polygon_channel": 6,  # and the boundaries
-    "history_channel": layers.HISTORY_CHANNELS,
-    "history_steps": 21,
-    "future_steps": STEPS,
-    "encoder_depth": DEPTH,
-    "decoder_depth": DEPTH,
-    "drop_path": 0.2,  # training only
-    "dropout": 0.1,  # training only
-    "num_heads": HEADS,
-    "num_modes": MODES,
-    "state_dropout": 0.75,  # training only
-    "use_ego_history": False,
-    "state_attn_encoder": True,
-    "use_hidden_proj": True,
-    "cat_x": True,
-    "ref_free_traj": True,
-}
 DRIVE_HEADS = {
     "planning_decoder.loc_head.mlp.3": DriveHead(
         gain=(80, 12), exponent=(1, 2), const=(0, 0), slope=(104, 7.8)

@@ -74,7 +74,7 @@ class Output(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class Surroundings:
     """What one step saw."""
 
     drivable: reference.Drivable  # drivable areas
@@ -102,18 +102,18 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
     name = "pluto"
     _scene: SceneInfo | None = None
     route: reference.RouteLanes | None = None  # lanes of the corrected route, from the first step
-    sight: Sight | None = None  # what the last step saw
+    surroundings: Surroundings | None = None  # what the last step saw
     choice: Choice | None = None  # how it chose; None where it had no reference line
 
     def reset(self, scene: SceneInfo) -> None:
         """Look up the route; it is corrected at the first step."""
         self._blocks = route_blocks(scene)
         self._scene, self._lights = scene, LightLookup(scene.map)
-        self.route = self.sight = self.choice = None
+        self.route = self.surroundings = self.choice = None
         self.degraded = ""
 
     def features(self, observation: Observation) -> SceneInputs:
-        """Arrays of the network; what they were made from is kept in `sight`."""
+        """Arrays of the network; what they were made from is kept in `surroundings`."""
         scene = self._scene
         if scene is None:
             raise PlannerError(f"{self.name}: plan() was called before reset()")
@@ -130,7 +130,7 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         agents = agent_features(history, center, MAX_AGENTS)
         lights = self._lights.at(observation.lights)
         near = road_features(road, ego[:3], center, RADIUS, lights, route.has_block)
-        self.sight = Sight(drivable, static, lines, agents, near)
+        self.surroundings = Surroundings(drivable, static, lines, agents, near)
         return scene_inputs(ego, agents, near, static, reference.line_features(lines, ego[:3]))
 
     def infer(self, features: Sequence[SceneInputs]) -> list[Output]:
@@ -152,13 +152,13 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
 
     def decode(self, output: Output, observation: Observation) -> Trajectory:
         """The best proposal, an emergency brake, or the reference-free trajectory."""
-        assert self.sight is not None
+        assert self.surroundings is not None
         assert self._scene is not None
         history, self.choice = observation.history, None
         # where the official planner would fail
-        reason = short_history(len(history.ego)) if self.sight.lines else NO_LINE
+        reason = short_history(len(history.ego)) if self.surroundings.lines else NO_LINE
         self.degraded = reason if self._blocks else NO_ROUTE
-        if not self.sight.lines:
+        if not self.surroundings.lines:
             free = headings_of(output.ref_free_trajectory)
             return _plan(to_map(free, history.ego[-1, :3]), observation)
         self.choice = choice = self._choose(output, observation)
@@ -169,11 +169,11 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         return Trajectory(observation.time_us + STEP_US * np.arange(len(states)), states)
 
     def _choose(self, output: Output, observation: Observation) -> Choice:
-        sight = self.sight
-        assert sight is not None
+        surroundings = self.surroundings
+        assert surroundings is not None
         ego, tracks = observation.history.ego[-1].copy(), observation.history.tracks
         poses, learned = best_proposals(output, ego[:3])
-        seen, rows = sight.agents, sight.agents.tracks
+        seen, rows = surroundings.agents, surroundings.agents.tracks
         local = np.concatenate([seen.position[1:, -1], seen.heading[1:, -1:]], axis=1)
         present = (tracks.poses[-1, rows], tracks.velocities[-1, rows])
         motion = predicted_agents(output, local, *present, ego[:3])
@@ -187,16 +187,17 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
 
         `learned` (P,) are their scores by the network.
         """
-        scene, sight, route = self._scene, self.sight, self.route
+        scene, surroundings, route = self._scene, self.surroundings, self.route
         assert scene is not None
-        assert sight is not None
+        assert surroundings is not None
         assert route is not None
         ego = observation.history.ego[-1].copy()
         size = np.array([scene.vehicle.length, scene.vehicle.width])
         footprint = boxes_to_corners(observation.ego.center, size)
         lights = world.red_lights(scene.map, route, observation)
-        hazards = world.make_world(sight.static, agents, lights, footprint)
-        place = Place(sight.drivable, scene.map.edges.polygons, nearest_line(sight.lines, ego))
+        hazards = world.make_world(surroundings.static, agents, lights, footprint)
+        line = nearest_line(surroundings.lines, ego)
+        place = Place(surroundings.drivable, scene.map.edges.polygons, line)
         scores = score(poses, learned, ego, hazards, place, scene.vehicle)
         best = int(np.argmax(scores.total))  # the first one on ties
         speed = float(np.hypot(ego[VX], ego[VY]))

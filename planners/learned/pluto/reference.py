@@ -9,11 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.geometry.boxes import meets_bounds, wrap_angles
-from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.geometry.boxes import wrap_angles
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.planners.proposals.areas import Areas, make_areas, select_areas
 from shiftsim.planners.routes.graph import LanePath, deviation, lane_path, sub_path
-from shiftsim.world.layers import Polygons, Polylines, meets_convex, square_around
 from shiftsim.world.map import NONE, VectorMap
 
 AREA_HALF_SIDE = 60.0  # m, of the square of the drivable areas
@@ -37,13 +36,6 @@ class Drivable(NamedTuple):
     limits: FloatArray  # (M,) speed limit of each area of the map, of this step [m/s]
 
 
-class MapAreas(NamedTuple):
-    """What is made once per map."""
-
-    areas: Areas  # all areas of the map, none of them on a route
-    limits: FloatArray  # (M,) speed limits, 50 where the map has none [m/s]
-
-
 class RouteLanes(NamedTuple):
     """What is made once per scenario."""
 
@@ -56,25 +48,27 @@ class RouteLanes(NamedTuple):
     paths: dict[tuple[int, ...], LanePath]  # made so far, by their lanes
 
 
-def areas_of_map(road: VectorMap) -> MapAreas:
-    """Areas of all lanes, connectors and car parks of a map."""
+def areas_of_map(road: VectorMap) -> tuple[Areas, FloatArray]:
+    """Areas of a map, none on a route, and their speed limits (M,), 50 m/s where it has none."""
     limits = np.full(len(road.edges) + len(road.car_parks), FALLBACK_LIMIT)
     known = np.nan_to_num(road.speed_limits, nan=0.0)
     limits[: len(known)] = np.where(known == 0.0, FALLBACK_LIMIT, known)
-    return MapAreas(make_areas(road, []), limits)
+    return make_areas(road, []), limits
 
 
-def route_lanes(road: VectorMap, map_areas: MapAreas, blocks: Sequence[int]) -> RouteLanes:
-    """Lanes of a corrected route."""
+def route_lanes(
+    road: VectorMap, map_areas: tuple[Areas, FloatArray], blocks: Sequence[int]
+) -> RouteLanes:
+    """Lanes of a corrected route; `map_areas` are of `areas_of_map`."""
+    areas, limits = map_areas
     unique = list(dict.fromkeys(blocks))
     has_block = np.zeros(len(road.blocks), np.bool_)
     has_block[unique] = True
     is_on = (road.block_of != NONE) & has_block[road.block_of]
     lanes = np.flatnonzero(is_on)
     starts = np.concatenate([lanes[lanes >= road.num_lanes], lanes[lanes < road.num_lanes]])
-    on_route = np.isin(map_areas.areas.lane, lanes)
-    areas = map_areas.areas._replace(on_route=on_route)
-    return RouteLanes(unique, starts, has_block, is_on, areas, map_areas.limits, {})
+    areas = areas._replace(on_route=np.isin(areas.lane, lanes))
+    return RouteLanes(unique, starts, has_block, is_on, areas, limits, {})
 
 
 def drivable_near(road: VectorMap, route: RouteLanes, x: float, y: float) -> Drivable:
@@ -97,11 +91,13 @@ def reference_lines(
     `rear` (3,) and `center` (3,) are the poses of the rear axle and of the ego box.
     """
     x, y = float(rear[0]), float(rear[1])
-    found = np.empty(len(route.starts), np.int64)
-    count = _start_lanes(
-        road.edges.polygons, road.baselines, route.starts, rear, center[0], center[1], found
-    )
-    starts = found[:count].tolist()
+    near = road.edges.within_box(float(center[0]), float(center[1]), START_HALF_SIDE)
+    starts = [
+        start
+        for start in route.starts[np.isin(route.starts, near)].tolist()
+        if road.baselines.length(start) > MIN_BASELINE
+        and deviation(road.baselines, start, STRIDE, *rear.tolist())[1] < MAX_HEADING_ERROR
+    ]
     after = {lane for start in starts for lane in road.outgoing.at(start).tolist()}
     lines, lengths = [], []
     for start in starts:
@@ -148,31 +144,6 @@ def _distinct(lines: list[FloatArray]) -> list[FloatArray]:
         else:
             distinct.append(line)
     return distinct
-
-
-@kernel
-def _start_lanes(
-    polygons: Polygons,
-    baselines: Polylines,
-    lanes: IntArray,
-    rear: FloatArray,
-    x: float,
-    y: float,
-    out: IntArray,
-) -> int:
-    """Write the lanes a line may start on into `out`; their number."""
-    count = 0
-    square = square_around(x, y, START_HALF_SIDE)
-    for lane in lanes:
-        if (
-            meets_bounds(square, polygons.bounds[lane])
-            and baselines.arc[baselines.ptr[lane + 1] - 1] > MIN_BASELINE
-            and meets_convex(polygons, lane, square)
-            and deviation(baselines, lane, STRIDE, rear[0], rear[1], rear[2])[1] < MAX_HEADING_ERROR
-        ):
-            out[count] = lane
-            count += 1
-    return count
 
 
 def _cut(path: LanePath, x: float, y: float) -> tuple[FloatArray, float]:

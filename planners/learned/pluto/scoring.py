@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.geometry.boxes import boxes_touch, circle_around, meets_bounds
-from shiftsim.geometry.polylines import arc_lengths, project_on_polyline
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.learned.pluto.reference import Drivable
 from shiftsim.planners.learned.pluto.world import World
@@ -37,7 +36,7 @@ from shiftsim.sim.dynamics.lqr import (
     fit_curvature,
     is_stopping,
 )
-from shiftsim.world.layers import Polygons, meets_convex
+from shiftsim.world.layers import Polygons, make_polylines, meets_convex, project_on_line
 from shiftsim.world.state import HEADING, NUM_STATE, STEERING_RATE, VX, VY, VehicleParameters, X, Y
 
 LEARNED_WEIGHT = 0.3
@@ -133,19 +132,10 @@ def speed_score(driven: FloatArray, limits: FloatArray) -> FloatArray:
 
 def travel(driven: FloatArray, baseline: FloatArray) -> FloatArray:
     """(P,) progress along a line (K, 2) [m]."""
-    out = np.empty(len(driven))
-    arc = arc_lengths(baseline, np.array([0, len(baseline)]))
-    _project_ends(driven[:, [0, -1], :2], baseline, arc, out)
-    return out
-
-
-@kernel
-def _project_ends(ends: FloatArray, line: FloatArray, arc: FloatArray, out: FloatArray) -> None:
-    count = len(line)
-    for row in range(len(ends)):
-        start = project_on_polyline(line, arc, 0, count, ends[row, 0, X], ends[row, 0, Y])
-        end = project_on_polyline(line, arc, 0, count, ends[row, 1, X], ends[row, 1, Y])
-        out[row] = max(0.0, end - start)
+    line = make_polylines([baseline])
+    ends = driven[:, [0, -1], :2].reshape(-1, 2).tolist()
+    along = np.array([project_on_line(line, 0, x, y) for x, y in ends]).reshape(-1, 2)
+    return np.maximum(along[:, 1] - along[:, 0], 0.0)
 
 
 def aggregate(

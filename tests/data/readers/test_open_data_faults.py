@@ -120,11 +120,11 @@ def test_two_rows_of_one_object_at_one_time_are_refused(tmp_path):
 def test_a_time_years_away_is_an_error_and_takes_no_memory(tmp_path):
     path = write_av2(tmp_path)
     changed_table(path, with_value("timestep", 10**8))
-    refused(Av2Reader(tmp_path), path, path, r"none between 10.9 s and 1e\+07 s")
+    refused(Av2Reader(tmp_path), path, path, r"row between 10.9 s and 1e\+07 s")
     log = write_py123d(tmp_path)
     name = f"{BOXES}.timestamp_us"
     changed_arrow(log / f"{BOXES}.arrow", with_value(name, START_US - 4_000_000_000))
-    refused(Py123dReader(tmp_path), log, log, "none between 0 s and 4000 s")
+    refused(Py123dReader(tmp_path), log, log, "row between 0 s and 4000 s")
 
 
 XML_FAULTS = {

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from shiftsim.data.demo.store import bench_scene
+from shiftsim.benchmarks.speed.city import bench_scene
 from shiftsim.data.store.map import SCHEMA, read_map_file, write_map
 from shiftsim.errors import DataError
 from shiftsim.world.layers import Layer

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from worlds import cruise_scenario, moved, standing_tracks, straight_road
 
-from shiftsim.data.demo.store import bench_scene
+from shiftsim.benchmarks.speed.city import bench_scene
 from shiftsim.errors import CheckpointError, PlannerError
 from shiftsim.sim.loop import Rollout, simulate, simulate_together
 from shiftsim.sim.planner import scene_info

@@ -11,7 +11,6 @@ from scipy.signal import savgol_filter
 from strategies import seeds
 from worlds import straight_road
 
-from shiftsim.planners.learned import features as features_module
 from shiftsim.planners.learned.features import (
     SAMPLES,
     agent_features,
@@ -235,17 +234,6 @@ def test_agent_histories_are_as_computed_one_by_one(seed, count, samples):
             np.testing.assert_allclose(found.shape[at], size, atol=1e-6)
     assert not found.valid[:, : max(0, SAMPLES - samples)].any()
     assert found.valid[0].sum() == min(samples, SAMPLES)
-
-
-def test_the_compiled_history_is_that_of_the_python_original(rng):
-    past = history(tracks=random_tracks(rng, 12))
-    tracks = past.tracks
-    chosen = np.array([3, 0, 7])
-    arrays = (past.ego, tracks.poses, tracks.velocities, tracks.sizes, tracks.valid, chosen)
-    compiled = features_module._agent_histories(*arrays)
-    plain = features_module._agent_histories.py_func(*arrays)
-    for ours, theirs in zip(compiled, plain, strict=True):
-        np.testing.assert_array_equal(ours, theirs)
 
 
 def test_a_plan_at_constant_speed_has_no_acceleration():

@@ -184,7 +184,7 @@ SPOILT = {
     ),
     "places of the rear": (_along(-0.5), "in turns", "reference = 'rear'", {"reference": "rear"}),
     "one id for two objects": (_merged, "has two rows", "ids of their own", None),
-    "a row far away": (_jumping, "jumps 79.6 m", "a row is wrong", None),
+    "a row far away": (_jumping, "jumps 80.4 m", "a row is wrong", None),
     "a place of -9999 for what is not known": (
         lambda c: {"x_m": np.where(np.arange(len(c["x_m"])) % 33 == 5, -9999.0, c["x_m"])},
         "jumps",
@@ -205,7 +205,7 @@ SPOILT = {
     ),
     "yards": (
         _times(PLACES + SPEEDS, 1 / 0.9144),
-        "91% of the moving vehicles are on drivable area",
+        "47% of the moving vehicles are on drivable area",
         "no other unit, axis or origin fits better",
         None,
     ),
@@ -280,12 +280,24 @@ def test_half_and_twice_the_speed_are_noted_where_pedestrians_walk(hz, walking, 
     assert "--hz" in found.warnings[-1].remedy
 
 
-@pytest.mark.parametrize(("hz", "value"), [(37.5, 8.9), (50.0, 15)])
+def _lively(columns):
+    """The rows of the vehicles that brake and turn most, a third of all."""
+    median = {}
+    for track in np.unique(columns["track"][columns["kind"] != "pedestrian"]).tolist():
+        rows = columns["track"] == track
+        change = np.hypot(*(np.diff(columns[name][rows]) for name in SPEEDS))
+        median[track] = np.median(change)
+    lively = [track for track, x in median.items() if x >= np.quantile([*median.values()], 2 / 3)]
+    kept = np.isin(columns["track"], lively)
+    return {name: values[kept] for name, values in columns.items()}
+
+
+@pytest.mark.parametrize(("hz", "value"), [(37.5, 6.3), (50.0, 11)])
 def test_three_times_the_speed_cannot_be_for_how_cars_would_turn_and_brake(
     hz, value, town, tmp_path
 ):
     columns, road = town
-    path = write_tracks(tmp_path / "t.csv", columns, time_s=None, **NO_SPEEDS)
+    path = write_tracks(tmp_path / "t.csv", _lively(columns), time_s=None, **NO_SPEEDS)
     (found,) = _diagnose(path, road, hz=hz).errors
     assert f"with {value} m/s²" in found.what
     assert "--hz" in found.remedy
@@ -393,7 +405,7 @@ def test_a_clock_of_its_own_for_every_object_is_named(town, tmp_path):
     since = columns["time_s"] - np.array([first[name] for name in columns["track"].tolist()])
     path = write_tracks(tmp_path / "t.csv", columns, frame=None, time_s=np.round(since, 3))
     (note,) = _diagnose(path, road).warnings
-    assert "24 objects appear at the first time" in note.what
+    assert f"{len(first)} objects appear at the first time" in note.what
     assert "one clock for all" in note.remedy
 
 

@@ -5,30 +5,25 @@ two of them come too close.
 """
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
-from shiftsim.data.demo.lights import Lights
-from shiftsim.data.demo.network import Street, Town, build_town
-from shiftsim.data.demo.roads import arc, connect, line
-from shiftsim.data.demo.walks import add_bays, add_walks
-from shiftsim.data.towns.lights import random_lights
-from shiftsim.data.towns.streets import (
-    WIDE,
+from shiftsim.data.synthetic.roads import Piece, connect
+from shiftsim.data.synthetic.streets import (
+    AT_JUNCTION,
     are_apart,
     directions,
     fan,
-    length_of,
     random_angles,
     random_gaps,
     random_street,
     reaches,
-    turned,
     with_crossings,
     with_obstacles,
 )
+from shiftsim.data.synthetic.town import Lights, Street, Town, build_town
 
 _TRIES = 300
 # km/h, of main roads by lanes per direction
@@ -36,27 +31,29 @@ _LIMITS = ((30.0, 40.0, 50.0), (40.0, 50.0, 60.0), (50.0, 60.0, 70.0))
 _RINGS = ("moss", "nettle", "oak", "pine")
 
 
-@dataclass(frozen=True)
-class Place:
-    """A random town and its traffic lights."""
-
-    town: Town
-    lights: tuple[Lights, ...]
-
-
-def random_place(kind: str, name: str, rng: np.random.Generator) -> Place:
-    """A town of one of `KINDS`."""
+def random_town(kind: str, name: str, rng: np.random.Generator) -> Town:
+    """A town of one of `KINDS`, turned in any direction."""
     for _ in range(_TRIES):
         streets = KINDS[kind](rng)
-        if streets and are_apart(streets):
+        if streets and are_apart(streets := _turned(streets, float(rng.uniform(0.0, 2.0 * np.pi)))):
             break
     else:
         raise AssertionError(f"no town of kind {kind!r} in {_TRIES} tries")
-    town = build_town(name, tuple(streets))
-    add_walks(town)
-    add_bays(town)
+    town = build_town(name, streets)
     lit = sorted({x for street in streets if street.has_lights for x in street.junctions} - {0})
-    return Place(town, tuple(random_lights(town, junction, rng) for junction in lit))
+    town.lights = tuple(_random_lights(town, junction, rng) for junction in lit)
+    return town
+
+
+def _turned(streets: Sequence[Street], angle: float) -> list[Street]:
+    """Streets turned around the origin [rad]."""
+    cos, sin = float(np.cos(angle)), float(np.sin(angle))
+    out = []
+    for street in streets:
+        x, y, heading = street.start
+        start = (x * cos - y * sin, x * sin + y * cos, heading + angle)
+        out.append(replace(street, start=start))
+    return out
 
 
 def _junction(rng: np.random.Generator, *, lit: bool) -> list[Street]:
@@ -67,7 +64,7 @@ def _junction(rng: np.random.Generator, *, lit: bool) -> list[Street]:
     lanes = min(lanes, 2) if count == 5 else lanes
     share = float(rng.uniform(0.3, 1.0))
     arms = _arms(rng, range(1, count + 1), angles, lit=lit, lanes=lanes, crossings=share)
-    return _anywhere(rng, fan(arms, angles, _rounding(rng)))
+    return fan(arms, angles, _rounding(rng))
 
 
 def _pair(rng: np.random.Generator, *, lanes: int) -> list[Street]:
@@ -77,7 +74,7 @@ def _pair(rng: np.random.Generator, *, lanes: int) -> list[Street]:
     limit, length = float(rng.choice(limits)), float(rng.uniform(60.0, 120.0))
     mid = random_street(rng, 1, lanes=lanes, limit=limit, length=length, parking=0.0)
     if rng.random() < 0.6 and not lit:
-        at = 0.5 * length_of(mid)
+        at = 0.5 * mid.length
         mid = replace(mid, crossings=((at - 2.0, at + 2.0),))
     mid = replace(mid, has_lights=lit, stop=2.0)
     out: list[Street] = []
@@ -103,7 +100,7 @@ def _pair(rng: np.random.Generator, *, lanes: int) -> list[Street]:
             center = (float(x + reach * np.cos(heading)), float(y + reach * np.sin(heading)))
             around = [angle + heading + np.pi for angle in angles]
             out += fan(arms, around, rounding, center=center, junction=102)[1:]
-    return _anywhere(rng, out)
+    return out
 
 
 def _arms(
@@ -181,11 +178,12 @@ def _roundabout(rng: np.random.Generator) -> list[Street]:
         x, y = radius * float(np.cos(begin)), radius * float(np.sin(begin))
         ring = Street(
             _RINGS[place], count + place + 1, (x, y, float(begin + np.pi / 2)),
-            (arc(length, 1.0 / radius),), 4.5, 30.0, is_one_way=True, sidewalk=0.0, stop=1.0,
+            (Piece(length, 1.0 / radius, 1.0 / radius),), 4.5, 30.0,
+            is_one_way=True, sidewalk=0.0, stop=1.0,
             junctions=(101 + place, 101 + (place + 1) % count),
         )  # fmt: skip
         rings.append(ring)
-    return _anywhere(rng, [*arms, *rings])
+    return [*arms, *rings]
 
 
 def _street(rng: np.random.Generator) -> list[Street]:
@@ -205,12 +203,12 @@ def _street(rng: np.random.Generator) -> list[Street]:
         if not is_side and rng.random() < 0.5:
             arm = with_obstacles(rng, arm)
         elif not is_side and rng.random() < 0.7:
-            begin = float(rng.uniform(24.0, length_of(arm) - 60.0))
+            begin = float(rng.uniform(24.0, arm.length - 60.0))
             end = begin + float(rng.uniform(15.0, 30.0))
             if all(last < begin - 12.0 or first > end + 12.0 for first, last in arm.crossings):
                 arm = replace(arm, narrow=(begin, end))
         arms.append(arm)
-    return _anywhere(rng, fan(arms, angles, _rounding(rng)))
+    return fan(arms, angles, _rounding(rng))
 
 
 def _car_park(rng: np.random.Generator) -> list[Street]:
@@ -220,30 +218,30 @@ def _car_park(rng: np.random.Generator) -> list[Street]:
     east, north, west, south = 0.0, np.pi / 2, np.pi, -np.pi / 2
     x, y = -apart, start + aisle
     way = (
-        line(aisle),
+        Piece(aisle),
         *connect((x, y, north), (0.0, y + top, east), ease=True),
         *connect((0.0, y + top, east), (-x, y, south), ease=True),
-        line(aisle),
+        Piece(aisle),
     )
     length = sum(piece.length for piece in way)
     limit, width = float(rng.choice((30.0, 40.0, 50.0))), round(float(rng.uniform(3.25, 3.6)), 2)
     free = np.flatnonzero(rng.random(60) < rng.uniform(0.2, 0.6))
     lot = Street(
-        "lot", 4, (x, start, north), way, 3.4, 20.0, is_main=False, junctions=(101, 102), wide=WIDE,
+        "lot", 4, (x, start, north), way, 3.4, 20.0, is_main=False, junctions=(101, 102),
         stop=2.0, sidewalk=1.8, parking=5.2,
         stalls=((18.0, aisle - 6.0), (length - aisle + 6.0, length - 18.0)),
         empty=tuple(free.tolist()), crossings=((0.5 * aisle, 0.5 * aisle + 3.0),), is_marked=False,
     )  # fmt: skip
     made = partial(random_street, rng, limit=limit, parking=0.0)
     begins = ((x + start, 0.0, east), (x - start, 0.0, west), (start - x, 0.0, east))
-    mid = replace(made(2, pieces=(line(2.0 * (apart - start)),)), junctions=(101, 102), stop=1.0)
+    mid = replace(made(2, pieces=(Piece(2.0 * (apart - start)),)), junctions=(101, 102), stop=1.0)
     one = replace(with_crossings(rng, made(1), 0.0), junctions=(101, 0))
     two = replace(with_crossings(rng, made(3), 0.0), junctions=(102, 0))
     mid, one, two = (
         replace(street, start=begin, width=width)
         for street, begin in zip((mid, one, two), begins, strict=True)
     )
-    return _anywhere(rng, [one, mid, two, lot])
+    return [one, mid, two, lot]
 
 
 def _shared(rng: np.random.Generator) -> list[Street]:
@@ -257,7 +255,7 @@ def _shared(rng: np.random.Generator) -> list[Street]:
         places = tuple((round(x, 1), round(x + 3.0, 1)) for x in spots.tolist() if x < 52.0)
         arm = random_street(rng, number, limit=20.0, length=length, parking=0.0)
         arms.append(replace(arm, sidewalk=4.0, stop=1.0, is_marked=False, crossings=places))
-    return _anywhere(rng, fan(arms, angles, _rounding(rng)))
+    return fan(arms, angles, _rounding(rng))
 
 
 def _rounding(rng: np.random.Generator) -> float:
@@ -265,9 +263,47 @@ def _rounding(rng: np.random.Generator) -> float:
     return float(rng.uniform(10.0, 15.0))
 
 
-def _anywhere(rng: np.random.Generator, streets: Sequence[Street]) -> list[Street]:
-    """Streets in any direction."""
-    return turned(streets, float(rng.uniform(0.0, 2.0 * np.pi)))
+def _random_lights(town: Town, junction: int, rng: np.random.Generator) -> Lights:
+    """Lights of a junction, at which streets that face each other are green together."""
+    roads: dict[str, set[int]] = {}
+    for (at, street, _, _), (number, _) in town.connectors.items():
+        if at == junction:
+            roads.setdefault(street, set()).add(number)
+    phases = _phases({name: _inward(town.streets[name], junction) for name in roads})
+    crossings = {
+        town.streets[name].crossing_name(number): place
+        for place, phase in enumerate(phases)
+        for name in phase
+        for number, ends in enumerate(town.streets[name].crossings)
+        if ends in AT_JUNCTION and junction == town.streets[name].junctions[0]
+    }
+    green = tuple(round(float(rng.uniform(7.0, 13.0)), 1) for _ in phases)
+    begun = round(float(rng.uniform(0.0, 30.0)), 1)
+    numbers = tuple(frozenset(x for name in phase for x in roads[name]) for phase in phases)
+    fastest = max(town.streets[name].limit for name in roads)
+    yellow = float(np.clip(0.1 * fastest - 2.0, 3.0, 5.0))  # as in German towns
+    return Lights(numbers, green, begun, crossings, yellow)
+
+
+def _phases(headings: dict[str, float]) -> list[list[str]]:
+    """Streets by the headings in which they enter a junction [rad], those that face in pairs."""
+    left, phases = list(headings), []
+    while left:
+        first = left.pop(0)
+        phase = [first]
+        turn = [abs(np.cos(headings[x] - headings[first]) + 1.0) for x in left]
+        if turn and min(turn) < 0.2:
+            phase.append(left.pop(int(np.argmin(turn))))
+        phases.append(phase)
+    return phases
+
+
+def _inward(street: Street, junction: int) -> float:
+    """Heading of a street where it enters a junction [rad]."""
+    if street.junctions[0] == junction:
+        return street.start[2] + float(np.pi)
+    road = street.road()
+    return float(road.at(np.array([road.length]))[0, 2])
 
 
 KINDS: dict[str, Callable[[np.random.Generator], list[Street]]] = {

@@ -6,14 +6,14 @@ Whoever would run into somebody is left out, and the others drive again without 
 from dataclasses import replace
 
 import numpy as np
+import shapely
 
-from shiftsim.data.demo.agents import Driver, Walker, has_room
-from shiftsim.data.demo.network import Town
-from shiftsim.data.demo.paths import STEP, Path, arc_at, shifted
-from shiftsim.data.demo.traffic import Traffic
-from shiftsim.data.towns.contacts import touching
-from shiftsim.data.towns.layouts import Place
-from shiftsim.data.towns.ways import Ways
+from shiftsim.data.synthetic.agents import SIZES, STEP, Driver, Path, Pedestrian, arc_at, shifted
+from shiftsim.data.synthetic.routes import RandomRoutes
+from shiftsim.data.synthetic.town import Town
+from shiftsim.data.synthetic.traffic import Box, Traffic
+from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.kernels import FloatArray
 from shiftsim.world.state import LightStatus
 
 _SHARES = {
@@ -31,22 +31,26 @@ _NEVER = (0.0, 0.0)  # a halt that is none
 _WALK_UP = 14.0  # m, of pedestrians to the place where they cross
 _MERGING = 14.0  # m, on which who was parked joins the lane
 _ROUNDS = 12  # how often somebody is left out
+_MARGIN = 0.1  # m, added to length and width, so that nobody brushes anybody
+_EVERY = 3  # frames
+_PARKED = -1  # number of what nobody drives
+_ON_FOOT = 1.0  # m, who is shorter walks
 
 
-def random_traffic(place: Place, rng: np.random.Generator, duration: float) -> Traffic:
+def random_traffic(town: Town, rng: np.random.Generator, duration: float) -> Traffic:
     """Traffic that was recorded for a time [s], without anybody touching anybody."""
-    town = place.town
-    ways = Ways(town, rng)
-    drivers = [*_present(place, ways, rng), *_arriving(ways, rng, duration)]
-    walkers = _walkers(town, rng, duration)
+    routes = RandomRoutes(town, rng)
+    drivers = [*_present(routes, rng), *_arriving(routes, rng, duration)]
+    pedestrians = _pedestrians(town, rng, duration)
     for _ in range(_ROUNDS):
-        fresh = [replace(driver, held=set(), waiting=set()) for driver in drivers]
-        on_foot = [replace(walker) for walker in walkers]
-        traffic = Traffic(town, fresh, on_foot, lights=place.lights)
+        fresh = [replace(driver, admitted=set(), waiting=set()) for driver in drivers]
+        traffic = Traffic(town, fresh, [replace(pedestrian) for pedestrian in pedestrians])
         left_out = touching(traffic.record(duration), town.parked(), drivers)
         if not left_out:
             break
-        walkers = [x for number, x in enumerate(walkers, len(drivers)) if number not in left_out]
+        pedestrians = [
+            x for number, x in enumerate(pedestrians, len(drivers)) if number not in left_out
+        ]
         drivers = [x for number, x in enumerate(drivers) if number not in left_out]
     return traffic
 
@@ -83,20 +87,20 @@ def _halt(path: Path, driver: Driver, rng: np.random.Generator) -> tuple[float, 
     return _NEVER
 
 
-def _present(place: Place, ways: Ways, rng: np.random.Generator) -> list[Driver]:
+def _present(routes: RandomRoutes, rng: np.random.Generator) -> list[Driver]:
     """Those who are there at time 0: queues before junctions, parked ones, and others anywhere."""
     placed: list[Driver] = []
-    for entry in ways.entries:
-        if rng.random() < (0.85 if _is_red(place, entry) else 0.12):
-            placed += _queue(ways, entry, rng, placed)
-    for entry in ways.entries:
-        placed += _moving_off(ways, entry, rng)
+    for entry in routes.entries:
+        if rng.random() < (0.85 if _is_red(routes.town, entry) else 0.12):
+            placed += _queue(routes, entry, rng, placed)
+    for entry in routes.entries:
+        placed += _moving_off(routes, entry, rng)
     wanted = int(rng.integers(3, 16))
     for _ in range(4 * wanted):
         if len(placed) >= wanted:
             break
         category = _category(rng)
-        path = ways.path(str(rng.choice(ways.entries)), category)
+        path = routes.path(str(rng.choice(routes.entries)), category)
         if path is None or path.length < 40.0:
             continue
         driver = _driver(path, category, rng)
@@ -107,18 +111,20 @@ def _present(place: Place, ways: Ways, rng: np.random.Generator) -> list[Driver]
         driver.v = 0.0 if rng.random() < 0.12 else speed * float(rng.uniform(0.7, 1.0))
         if driver.halt[0] < driver.front + 20.0:
             driver.halt = _NEVER
-        if _may_begin(driver) and _fits(driver, placed) and has_room(driver, placed):
+        if _may_begin(driver) and _fits(driver, placed) and driver.has_room(placed):
             placed.append(driver)
     return placed
 
 
-def _queue(ways: Ways, entry: str, rng: np.random.Generator, placed: list[Driver]) -> list[Driver]:
+def _queue(
+    routes: RandomRoutes, entry: str, rng: np.random.Generator, placed: list[Driver]
+) -> list[Driver]:
     """Vehicles that stand before the junction at the end of a street."""
     out: list[Driver] = []
     stop = None
     for _ in range(int(rng.integers(1, 6))):
         category = _category(rng)
-        path = ways.path(entry, category)
+        path = routes.path(entry, category)
         if path is None or not path.zones:
             continue
         driver = _driver(path, category, rng)
@@ -134,26 +140,26 @@ def _queue(ways: Ways, entry: str, rng: np.random.Generator, placed: list[Driver
     return out
 
 
-def _is_red(place: Place, entry: str) -> bool:
+def _is_red(town: Town, entry: str) -> bool:
     """Whether a street has a light that is red at time 0."""
-    connectors = place.town.connectors.items()
+    connectors = town.connectors.items()
     numbers = {number for (_, name, _, _), (number, _) in connectors if name == entry}
     return any(
-        numbers & phase and lights.status(place_in_turn, 0.0) == LightStatus.RED
-        for lights in place.lights
-        for place_in_turn, phase in enumerate(lights.phases)
+        numbers & group and lights.status(phase, 0.0) == LightStatus.RED
+        for lights in town.lights
+        for phase, group in enumerate(lights.phases)
     )
 
 
-def _moving_off(ways: Ways, entry: str, rng: np.random.Generator) -> list[Driver]:
+def _moving_off(routes: RandomRoutes, entry: str, rng: np.random.Generator) -> list[Driver]:
     """Vehicles that stand in a parking space along a street until they move off."""
-    bays = ways.town.bays.get(entry)
+    bays = routes.town.bays.get(entry)
     if bays is None:
         return []
     out = []
-    inward = [x for x in ways.town.streets[entry].empty if len(bays) // 2 <= x < len(bays)]
+    inward = [x for x in routes.town.streets[entry].empty if len(bays) // 2 <= x < len(bays)]
     for space in rng.permutation(inward)[: int(rng.integers(0, 4))].tolist():
-        path = ways.path(entry, "car")
+        path = routes.path(entry, "car")
         if path is None or not path.zones:
             continue
         s = arc_at(path.points, bays[space, :2])
@@ -190,26 +196,27 @@ def _may_begin(driver: Driver) -> bool:
 def _fits(driver: Driver, placed: list[Driver], gap: float = 6.0) -> bool:
     """Whether a driver stands a gap away from all others, more at speed [m]."""
     for other in placed:
-        apart = float(np.hypot(*np.subtract(driver.place, other.place)[:2]))
+        apart = float(np.hypot(*np.subtract(driver.pose, other.pose)[:2]))
         apart -= 0.5 * (driver.length + other.length)
-        aside = min(abs(driver.aside(*other.place[:2])), abs(other.aside(*driver.place[:2])))
+        one, two = driver.offset(*other.pose[:2]), other.offset(*driver.pose[:2])
+        aside = min(abs(one[1]), abs(two[1]))
         needed = gap + 1.2 * max(driver.v, other.v)
         if apart < min(needed, 40.0) and (aside < 2.3 or (apart < 0.5 and aside < 2.6)):
             return False
     return True
 
 
-def _arriving(ways: Ways, rng: np.random.Generator, duration: float) -> list[Driver]:
+def _arriving(routes: RandomRoutes, rng: np.random.Generator, duration: float) -> list[Driver]:
     """Those who come into town later."""
     out = []
     level = float(rng.choice((0.4, 0.8, 1.3)))
-    for entry in ways.entries:
-        street = ways.town.streets[entry]
-        mean = 11.0 / (level * ways.likes[entry] * street.lanes**0.7 + 0.15)  # s
+    for entry in routes.entries:
+        street = routes.town.streets[entry]
+        mean = 11.0 / (level * routes.likes[entry] * street.lanes**0.7 + 0.15)  # s
         time = float(rng.exponential(mean))
         while time < duration - 4.0:
             category = _category(rng)
-            path = ways.path(entry, category)
+            path = routes.path(entry, category)
             if path is not None:
                 driver = _driver(path, category, rng, start=round(time, 2))
                 driver.move_to(0.5 * driver.length + 3.0)
@@ -220,16 +227,59 @@ def _arriving(ways: Ways, rng: np.random.Generator, duration: float) -> list[Dri
     return sorted(out, key=lambda driver: driver.start)
 
 
-def _walkers(town: Town, rng: np.random.Generator, duration: float) -> list[Walker]:
+def _pedestrians(town: Town, rng: np.random.Generator, duration: float) -> list[Pedestrian]:
     """Pedestrians over crossings and along the streets."""
     out = []
     level = float(rng.choice((0.5, 1.0, 1.5)))
-    for walk in town.walks.values():
+    for walk in town.walks:
         last = walk.kerb - 4.0 if walk.crossing else 0.7 * walk.length
         if last < 3.0:
             continue
         for _ in range(int(rng.poisson(level if walk.crossing else 0.5 * level))):
             start = float(rng.uniform(0.0, duration - 8.0)) if rng.random() < 0.7 else 0.0
             s = float(rng.uniform(max(2.0, last - _WALK_UP), last))
-            out.append(Walker(walk, start=round(start, 2), s=round(s, 2)))
-    return sorted(out, key=lambda walker: walker.start)
+            out.append(Pedestrian(walk, start=round(start, 2), s=round(s, 2)))
+    return sorted(out, key=lambda pedestrian: pedestrian.start)
+
+
+def touching(boxes: list[Box], parked: FloatArray, drivers: list[Driver]) -> set[int]:
+    """Numbers of agents to leave out, so that nobody touches anybody.
+
+    Agents are numbered from 0 on, drivers first, in the order of their tracks; cars are parked at
+    `parked` (n, 3).
+    """
+    rows = np.array([(x[0], x[1] - 1, *x[3:6], *SIZES[x[2]][:2]) for x in boxes]).reshape(-1, 7)
+    out: set[int] = set()
+    size = np.array(SIZES["car"][:2])
+    numbers = np.full((len(parked), 2), float(_PARKED))
+    still = np.column_stack([numbers, parked, np.tile(size, (len(parked), 1))])
+    for frame in range(0, round(rows[:, 0].max(initial=-1.0)) + 1, _EVERY):
+        low, high = np.searchsorted(rows[:, 0], (frame, frame + 1))
+        now = np.concatenate([rows[low:high], still])
+        for i, j in _pairs(now, high - low):
+            one, two = (int(now[k, 1]) for k in (i, j))
+            if not out & {one, two}:
+                out.add(_blamed(one, two, drivers))
+    return out
+
+
+def _pairs(now: FloatArray, moving: int) -> list[tuple[int, int]]:
+    """Pairs of rows i < j that touch, of which the first is one of those that may move."""
+    gap = np.hypot(*np.moveaxis(now[:moving, None, 2:4] - now[None, :, 2:4], -1, 0))
+    reach = 0.5 * np.hypot(now[:, 5], now[:, 6])
+    i, j = np.nonzero(gap < reach[:moving, None] + reach + 2.0 * _MARGIN)
+    kept = (j > i) & ((now[i, 5] >= _ON_FOOT) | (now[j, 5] >= _ON_FOOT))
+    i, j = i[kept], j[kept]
+    sizes = now[:, 5:7] + np.where(now[:, 1:2] == _PARKED, 0.0, _MARGIN)
+    shapes = shapely.polygons(boxes_to_corners(now[:, 2:5], sizes))
+    meet = shapely.intersects(shapes[i], shapes[j])
+    return list(zip(i[meet].tolist(), j[meet].tolist(), strict=True))
+
+
+def _blamed(one: int, two: int, drivers: list[Driver]) -> int:
+    """Which of two to leave out: a pedestrian, else the much longer vehicle, else the later one."""
+    low, high = sorted((one, two))
+    if low == _PARKED or high >= len(drivers):
+        return high
+    longer = drivers[low].length - drivers[high].length
+    return low if longer > 2.0 else high

@@ -5,12 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from shiftsim.data.demo.network import Street
-from shiftsim.data.demo.roads import Piece, bend, line
+from shiftsim.data.synthetic.roads import Piece
+from shiftsim.data.synthetic.town import Street
 from shiftsim.kernels import FloatArray
 
 AT_JUNCTION = ((3.0, 7.0),)  # m along a street, crosswalk at a junction
-WIDE = 0.3  # m, how far drivers swing out to turn right
 _NAMES = ("alder", "birch", "cedar", "dogwood", "elm", "fir", "gorse", "hazel", "iris")
 # km/h, by lanes per direction
 _LIMITS = ((20.0, 30.0, 30.0, 40.0, 50.0), (30.0, 40.0, 50.0, 50.0, 60.0), (50.0, 60.0, 70.0))
@@ -48,17 +47,14 @@ def random_street(
     if pieces is None:
         straight = float(rng.uniform(20.0, 35.0))
         pieces = _winding(rng, length, limit, lanes * width + strip, straight)
-    made = Street(
+    free: tuple[int, ...] = ()  # parking spaces
+    if strip:
+        share = rng.uniform(0.1, 0.7)
+        free = tuple(np.flatnonzero(rng.random(80) < share).tolist())
+    return Street(
         _NAMES[number - 1], number, (0.0, 0.0, 0.0), pieces, width, limit, lanes, parking=strip,
-        sidewalk=sidewalk, wide=WIDE,
+        sidewalk=sidewalk, empty=free,
     )  # fmt: skip
-    return replace(made, empty=_free_spaces(rng)) if strip else made
-
-
-def _free_spaces(rng: np.random.Generator) -> tuple[int, ...]:
-    """Numbers of parking spaces without a car."""
-    share = rng.uniform(0.1, 0.7)
-    return tuple(np.flatnonzero(rng.random(80) < share).tolist())
 
 
 def _winding(
@@ -66,25 +62,25 @@ def _winding(
 ) -> tuple[Piece, ...]:
     """Lines and bends; the first metres are straight, and it never turns far from there."""
     comfortable = (limit / 3.6) ** 2 / _LATERAL_ACCEL  # m, radius
-    pieces, turned = [line(straight)], 0.0
+    pieces, turned = [Piece(straight)], 0.0
     goes_on = rng.random() < 0.25  # straight to the end
     while (rest := length - sum(piece.length for piece in pieces)) > 8.0:
         radius = max(comfortable * float(rng.uniform(0.35, 2.5)), half + 9.0, 16.0)
         angle = float(rng.uniform(0.2, 0.9) * rng.choice((-1.0, 1.0)))
         easing = min(float(rng.uniform(6.0, 16.0)), 0.5 * abs(angle) * radius)
         if goes_on or abs(turned + angle) > 0.8 or abs(angle) * radius + easing > rest - 6.0:
-            pieces.append(line(min(rest, float(rng.uniform(15.0, 40.0)))))
+            pieces.append(Piece(min(rest, float(rng.uniform(15.0, 40.0)))))
             goes_on = goes_on or rest < 40.0
             continue
-        pieces += bend(angle, float(np.sign(angle)) / radius, easing)
-        pieces.append(line(float(rng.uniform(6.0, 25.0))))
+        curvature = float(np.sign(angle)) / radius
+        pieces += [
+            Piece(easing, 0.0, curvature),
+            Piece(abs(angle / curvature) - easing, curvature, curvature),
+            Piece(easing, curvature, 0.0),
+            Piece(float(rng.uniform(6.0, 25.0))),
+        ]
         turned += angle
     return tuple(pieces)
-
-
-def length_of(street: Street) -> float:
-    """Length of a street [m]."""
-    return sum(piece.length for piece in street.pieces)
 
 
 def with_crossings(rng: np.random.Generator, street: Street, share: float) -> Street:
@@ -92,7 +88,7 @@ def with_crossings(rng: np.random.Generator, street: Street, share: float) -> St
 
     Some are not marked: there people step out between parked cars.
     """
-    length = length_of(street)
+    length = street.length
     places = AT_JUNCTION if rng.random() < share else ()
     if rng.random() < 0.6 and length > 75.0:
         at = round(float(rng.uniform(32.0, length - 38.0)), 1)
@@ -103,7 +99,7 @@ def with_crossings(rng: np.random.Generator, street: Street, share: float) -> St
 
 def with_obstacles(rng: np.random.Generator, street: Street) -> Street:
     """The same street with cars half on the road, so that vehicles swing out or take turns."""
-    length = length_of(street)
+    length = street.length
     begin = float(rng.uniform(28.0, max(length - 60.0, 30.0)))
     count = int(rng.integers(1, 5))
     end = begin + _SPACE * count
@@ -179,17 +175,6 @@ def reaches(streets: Sequence[Street], angles: Sequence[float], rounding: float)
         around = rounding / np.tan(0.5 * gap)
         out[one] = max(out[one], float((b + a * np.cos(gap)) / np.sin(gap) + around))
         out[other] = max(out[other], float((a + b * np.cos(gap)) / np.sin(gap) + around))
-    return out
-
-
-def turned(streets: Sequence[Street], angle: float) -> list[Street]:
-    """Streets turned around the origin [rad]."""
-    cos, sin = float(np.cos(angle)), float(np.sin(angle))
-    out = []
-    for street in streets:
-        x, y, heading = street.start
-        start = (x * cos - y * sin, x * sin + y * cos, heading + angle)
-        out.append(replace(street, start=start))
     return out
 
 

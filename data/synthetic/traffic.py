@@ -6,16 +6,13 @@ conflicting ways at a time; a crossing belongs to whoever is on it, then to pede
 vehicles can still stop for. Steps are the frames of the recording.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from math import cos, inf, sin, sqrt
+from math import cos, hypot, inf, pi, sin, sqrt
 
 import numpy as np
 
-from shiftsim.data.demo.agents import WALKING, Driver, Walker, goes_first, has_room, must_queue
-from shiftsim.data.demo.lights import Lights
-from shiftsim.data.demo.network import Town
-from shiftsim.data.demo.paths import STEP, Zone, arc_at
+from shiftsim.data.synthetic.agents import STEP, WALKING, Driver, Pedestrian, Zone, arc_at
+from shiftsim.data.synthetic.town import Town
 from shiftsim.kernels import FloatArray
 
 DT = 0.08  # s, 12.5 Hz
@@ -39,15 +36,14 @@ class Traffic:
 
     town: Town  # where
     drivers: list[Driver]  # in the order of their tracks
-    walkers: list[Walker]  # the tracks after those
+    pedestrians: list[Pedestrian]  # the tracks after those
     # frame, track, category, x [m], y [m], heading [rad], speed [m/s], acceleration [m/s^2], yaw
     # rate [rad/s]
     boxes: list[Box] = field(default_factory=list)
-    lights: Sequence[Lights] = ()  # of junctions
-    _passing: dict[tuple[int, int], float] = field(default_factory=dict)
-    _closed: set[int] = field(
-        default_factory=set
-    )  # connecting roads with a light that is not green
+    # where pedestrians on a way over a crossing have left the way of drivers on a path [m]
+    _passed: dict[tuple[int, int], float] = field(default_factory=dict)
+    # connecting roads with a light that is not green
+    _closed: set[int] = field(default_factory=set)
     # how long the light for vehicles will stay red, by crosswalk [s]
     _waits: dict[str, float] = field(default_factory=dict)
 
@@ -55,39 +51,37 @@ class Traffic:
         """Simulate from time 0, once, and return the boxes of all frames."""
         if self.boxes:
             return self.boxes
-        everybody: list[Driver | Walker] = [*self.drivers, *self.walkers]
+        everybody: list[Driver | Pedestrian] = [*self.drivers, *self.pedestrians]
         for number, agent in enumerate(everybody, start=1):
-            agent.token = number
+            agent.track = number
         waiting = list(self.drivers)
         active: list[Driver] = []
         for frame in range(round(duration / DT) + 1):
             time = frame * DT
             for driver in [d for d in waiting if d.start <= time]:
-                if has_room(driver, active):
+                if driver.has_room(active):
                     active.append(driver)
                     waiting.remove(driver)
-            walkers = [w for w in self.walkers if w.start <= time and w.is_under_way]
-            self._write(frame, active, walkers)
-            self._step(active, walkers, time)
-            active = [d for d in active if not d.has_arrived]
+            on_foot = [x for x in self.pedestrians if x.start <= time and x.s < x.walk.length - 0.5]
+            self.boxes += [
+                (frame, x.track, x.category, *x.pose, x.v, x.a, x.path.curvature(x.s) * x.v)
+                for x in active
+            ]
+            self.boxes += [
+                (frame, x.track, "pedestrian", *x.walk.at(x.s), x.v, 0.0, 0.0) for x in on_foot
+            ]
+            self._step(active, on_foot, time)
+            active = [x for x in active if x.path.is_parking or x.front < x.path.length - 1.0]
         return self.boxes
 
-    def _write(self, frame: int, drivers: list[Driver], walkers: list[Walker]) -> None:
-        for driver in drivers:
-            rate = driver.path.bend(driver.s) * driver.v
-            row = (frame, driver.token, driver.category, *driver.place, driver.v, driver.a, rate)
-            self.boxes.append(row)
-        for walker in walkers:
-            place = walker.walk.at(walker.s)
-            self.boxes.append((frame, walker.token, "pedestrian", *place, walker.v, 0.0, 0.0))
-
-    def _step(self, drivers: list[Driver], walkers: list[Walker], time: float) -> None:
-        self._closed = {number for lights in self.lights for number in lights.closed(time)}
-        self._waits = {name: x for lights in self.lights for name, x in lights.waits(time).items()}
+    def _step(self, drivers: list[Driver], pedestrians: list[Pedestrian], time: float) -> None:
+        lights = self.town.lights
+        self._closed = {number for x in lights for number in x.closed(time)}
+        self._waits = {name: wait for x in lights for name, wait in x.waits(time).items()}
         self._admit(drivers)
         bodies = _bodies(drivers)
-        wanted = [self._acceleration(d, drivers, walkers, bodies, time) for d in drivers]
-        self._let_walk(drivers, walkers)
+        wanted = [self._acceleration(d, drivers, pedestrians, bodies, time) for d in drivers]
+        self._let_walk(drivers, pedestrians)
         for driver, accel in zip(drivers, wanted, strict=True):
             driver.a += min(max(accel - driver.a, -1.5 * _JERK * DT), _JERK * DT)
             if driver.v + driver.a * DT < 0.0 or (driver.v < 0.02 and accel <= 0.0):
@@ -96,62 +90,58 @@ class Traffic:
                 continue
             driver.move_to(driver.s + driver.v * DT + 0.5 * driver.a * DT * DT)
             driver.v += driver.a * DT
-        for walker in walkers:
-            walker.s += walker.v * DT
+        for pedestrian in pedestrians:
+            pedestrian.s += pedestrian.v * DT
 
     def _admit(self, drivers: list[Driver]) -> None:
         """Let drivers into zones, by priority, where nobody in there is in their way."""
         for driver in drivers:
-            for held in driver.path.zones if driver.held else ():
-                waits = driver.is_yielding(held) or driver.is_held_up(held)
-                if driver.rear > held.exit or waits or self._must_stop(driver, held):
-                    driver.held.discard(held.id)
+            for held in driver.path.zones if driver.admitted else ():
+                must_stop = (  # a light has turned, and who was let in before can still stop
+                    held.id in self._closed
+                    and driver.is_before(held)
+                    and driver.needed(held.stop - _REACTION * driver.v) < _AT_YELLOW
+                )
+                if driver.rear > held.exit or driver.waits(held) or must_stop:
+                    driver.admitted.discard(held.id)
         asking = [(d, zone) for d in drivers if (zone := d.next_zone())]
-        asking.sort(key=lambda x: (x[0].rank(x[1]), x[0].arrival(x[1]), x[0].token))
+        asking.sort(key=lambda x: (x[0].rank(x[1]), x[0].arrival(x[1]), x[0].track))
         refused: list[Zone] = []
         for driver, zone in asking:
             if zone.id in self._closed:
                 continue
-            if driver.v < 0.3 and _place_of(zone) in driver.waiting:
+            if driver.v < 0.3 and zone.id in driver.waiting:
                 driver.patience -= DT
             is_far = driver.arrival(zone) > _REQUEST + driver.v / (2.0 * _EVEN)
-            waits = driver.is_yielding(zone) or driver.is_held_up(zone)
-            refuses = any(self._conflict(zone, other) for other in refused)
-            if is_far or waits or refuses or must_queue(driver, zone, drivers):
+            refuses = any((zone.id, other.id) in self.town.conflicts for other in refused)
+            if is_far or driver.waits(zone) or refuses or _must_queue(driver, zone, drivers):
                 continue
             if not any(self._is_in_the_way(d, driver, zone) for d in drivers if d is not driver):
-                driver.held.add(zone.id)
+                driver.admitted.add(zone.id)
                 driver.patience = 6.0
             elif driver.patience <= 0.0:
                 refused.append(zone)
 
-    def _must_stop(self, driver: Driver, zone: Zone) -> bool:
-        """Whether a light has turned, and who was let in before can still stop."""
-        place = zone.stop - _REACTION * driver.v
-        is_shut = zone.id in self._closed and driver.is_before(zone)
-        return is_shut and driver.needed(place) < _AT_YELLOW
-
     def _is_in_the_way(self, other: Driver, driver: Driver, wanted: Zone) -> bool:
         return any(
-            zone.id in other.held
-            or (zone.id not in self._closed and goes_first(other, zone, driver, wanted))
+            zone.id in other.admitted
+            or (zone.id not in self._closed and _goes_first(other, zone, driver, wanted))
             for zone in other.path.zones
-            if self._conflict(wanted, zone)
+            if (wanted.id, zone.id) in self.town.conflicts
         )
-
-    def _conflict(self, a: Zone, b: Zone) -> bool:
-        return (a.id, b.id) in self.town.conflicts
 
     def _acceleration(
         self,
         driver: Driver,
         drivers: list[Driver],
-        walkers: list[Walker],
+        pedestrians: list[Pedestrian],
         bodies: FloatArray,
         time: float,
     ) -> float:
         index = min(int(driver.s / STEP), len(driver.path.speed) - 1)
-        target = max(driver.pace(time) * float(driver.path.speed[index]), 0.5)
+        depth, period = driver.wave
+        pace = driver.eager * (1.0 - depth * (0.5 - 0.5 * cos(2.0 * pi * time / period)))
+        target = max(pace * float(driver.path.speed[index]), 0.5)
         free = _MAX_ACCEL * (1.0 - (driver.v / target) ** 4)
         accel = max(free, -1.8)
         gap, lead_speed = _leader(driver, drivers, bodies)
@@ -160,24 +150,24 @@ class Traffic:
             wanted = _MIN_GAP + max(0.0, driver.v * _HEADWAY + closing)
             following = free - _MAX_ACCEL * (wanted / max(gap, 0.3)) ** 2
             accel = min(accel, max(following, -_HARDEST))
-        for name, place in self._places_to_wait(driver, drivers, walkers):
+        for name, place in self._places_to_wait(driver, drivers, pedestrians):
             accel = min(accel, _even_braking(driver, name, place))
         return accel
 
     def _places_to_wait(
-        self, driver: Driver, drivers: list[Driver], walkers: list[Walker]
-    ) -> list[tuple[str, float]]:
-        places = []
+        self, driver: Driver, drivers: list[Driver], pedestrians: list[Pedestrian]
+    ) -> list[tuple[int | str, float]]:
+        """Zones by number, other places by name, and the arc lengths to stop at [m]."""
+        places: list[tuple[int | str, float]] = []
         path = driver.path
         for zone in path.zones:
-            if zone.id not in driver.held and driver.is_before(zone):
-                places.append((_place_of(zone), zone.stop))
+            if zone.id not in driver.admitted and driver.is_before(zone):
+                places.append((zone.id, zone.stop))
             else:
-                driver.waiting.discard(_place_of(zone))
+                driver.waiting.discard(zone.id)
         for name, first, _ in path.crossings:
             place = first - 1.5
-            before = driver.front <= first - 0.3
-            if before and self._is_claimed(driver, name, place, walkers):
+            if driver.front <= first - 0.3 and self._is_claimed(driver, name, place, pedestrians):
                 places.append((name, place))
             else:
                 driver.waiting.discard(name)
@@ -190,53 +180,57 @@ class Traffic:
             places.append(("end", path.length + 0.5 * driver.length + 0.9))
         return places
 
-    def _is_claimed(self, driver: Driver, name: str, place: float, walkers: list[Walker]) -> bool:
+    def _is_claimed(
+        self, driver: Driver, name: str, place: float, pedestrians: list[Pedestrian]
+    ) -> bool:
         """Whether a driver must wait before a crossing."""
-        for walker in walkers:
-            if walker.walk.crossing != name or walker.s > self._passed(driver, walker):
+        for pedestrian in pedestrians:
+            if pedestrian.walk.crossing != name or pedestrian.s > self._place_passed(
+                driver, pedestrian
+            ):
                 continue
-            if walker.crossing:
+            if pedestrian.is_crossing:
                 return True
-            if name in self._waits and not self._has_time(walker):
+            if name in self._waits and not self._has_time(pedestrian):
                 continue
-            near = walker.s > walker.walk.kerb - 2.5
+            near = pedestrian.s > pedestrian.walk.kerb - 2.5
             if near and (name in driver.waiting or driver.needed(place) < _YIELDING):
                 return True
         return False
 
-    def _passed(self, driver: Driver, walker: Walker) -> float:
+    def _place_passed(self, driver: Driver, pedestrian: Pedestrian) -> float:
         """Where on its way over a crossing a pedestrian has left the way of a driver [m]."""
-        key = (id(driver.path), id(walker.walk))
-        if key not in self._passing:
-            near = (p for n, *p in driver.path.crossings if n == walker.walk.crossing)
+        key = (id(driver.path), id(pedestrian.walk))
+        if key not in self._passed:
+            near = (p for n, *p in driver.path.crossings if n == pedestrian.walk.crossing)
             x, y, _ = driver.path.at(0.5 * sum(next(near)))
-            place = arc_at(walker.walk.points, np.array([x, y]))
-            self._passing[key] = min(place + _PASSED, walker.walk.across)
-        return self._passing[key]
+            place = arc_at(pedestrian.walk.points, np.array([x, y]))
+            self._passed[key] = min(place + _PASSED, pedestrian.walk.across)
+        return self._passed[key]
 
-    def _let_walk(self, drivers: list[Driver], walkers: list[Walker]) -> None:
-        for walker in walkers:
-            walk = walker.walk
-            at_kerb = walk.kerb - 0.9 <= walker.s <= walk.kerb + 0.2
-            if at_kerb and not walker.crossing and not self._may_cross(walker, drivers):
-                walker.v = max(walker.v - 2.2 * DT, 0.0)
+    def _let_walk(self, drivers: list[Driver], pedestrians: list[Pedestrian]) -> None:
+        for pedestrian in pedestrians:
+            walk = pedestrian.walk
+            at_kerb = walk.kerb - 0.9 <= pedestrian.s <= walk.kerb + 0.2
+            if at_kerb and not pedestrian.is_crossing and not self._may_cross(pedestrian, drivers):
+                pedestrian.v = max(pedestrian.v - 2.2 * DT, 0.0)
                 continue
-            if walker.s >= walk.kerb - 0.9:
-                walker.crossing = walker.s <= walk.across
-            walker.v = min(walker.v + 1.0 * DT, WALKING)
+            if pedestrian.s >= walk.kerb - 0.9:
+                pedestrian.is_crossing = pedestrian.s <= walk.across
+            pedestrian.v = min(pedestrian.v + 1.0 * DT, WALKING)
 
-    def _has_time(self, walker: Walker) -> bool:
+    def _has_time(self, pedestrian: Pedestrian) -> bool:
         """Whether the light lets a pedestrian cross."""
-        walk = walker.walk
+        walk = pedestrian.walk
         return self._waits.get(walk.crossing, inf) > (walk.across - walk.kerb) / WALKING
 
-    def _may_cross(self, walker: Walker, drivers: list[Driver]) -> bool:
-        if not self._has_time(walker):
+    def _may_cross(self, pedestrian: Pedestrian, drivers: list[Driver]) -> bool:
+        if not self._has_time(pedestrian):
             return False
-        needed = (walker.walk.across - walker.walk.kerb) / WALKING + 2.0
+        needed = (pedestrian.walk.across - pedestrian.walk.kerb) / WALKING + 2.0
         for driver in drivers:
             for name, first, last in driver.path.crossings:
-                if name != walker.walk.crossing or driver.rear > last + 0.5:
+                if name != pedestrian.walk.crossing or driver.rear > last + 0.5:
                     continue
                 stands = driver.v < 0.3
                 if driver.front > first - (0.4 if stands else 1.6):
@@ -248,11 +242,34 @@ class Traffic:
         return True
 
 
-def _place_of(zone: Zone) -> str:
-    return f"zone {zone.id}"
+def _goes_first(driver: Driver, zone: Zone, other: Driver, wanted: Zone) -> bool:
+    """Whether a driver with priority is too near for another one to enter before it."""
+    clear = other.arrival(wanted) + (wanted.exit - wanted.stop + other.length) / 5.5
+    return (
+        driver.rank(zone) < other.rank(wanted)
+        and driver.is_before(zone)
+        and driver.v > 0.5
+        and driver.arrival(zone) < clear + 1.0
+    )
 
 
-def _even_braking(driver: Driver, name: str, place: float) -> float:
+def _must_queue(driver: Driver, zone: Zone, drivers: list[Driver]) -> bool:
+    """Whether somebody ahead still has to enter, or stands behind the zone."""
+    x, y, heading = driver.path.at(min(zone.exit + 6.0, driver.path.length))
+    for other in drivers:
+        if other is driver:
+            continue
+        ahead = other.next_zone()
+        is_first = ahead and ahead.stop - other.front < zone.stop - driver.front
+        if ahead and is_first and ahead.origin == zone.origin:
+            return True
+        ox, oy, other_heading = other.pose
+        if other.v < 2.0 and hypot(ox - x, oy - y) < 8.0 and cos(other_heading - heading) > 0.5:
+            return True
+    return False
+
+
+def _even_braking(driver: Driver, name: int | str, place: float) -> float:
     needed = driver.needed(place)
     if needed < _EVEN and name not in driver.waiting:
         return _MAX_ACCEL
@@ -266,7 +283,7 @@ def _bodies(drivers: list[Driver]) -> FloatArray:
     """(n, 3, 3) rear, middle and front of everybody, and half the width."""
     out = []
     for driver in drivers:
-        x, y, heading = driver.place
+        x, y, heading = driver.pose
         half = 0.5 * driver.length - 0.3
         dx, dy, wide = half * cos(heading), half * sin(heading), 0.5 * driver.width
         out.append(((x - dx, y - dy, wide), (x, y, wide), (x + dx, y + dy, wide)))
@@ -292,7 +309,7 @@ def _leader(driver: Driver, drivers: list[Driver], bodies: FloatArray) -> tuple[
     best, speed = inf, 0.0
     for part in np.flatnonzero((aside < own) & (nearest > 0)).tolist():
         other = drivers[near[part // 3]]
-        turn = other.place[2] - driver.path.at(float(along[part]))[2]
+        turn = other.pose[2] - driver.path.at(float(along[part]))[2]
         gap = float(along[part]) - 0.3 - driver.front
         if abs(cos(turn)) < 0.7:
             gap -= parts[part, 2]
@@ -303,20 +320,16 @@ def _leader(driver: Driver, drivers: list[Driver], bodies: FloatArray) -> tuple[
 
 def _comes(other: Driver, driver: Driver) -> bool:
     """Whether somebody is beside or behind on the lane that a parked driver moves off to."""
-    x, y, heading = driver.place
-    dx, dy = other.place[0] - x, other.place[1] - y
-    along = dx * cos(heading) + dy * sin(heading)
-    near = -4.5 * other.v - 12.0 < along < 9.0 and 0.5 < driver.aside(*other.place[:2]) < 5.0
-    return near and cos(other.place[2] - heading) > 0.5
+    x, y, heading = other.pose
+    along, aside = driver.offset(x, y)
+    near = -4.5 * other.v - 12.0 < along < 9.0 and 0.5 < aside < 5.0
+    return near and cos(heading - driver.pose[2]) > 0.5
 
 
 def _may_lead(other: Driver, driver: Driver, reach: float) -> bool:
     """Whether somebody is near enough to be on the path ahead, and not behind."""
-    (x, y, heading), (ox, oy, _) = driver.place, other.place
+    (x, y, _), (ox, oy, _) = driver.pose, other.pose
     dx, dy = ox - x, oy - y
     limit = reach + 0.5 * other.length + 2.0
-    return (
-        other is not driver
-        and dx * dx + dy * dy < limit * limit
-        and dx * cos(heading) + dy * sin(heading) > -0.5 * other.length
-    )
+    is_near = other is not driver and dx * dx + dy * dy < limit * limit
+    return is_near and driver.offset(ox, oy)[0] > -0.5 * other.length

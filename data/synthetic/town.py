@@ -1,24 +1,31 @@
-"""Towns from streets: junctions between them, and the ways that traffic takes through them.
+"""Towns from streets: junctions between them, ways of pedestrians, and parking spaces."""
 
-A way is written as the streets it follows, joined by hyphens, the first one with its lane:
-`east2-west` begins on lane 2 of `east`, counted from the middle, and goes on to `west`. `mid1>2`
-changes lanes on the way, `lot@7` ends in parking space 7 of `lot`, `-bicycle` keeps to the right.
-"""
-
-import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import permutations, product
 
 import numpy as np
 
-from shiftsim.data.demo import paths
-from shiftsim.data.demo.roads import CrosswalkSpec, LaneSpec, Piece, RoadNetwork, RoadSpec, connect
+from shiftsim.data.synthetic.agents import STEP, Walk, arc_at, resample
+from shiftsim.data.synthetic.roads import (
+    CrosswalkSpec,
+    LaneSpec,
+    Piece,
+    RoadNetwork,
+    RoadSpec,
+    connect,
+)
 from shiftsim.kernels import FloatArray
+from shiftsim.world.state import LightStatus
 
 _CLOSE = 2.9  # m between the centres of connecting roads that conflict
-_LANE_CHANGE = 45.0  # m
-_NARROW_SPEED, _NARROW_ASIDE, _NARROW_RAMP = 5.5, 0.3, 12.0  # m/s, m, m
-BAY_ANGLE = np.pi / 3  # of diagonal parking spaces
+_NARROW_ASIDE = 0.3  # m
+_BAY_ANGLE = np.pi / 3  # of diagonal parking spaces
+_PARKING_STEP, _BAY_STEP = 6.6, 3.1  # m along the street between parked cars, diagonal ones
+_UNMARKED = 4.0  # m from a place to cross without a crosswalk to the middle of a parked car
+_DIAGONAL = 3.0  # m, wider strips are for diagonal parking
+_ROUNDING = 0.6  # m
+_CLEARING = 2.0  # s between the yellow light of one phase and the green light of the next
 
 
 @dataclass(frozen=True)
@@ -46,9 +53,13 @@ class Street:
     narrow: tuple[float, float] | None = None  # first and last s where vehicles cannot meet [m]
     # how far vehicles swing to the left there, along s and against it; who must more gives way [m]
     swings: tuple[float, float] = (_NARROW_ASIDE, _NARROW_ASIDE)
-    wide: float = 0.0  # how far vehicles swing out to turn right at its junctions [m]
     obstacles: tuple[tuple[float, float], ...] = ()  # s and t of cars parked on the road [m]
     has_lights: bool = False  # whether traffic lights stand before its junctions
+
+    @property
+    def length(self) -> float:
+        """Length [m]."""
+        return sum(piece.length for piece in self.pieces)
 
     @property
     def half(self) -> float:
@@ -82,6 +93,44 @@ class Street:
 
 
 @dataclass(frozen=True)
+class Lights:
+    """The lights of one junction: streets take turns."""
+
+    # connecting roads that are green together, phase after phase
+    phases: tuple[frozenset[int], ...]
+    green: tuple[float, ...]  # how long each phase is green [s]
+    begun: float  # how long the cycle has been going on at time 0 [s]
+    crossings: dict[str, int]  # phase of the vehicles that a crosswalk stops, by its name
+    yellow: float = 3.0  # how long a phase is yellow [s]
+
+    def status(self, phase: int, time: float) -> LightStatus:
+        """What a phase shows at a time [s]."""
+        wait = self.wait(phase, time)
+        if wait > 0.0:
+            return LightStatus.RED
+        return LightStatus.GREEN if -wait < self.green[phase] else LightStatus.YELLOW
+
+    def wait(self, phase: int, time: float) -> float:
+        """Time until a phase becomes green; 0 and less, how long it has been, or yellow [s]."""
+        spans = [green + self.yellow + _CLEARING for green in self.green]
+        since = (self.begun + time - sum(spans[:phase])) % sum(spans)
+        return -since if since < self.green[phase] + self.yellow else sum(spans) - since
+
+    def closed(self, time: float) -> set[int]:
+        """Connecting roads that nobody may enter at a time [s]."""
+        return {
+            number
+            for phase, numbers in enumerate(self.phases)
+            if self.status(phase, time) != LightStatus.GREEN
+            for number in numbers
+        }
+
+    def waits(self, time: float) -> dict[str, float]:
+        """How long the vehicles before each crosswalk will see red [s]."""
+        return {name: self.wait(phase, time) for name, phase in self.crossings.items()}
+
+
+@dataclass(frozen=True)
 class Leg:
     """A street in one direction."""
 
@@ -108,7 +157,7 @@ class Leg:
 
     def lane(self, road: RoadSpec, lane: int) -> FloatArray:
         """(n, 2) centre of a lane, in its direction."""
-        s = np.arange(0.0, road.length, paths.STEP)
+        s = np.arange(0.0, road.length, STEP)
         center = road.center_of(-lane if self.is_forward else lane, s)[:, :2]
         return center if self.is_forward else center[::-1]
 
@@ -124,9 +173,9 @@ class Town:
     connectors: dict[tuple[int, str, int, str], tuple[int, int]] = field(default_factory=dict)
     # connecting roads and narrow places that cannot be used at once
     conflicts: set[tuple[int, int]] = field(default_factory=set)
-    walks: dict[str, paths.Walk] = field(default_factory=dict)  # by name
+    walks: list[Walk] = field(default_factory=list)
     bays: dict[str, FloatArray] = field(default_factory=dict)  # (n, 3) parking spaces by street
-    _paths: dict[str, paths.Path] = field(default_factory=dict)
+    lights: tuple[Lights, ...] = ()  # of its junctions
 
     def parked(self) -> FloatArray:
         """(n, 3) poses of parked cars."""
@@ -141,14 +190,8 @@ class Town:
                 poses.append(pose)
         return np.concatenate([np.zeros((0, 3)), *poses])
 
-    def path(self, way: str) -> paths.Path:
-        """The path of a way."""
-        if way not in self._paths:
-            self._paths[way] = _make_way(self, way)
-        return self._paths[way]
 
-
-def build_town(name: str, streets: tuple[Street, ...]) -> Town:
+def build_town(name: str, streets: Sequence[Street]) -> Town:
     """A town from its streets; junctions connect all that meet there."""
     town = Town(name, {street.name: street for street in streets}, RoadNetwork(name))
     legs = [Leg(street, True) for street in streets]
@@ -160,21 +203,28 @@ def build_town(name: str, streets: tuple[Street, ...]) -> Town:
         meet = source.enters and source.enters == target.leaves
         if meet and source.street is not target.street:
             _connect(town, source, target, lines)
+    roads = town.network.roads
     starts = {number: (street, lane) for street, number, lane in town.network.links}
     for a, b in permutations(lines, 2):
-        same = town.network.roads[a].junction == town.network.roads[b].junction
-        if same and starts[a] != starts[b] and _closest(lines[a], lines[b]) < _CLOSE:
-            town.conflicts.add((a, b))
+        if roads[a].junction == roads[b].junction and starts[a] != starts[b]:
+            gaps = np.hypot(*np.moveaxis(lines[a][:, None] - lines[b], -1, 0))
+            if gaps.min() < _CLOSE:
+                town.conflicts.add((a, b))
     for street in streets:
         if street.narrow:
             one, other = -2 * street.id, -2 * street.id - 1
             town.conflicts |= {(one, other), (other, one)}
+    for street in streets:
+        if not street.is_one_way:
+            _add_walks(town, street)
+        if street.parking > 0.0:
+            town.bays[street.name] = _bays(town, street)
     return town
 
 
 def _connect(town: Town, source: Leg, target: Leg, lines: dict[int, FloatArray]) -> None:
     """Connecting roads from one street to another, one per lane that leads there."""
-    turn, roads = _turn(town, source, target), town.network.roads
+    turn, roads = turn_angle(town, source, target), town.network.roads
     a, b = source.street, target.street
     if abs(turn) < 0.5:
         pairs = [(n, n) for n in range(1, min(a.lanes, b.lanes) + 1)]
@@ -199,131 +249,58 @@ def _connect(town: Town, source: Leg, target: Leg, lines: dict[int, FloatArray])
         roads[number] = road
         town.network.links.append((a.id, number, incoming))
         town.connectors[source.enters, a.name, from_lane, b.name] = (number, to_lane)
-        lines[number] = road.center_of(-1, np.arange(0.0, road.length, paths.STEP))[:, :2]
+        lines[number] = road.center_of(-1, np.arange(0.0, road.length, STEP))[:, :2]
 
 
-def _turn(town: Town, source: Leg, target: Leg) -> float:
+def turn_angle(town: Town, source: Leg, target: Leg) -> float:
     """Change of heading through a junction [rad]."""
     a = source.pose(town.network.roads[source.street.id], 1, at_end=True)
     b = target.pose(town.network.roads[target.street.id], 1, at_end=False)
     return float((b[2] - a[2] + np.pi) % (2 * np.pi) - np.pi)
 
 
-def _make_way(town: Town, way: str) -> paths.Path:
-    names = way.split("-")
-    if names[-1] == "bicycle":
-        return paths.for_bicycles(town.path(way.removesuffix("-bicycle")))
-    steps = [re.fullmatch(r"([a-z]+)(\d*)(?:>(\d+))?(?:@(\d+))?", name) for name in names]
-    parts, limits, zones, crossings = [], [], [], []
-    lane, is_forward = 1, False
-    for number, step in enumerate(steps):
-        assert step, way
-        street = town.streets[step[1]]
-        if number == 0:
-            after = town.streets[re.split(r"[\d>@]", names[1])[0]]
-            lane, is_forward = int(step[2]), street.junctions[1] in (set(after.junctions) - {0})
-        leg, road = Leg(street, is_forward), town.network.roads[street.id]
-        line = leg.lane(road, lane)
-        origin = f"{street.name}{lane}"
-        if step[3]:
-            line, lane = _change_lanes(line, leg.lane(road, int(step[3]))), int(step[3])
-        if step[4]:
-            line = _into_bay(line, town.bays[street.name][int(step[4])])
-        parts.append(line)
-        limits.append(street.limit)
-        crossings += [
-            (street.crossing_name(n), *_ends(road, leg, lane, ends))
-            for n, ends in enumerate(street.crossings)
-        ]
-        if street.narrow:
-            ends = _ends(road, leg, lane, street.narrow)
-            zones.append((_narrow_zone(leg), *ends, 2.0, street.swings[not is_forward]))
-        if number < len(steps) - 1:
-            following = re.split(r"[\d>@]", names[number + 1])[0]
-            connector, to_lane = town.connectors[leg.enters, street.name, lane, following]
-            onward = town.streets[following]
-            target = Leg(onward, leg.enters == onward.junctions[0])
-            inner = town.network.roads[connector]
-            is_left = _turn(town, leg, target) > 0.5 and not street.is_one_way
-            rank = (0 if street.is_main else 2) + is_left
-            points = inner.center_of(-1, np.arange(0.0, inner.length, paths.STEP))[:, :2]
-            parts.append(points)
-            limits.append(min(street.limit, onward.limit))
-            zone = paths.Zone(connector, 0.0, 0.0, 0.0, rank, origin)
-            swing = street.wide if _turn(town, leg, target) < -0.5 else 0.0
-            zones.append((zone, points[0], points[-1], street.stop, swing))
-            lane, is_forward = to_lane, target.is_forward
-    path = paths.make_path(parts, limits)
-    return _with_places(path, zones, crossings, is_parking=bool(steps[-1] and steps[-1][4]))
+def _add_walks(town: Town, street: Street) -> None:
+    """Add ways over the crossings of a street, and along its sidewalks."""
+    for number in range(len(street.crossings)):
+        _add_crossing(town, street, number)
+    road = town.network.roads[street.id]
+    first = 0.5 * sum(street.crossings[0]) + 8.0 if street.crossings else 3.0
+    s = np.arange(first, road.length - 3.0, STEP)
+    left, right = (road.at(s, sign * (street.half + 2.5))[:, :2] for sign in (1.0, -1.0))
+    town.walks += [Walk(resample(points, _ROUNDING)) for points in (left, right[::-1])]
 
 
-def _with_places(
-    path: paths.Path,
-    zones: list[tuple[paths.Zone, FloatArray, FloatArray, float, float]],
-    crossings: list[tuple[str, FloatArray, FloatArray]],
-    *,
-    is_parking: bool,
-) -> paths.Path:
-    """A path with its zones and crossings, narrow places driven past with care."""
-    arc = paths.STEP * np.arange(len(path.points))
-    aside, speed = np.zeros(len(arc)), path.speed
-    places, made = [], []
-    for name, *ends in crossings:
-        first, last = sorted(paths.arc_at(path.points, end) for end in ends)
-        places.append((name, first, last))
-    for zone, begin, end, stop, swing in zones:
-        entry, leave = paths.arc_at(path.points, begin), paths.arc_at(path.points, end)
-        between = [x for x in places if entry - stop - 0.5 < x[1] and x[2] < entry]
-        crosswalk = between[-1][0] if between else ""
-        made.append(replace(zone, entry=entry, exit=leave, stop=entry - stop, crosswalk=crosswalk))
-        if swing or zone.id < 0:
-            outside = np.maximum(np.maximum(entry - arc, arc - leave), 0.0) / _NARROW_RAMP
-            share = np.clip(1.0 - outside, 0.0, 1.0)
-            aside += swing * share * share * (3.0 - 2.0 * share)
-        if zone.id < 0:
-            speed = np.where(share > 0.5, np.minimum(speed, _NARROW_SPEED), speed)
-    path = paths.shifted(replace(path, speed=paths.brake_in_time(speed)), aside)
-    order = tuple(sorted(made, key=lambda zone: zone.entry))
-    return replace(path, zones=order, crossings=tuple(places), is_parking=is_parking)
+def _add_crossing(town: Town, street: Street, number: int) -> None:
+    """Four ways over a crossing: two to either side, which never meet."""
+    road = town.network.roads[street.id]
+    half, middle = street.half, 0.5 * sum(street.crossings[number])
+    far = min(middle + 30.0, road.length - 3.0)
+    for sign, offsets in ((1.0, (-0.9, -0.2)), (-1.0, (0.5, 1.2))):
+        aside = half + 1.2 + 0.4 * sign
+        for at in (middle + offset for offset in offsets):
+            before = road.at(np.arange(far, at, -STEP), sign * aside)[:, :2]
+            lateral = np.arange(aside, -aside, -STEP)
+            over = road.at(np.full(len(lateral), at), sign * lateral)[:, :2]
+            after = road.at(np.arange(at, far - 6.0, STEP), -sign * aside)[:, :2]
+            points = resample(np.concatenate([before, over, after]), _ROUNDING)
+            kerb = arc_at(points, over[0]) + (aside - half) - 0.6
+            across = kerb + 2 * half + 1.4
+            town.walks.append(Walk(points, street.crossing_name(number), kerb, across))
 
 
-def _narrow_zone(leg: Leg) -> paths.Zone:
-    number = -2 * leg.street.id - leg.is_forward
-    name = f"{leg.street.name}{'>' if leg.is_forward else '<'}"
-    ahead, back = leg.street.swings
-    goes_first = leg.is_forward if ahead == back else (ahead < back) == leg.is_forward
-    return paths.Zone(number, 0.0, 0.0, 0.0, 1 - goes_first, name)
-
-
-def _ends(
-    road: RoadSpec, leg: Leg, lane: int, ends: tuple[float, float]
-) -> tuple[FloatArray, FloatArray]:
-    """Centre of a lane at two places, in the direction of the leg."""
-    points = road.center_of(-lane if leg.is_forward else lane, np.array(ends))[:, :2]
-    return (points[0], points[1]) if leg.is_forward else (points[1], points[0])
-
-
-def _change_lanes(first: FloatArray, second: FloatArray) -> FloatArray:
-    """(n, 2) a line that goes over from one lane to another, halfway."""
-    count = min(len(first), len(second))
-    along = (paths.STEP * (np.arange(count) - 0.5 * count)) / _LANE_CHANGE + 0.5
-    share = np.clip(along, 0.0, 1.0)[:, None]
-    share = share * share * (3.0 - 2.0 * share)
-    return (1.0 - share) * first[:count] + share * second[:count]
-
-
-def _into_bay(line: FloatArray, bay: FloatArray) -> FloatArray:
-    """(n, 2) a line that turns off into a parking space."""
-    along = np.array([np.cos(bay[2]), np.sin(bay[2])])
-    offset = line - bay[:2]
-    beside = offset[:, 0] * along[1] - offset[:, 1] * along[0]
-    near = np.hypot(*offset.T) < 15.0
-    corner = int(np.argmin(np.where(near, np.abs(beside), np.inf)))
-    reach = float(np.hypot(*offset[corner]))
-    into = line[corner] + np.arange(paths.STEP, reach, paths.STEP)[:, None] * along
-    return np.concatenate([line[:corner], into, bay[None, :2]])
-
-
-def _closest(a: FloatArray, b: FloatArray) -> float:
-    gaps = a[:, None] - b[None]
-    return float(np.hypot(gaps[..., 0], gaps[..., 1]).min())
+def _bays(town: Town, street: Street) -> FloatArray:
+    """(n, 3) poses of parking spaces, right ones first, away from crossings and junctions."""
+    road = town.network.roads[street.id]
+    step, clear = (_BAY_STEP, 4.0) if street.parking > _DIAGONAL else (_PARKING_STEP, 9.0)
+    stalls = street.stalls or ((14.0, road.length - 8.0),)
+    places = np.concatenate([np.arange(*ends, step) for ends in stalls])
+    clear = clear if street.is_marked else min(clear, _UNMARKED)
+    for first, last in street.crossings:
+        places = places[(places < first - clear) | (places > last + clear)]
+    aside = np.full(len(places), street.half - 0.5 * street.parking)
+    right, left = road.at(places, -aside), road.at(places, aside)
+    left[:, 2] += np.pi
+    if street.parking > _DIAGONAL:
+        right[:, 2] -= _BAY_ANGLE
+        left[:, 2] -= _BAY_ANGLE
+    return np.concatenate([right, left])

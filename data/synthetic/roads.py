@@ -36,22 +36,6 @@ class Piece:
         return f'<spiral curvStart="{self.start!r}" curvEnd="{self.end!r}"/>'
 
 
-def line(length: float) -> Piece:
-    """A straight piece."""
-    return Piece(length)
-
-
-def arc(length: float, curvature: float) -> Piece:
-    """A circular piece."""
-    return Piece(length, curvature, curvature)
-
-
-def bend(angle: float, curvature: float, easing: float) -> list[Piece]:
-    """Clothoid, arc, clothoid that turn by `angle` (both with a sign) [rad]."""
-    rest = abs(angle / curvature) - easing
-    return [Piece(easing, 0.0, curvature), arc(rest, curvature), Piece(easing, curvature, 0.0)]
-
-
 @dataclass(frozen=True)
 class LaneSpec:
     """One lane of a road: type, width at both ends [m], lanes before and after."""
@@ -163,7 +147,7 @@ def connect(start: Sequence[float], end: Sequence[float], *, ease: bool) -> tupl
     u, v = dx * cos + dy * sin, dy * cos - dx * sin
     turn = float((end[2] - start[2] + np.pi) % (2 * np.pi) - np.pi)
     if abs(turn) < 1e-9 and abs(v) < 1e-9:
-        return (line(float(u)),)
+        return (Piece(float(u)),)
     if abs(turn) < 0.5:
         return (_cubic(float(u), float(v), turn),)
     after = v / np.sin(turn)  # from the corner of the two tangents to the end
@@ -171,14 +155,15 @@ def connect(start: Sequence[float], end: Sequence[float], *, ease: bool) -> tupl
     tangent = float(min(before, after))
     shape = _turn(turn, tangent, ease)
     head, tail = float(before) - tangent, float(after) - tangent
-    return tuple(piece for piece in (line(head), *shape, line(tail)) if piece.length > 1e-6)
+    return tuple(piece for piece in (Piece(head), *shape, Piece(tail)) if piece.length > 1e-6)
 
 
 def _turn(turn: float, tangent: float, ease: bool) -> list[Piece]:
     if not ease:
         radius = tangent / np.tan(abs(turn) / 2)
-        return [arc(float(radius * abs(turn)), float(np.sign(turn) / radius))]
-    unit = [Piece(1.0, 0.0, turn / 2), arc(1.0, turn / 2), Piece(1.0, turn / 2, 0.0)]
+        curvature = float(np.sign(turn) / radius)
+        return [Piece(float(radius * abs(turn)), curvature, curvature)]
+    unit = [Piece(1.0, 0.0, turn / 2), Piece(1.0, turn / 2, turn / 2), Piece(1.0, turn / 2, 0.0)]
     pose = (0.0, 0.0, 0.0)
     for piece in unit:
         pose = tuple(_along(piece, pose, np.array([piece.length]))[0].tolist())

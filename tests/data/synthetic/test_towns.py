@@ -7,20 +7,18 @@ import pytest
 import shapely
 from map_checks import check_map
 
-from shiftsim.data.demo.agents import SIZES
-from shiftsim.data.demo.lights import Lights
-from shiftsim.data.demo.paths import arc_at
-from shiftsim.data.demo.scenes import demo_sites
-from shiftsim.data.demo.traffic import DT
 from shiftsim.data.maps.opendrive.map import build_road_map
 from shiftsim.data.maps.opendrive.reading import read_opendrive
 from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.data.store.writing import StoreWriter
-from shiftsim.data.towns import recordings as towns_recordings
-from shiftsim.data.towns.layouts import KINDS, random_place
-from shiftsim.data.towns.people import random_traffic
-from shiftsim.data.towns.store import write_towns
+from shiftsim.data.synthetic import recordings as town_recordings
+from shiftsim.data.synthetic.agents import SIZES, arc_at
+from shiftsim.data.synthetic.layouts import KINDS, random_town
+from shiftsim.data.synthetic.population import random_traffic
+from shiftsim.data.synthetic.store import town_specs, write_towns
+from shiftsim.data.synthetic.town import Lights
+from shiftsim.data.synthetic.traffic import DT
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.runs.filter import FilterConfig, judge_scenario
@@ -32,9 +30,9 @@ ONE_PROCESS = partial(map_unordered, workers=1)
 DURATION = 42.08  # s
 
 
-def _place(kind, number=0):
+def _town(kind, number=0):
     rng = np.random.Generator(np.random.Philox(number))
-    return random_place(kind, "test", rng), rng
+    return random_town(kind, "test", rng), rng
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +65,7 @@ def test_two_towns_give_many_scenarios_that_pass_the_filter(store):
 
 def test_every_route_has_the_two_blocks_that_planners_need(store, tmp_path, monkeypatch):
     assert min(len(store.window(token).route) for token in store.tokens) >= 2
-    monkeypatch.setattr(towns_recordings, "_MIN_BLOCKS", 3)
+    monkeypatch.setattr(town_recordings, "_MIN_BLOCKS", 3)
     few = write_towns(tmp_path / "few", towns=1, seed=5, spread=ONE_PROCESS)
     here = [x for x in map(store.window, store.tokens) if x.log_name.startswith("town-5-001")]
     assert set(few.tokens) == {window.token for window in here if len(window.route) >= 3}
@@ -103,8 +101,8 @@ def test_a_store_that_is_there_is_kept_and_another_one_refused(store, tmp_path):
 
 
 def test_a_worker_that_dies_is_named_and_leaves_nothing(tmp_path):
-    def dying(make, names):
-        yield type("Outcome", (), {"task": names[0], "result": None, "death": "killed"})
+    def dying(make, specs):
+        yield type("Outcome", (), {"task": specs[0], "result": None, "death": "killed"})
 
     with pytest.raises(DataError, match="town 'town-5-001': killed"):
         write_towns(tmp_path / "store", towns=1, seed=5, spread=dying)
@@ -112,17 +110,17 @@ def test_a_worker_that_dies_is_named_and_leaves_nothing(tmp_path):
 
 
 def test_a_town_with_too_few_scenarios_is_drawn_again(tmp_path, monkeypatch):
-    tries = []
+    attempts = []
 
-    def make(name, rng, source, store):
-        tries.append(rng.random())
+    def convert(source, store, spec, place):
+        attempts.append((source / "map/map.xodr").read_text())
         store.mkdir()
         (store / "here").touch()
-        return 0 if len(tries) < 3 else 6
+        return 0 if len(attempts) < 3 else 6
 
-    monkeypatch.setattr(towns_recordings, "_make", make)
-    towns_recordings.MakeTown(tmp_path)("town-5-001")
-    assert len(set(tries)) == 3
+    monkeypatch.setattr(town_recordings, "_convert", convert)
+    town_recordings.make_town(tmp_path, town_specs(1, 5)[0])
+    assert len(set(attempts)) == 3
     assert (tmp_path / "town-5-001" / "here").is_file()
 
 
@@ -149,21 +147,14 @@ def test_a_generator_that_is_no_table_is_an_error(tmp_path):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_map_of_every_kind_passes_the_checks_of_the_reader(kind, tmp_path):
-    place, _ = _place(kind)
+    town, _ = _town(kind)
     path = tmp_path / "map.xodr"
-    path.write_text(place.town.network.xml())
+    path.write_text(town.network.xml())
     road, report = build_road_map(read_opendrive(path), name=kind)
     assert {name for name, good in check_map(road, report.stacked)[0].items() if not good} == set()
     assert report.warnings == {}
     lit = {road.edges.ids[k] for k in np.flatnonzero(road.has_traffic_lights)}
-    assert bool(lit) == bool(place.lights)
-
-
-def test_streets_of_the_demo_are_among_no_random_town():
-    shapes = {tuple(s.pieces) for site in demo_sites() for s in site.town().streets.values()}
-    for kind in ("junction", "street", "parking"):
-        place, _ = _place(kind)
-        assert not shapes & {tuple(s.pieces) for s in place.town.streets.values()}
+    assert bool(lit) == bool(town.lights)
 
 
 def test_towns_differ_in_arms_lanes_and_limits():
@@ -196,10 +187,10 @@ def _assert_apart(boxes, parked):
     ["street", *(pytest.param(x, marks=pytest.mark.thorough) for x in KINDS if x != "street")],
 )
 def test_nobody_touches_anybody_and_traffic_drives_smoothly(kind):
-    place, rng = _place(kind, 3)
-    traffic = random_traffic(place, rng, DURATION)
+    town, rng = _town(kind, 3)
+    traffic = random_traffic(town, rng, DURATION)
     boxes = traffic.record(DURATION)
-    _assert_apart(boxes, place.town.parked())
+    _assert_apart(boxes, town.parked())
     rows = np.array([(x[0], x[1], *x[3:8]) for x in boxes if x[2] != "pedestrian"])
     rows = rows[np.lexsort((rows[:, 0], rows[:, 1]))]
     same = (np.diff(rows[:, 1]) == 0) & (np.diff(rows[:, 0]) == 1)
@@ -212,7 +203,7 @@ def test_nobody_touches_anybody_and_traffic_drives_smoothly(kind):
 def test_some_people_step_out_between_parked_cars():
     found = {True: [], False: []}
     for number in range(6):
-        town = _place("street", number)[0].town
+        town = _town("street", number)[0]
         for street in town.streets.values():
             for ends in street.crossings if street.parking else ():
                 middle = town.network.roads[street.id].at(np.array([sum(ends) / 2]))[0, :2]
@@ -244,20 +235,20 @@ def test_streets_take_turns_and_yellow_lies_between_green_and_red():
 
 @pytest.mark.parametrize("number", [0, pytest.param(4, marks=pytest.mark.thorough)])
 def test_nobody_enters_a_junction_at_red(number):
-    place, rng = _place("lights", number)
-    traffic = random_traffic(place, rng, DURATION)
-    (lights,) = place.lights
+    town, rng = _town("lights", number)
+    traffic = random_traffic(town, rng, DURATION)
+    (lights,) = town.lights
     phases = {road: k for k, group in enumerate(lights.phases) for road in group}
     entered = 0
     for driver in traffic.drivers:
         zone = driver.path.zones[0]
-        rows = [x for x in traffic.record(DURATION) if x[1] == driver.token]
+        rows = [x for x in traffic.record(DURATION) if x[1] == driver.track]
         front = [arc_at(driver.path.points, np.array(x[3:5])) + driver.length / 2 for x in rows]
         late = [x[0] * DT for x, s in zip(rows, front, strict=True) if s > zone.stop + 2.5]
         if rows and front[0] < zone.stop and late:
             entered += 1
             shown = lights.status(phases[zone.id], late[0])
-            assert shown in (LightStatus.GREEN, LightStatus.YELLOW), driver.token
+            assert shown in (LightStatus.GREEN, LightStatus.YELLOW), driver.track
     assert entered >= 5
 
 
