@@ -217,12 +217,12 @@ def collide(a: FloatArray, b: FloatArray, corners: FloatArray) -> bool:
 @kernel
 def _first_contacts(ego: Ego, tracks: FlatTracks, out: Contacts) -> None:
     box, other, scratch = np.empty(BOX_SIZE), np.empty(BOX_SIZE), np.empty((2, 4, 2))
-    poses, sizes = tracks.poses, tracks.sizes
-    num_samples, num_tracks = tracks.valid.shape
+    valid, poses, sizes, first = tracks.valid, tracks.poses, tracks.sizes, out.first
+    num_samples, num_tracks = valid.shape
     for i in range(num_samples):
         set_box(box, ego.centers[i], ego.size[0], ego.size[1])
         for j in range(num_tracks):
-            if not tracks.valid[i, j] or out.first[j] < num_samples:
+            if not valid[i, j] or first[j] < num_samples:
                 continue
             dx, dy = poses[i, j, 0] - box[0], poses[i, j, 1] - box[1]
             reach = box[7] + 0.5 * (sizes[i, j, 0] + sizes[i, j, 1])
@@ -236,6 +236,6 @@ def _first_contacts(ego: Ego, tracks: FlatTracks, out: Contacts) -> None:
                 w = np.hypot(tracks.velocities[i, j, 0], tracks.velocities[i, j, 1])
             # `collide` left the corners of the track
             kind = contact_type(ego.states[i], v, ego.corners[i], other[0], other[1], w, scratch[1])
-            out.first[j], out.types[j] = i, kind
+            first[j], out.types[j] = i, kind
             angle = ego.states[i, 2] - poses[i, j, 2]
             out.delta_v[j] = 0.5 * np.sqrt(max(0.0, v * v + w * w - 2.0 * v * w * np.cos(angle)))

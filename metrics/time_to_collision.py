@@ -97,9 +97,10 @@ def _time_to_collision(
     """Write the time to collision of every sample."""
     speeds, poses, sizes = ego.speeds, tracks.poses, tracks.sizes
     num_samples, num_tracks = tracks.valid.shape
+    valid, is_static, velocities = tracks.valid, tracks.is_static, tracks.velocities
     boxes, steps = np.empty((num_tracks + 1, BOX_SIZE)), np.empty((num_tracks + 1, 2))
-    listed, swept = np.empty(num_tracks, np.int64), np.empty((2, BOX_SIZE))
-    scratch = np.empty((2, 4, 2))
+    listed, scratch, own = np.empty(num_tracks, np.int64), np.empty((2, 4, 2)), boxes[0]
+    own_swept, swept = np.empty(BOX_SIZE), np.empty(BOX_SIZE)
     for i in range(num_samples):
         ttc[i] = np.inf
         if partners[i] >= 0:
@@ -108,18 +109,18 @@ def _time_to_collision(
         if speeds[i] <= _STOPPED_SPEED:
             continue
         num, beside = 0, 0  # beside: 0 not asked yet, 1 tracks beside count, -1 they do not
-        set_box(boxes[0], ego.centers[i], ego.size[0], ego.size[1])
+        set_box(own, ego.centers[i], ego.size[0], ego.size[1])
         # nuPlan rule 66: along the heading, whatever the direction of the velocity
-        steps[0, 0] = boxes[0, 2] * speeds[i] * STEP
-        steps[0, 1] = boxes[0, 3] * speeds[i] * STEP
-        _stretch(boxes[0], speeds[i], swept[0])
-        x, y, cos, sin = ego.states[i, 0], ego.states[i, 1], boxes[0, 2], boxes[0, 3]
-        middle_x, middle_y, lon, lat = swept[0, 0], swept[0, 1], swept[0, 5], swept[0, 6]
+        steps[0, 0] = own[2] * speeds[i] * STEP
+        steps[0, 1] = own[3] * speeds[i] * STEP
+        _stretch(own, speeds[i], own_swept)
+        x, y, cos, sin = ego.states[i, 0], ego.states[i, 1], own[2], own[3]
+        middle_x, middle_y, lon, lat = own_swept[0], own_swept[1], own_swept[5], own_swept[6]
         for j in range(num_tracks):
-            if not tracks.valid[i, j] or first[j] <= i:
+            if not valid[i, j] or first[j] <= i:
                 continue
-            vx = 0.0 if tracks.is_static[j] else tracks.velocities[i, j, 0]
-            vy = 0.0 if tracks.is_static[j] else tracks.velocities[i, j, 1]
+            vx = 0.0 if is_static[j] else velocities[i, j, 0]
+            vy = 0.0 if is_static[j] else velocities[i, j, 1]
             # generous: what is elongated and further away than this cannot touch
             reach = 0.5 * (sizes[i, j, 0] + sizes[i, j, 1]) + HORIZON * np.sqrt(vx * vx + vy * vy)
             reach += SLACK
@@ -139,23 +140,23 @@ def _time_to_collision(
             box = boxes[num + 1]
             set_box(box, poses[i, j], sizes[i, j, 0], sizes[i, j, 1])
             speed = np.hypot(vx, vy)
-            _stretch(box, speed, swept[1])
-            if collide(swept[0], swept[1], scratch):
+            _stretch(box, speed, swept)
+            if collide(own_swept, swept, scratch):
                 steps[num + 1, 0], steps[num + 1, 1] = box[2] * speed * STEP, box[3] * speed * STEP
                 listed[num] = j
                 num += 1
         hit = 0
         for k in range(1, _NUM_TESTS + 1 if num > 0 else 1):
             # nuPlan rule 67: positions accumulate rounding step by step
-            boxes[0, 0] += steps[0, 0]
-            boxes[0, 1] += steps[0, 1]
+            own[0] += steps[0, 0]
+            own[1] += steps[0, 1]
             for index in range(1, num + 1):
                 boxes[index, 0] += steps[index, 0]
                 boxes[index, 1] += steps[index, 1]
-                dx, dy = boxes[index, 0] - boxes[0, 0], boxes[index, 1] - boxes[0, 1]
-                reach = boxes[0, 7] + boxes[index, 7]
+                dx, dy = boxes[index, 0] - own[0], boxes[index, 1] - own[1]
+                reach = own[7] + boxes[index, 7]
                 # most are too far away, which is decided without a call
-                if dx * dx + dy * dy <= reach * reach and collide(boxes[0], boxes[index], scratch):
+                if dx * dx + dy * dy <= reach * reach and collide(own, boxes[index], scratch):
                     hit = index
                     break
             if hit > 0:

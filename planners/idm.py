@@ -21,7 +21,7 @@ from shiftsim.geometry.corridor import (
     occupancy,
     without_repeats,
 )
-from shiftsim.geometry.polylines import Path, bound_runs, pose_at, runs_of
+from shiftsim.geometry.polylines import RUN, Path, bound_runs, pose_at
 from shiftsim.geometry.rings import SLACK, ring_bounds, rings_touch
 from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.planners.routes.graph import (
@@ -321,6 +321,7 @@ def _roll_on(
         The row, and the UNDECIDED object to decide, _TIED where several are touched, or _DONE.
     """
     length, half_width, count = policy.length, 0.5 * policy.width, len(objects.speeds)
+    xy, ptr = objects.xy, objects.ptr
     radius = 0.5 * np.hypot(length, policy.width) + SLACK  # of the footprint, which is on the path
     reach = 1.5 * (1.0 + BAND) * half_width  # of the corridor, the corners of its ends included
     if first == 0:
@@ -329,14 +330,14 @@ def _roll_on(
         begin = max(min(np.searchsorted(path.progress, progress), len(path.xy) - 1) - 1, 0)
         ahead = Corridor(path.xy, path.runs, begin, len(path.xy), half_width)
         for index in range(count):
-            ring = objects.xy[objects.ptr[index] : objects.ptr[index + 1]]
+            ring = xy[ptr[index] : ptr[index + 1]]
             apart[index] = line_distance(ahead, ring, ring_bounds(ring), 0.0, max(radius, reach))
     for step in range(first, STEPS):
         progress, speed, heading = motion[step, 0], motion[step, 1], centers[step, 2]
         box_corners(centers[step, 0], centers[step, 1], heading, length, policy.width, footprint)
         low, high = _reach(path, progress, policy)
         poses = sub_path(path, low, high)
-        line, runs = np.empty((len(poses), 2)), np.empty((runs_of(len(poses)), 4))
+        line, runs = np.empty((len(poses), 2)), np.empty(((len(poses) - 2) // RUN + 1, 4))
         for vertex in range(len(poses)):
             line[vertex, 0], line[vertex, 1] = poses[vertex, 0], poses[vertex, 1]
         bound_runs(line, runs)
@@ -348,7 +349,7 @@ def _roll_on(
             known[step, index] = CLEAR
             if step > 0 and apart[index] > radius and apart[index] > reach:
                 continue
-            ring = objects.xy[objects.ptr[index] : objects.ptr[index + 1]]
+            ring = xy[ptr[index] : ptr[index + 1]]
             if rings_touch(footprint, ring):
                 known[step, index] = OVERLAPPING
             elif apart[index] <= reach:

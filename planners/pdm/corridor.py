@@ -62,38 +62,50 @@ def fill_corridor(
 
     Of what stands still, maps beyond the second one repeat the one before.
     """
-    known, progress, others = (
-        corridors.occupancy[number],
-        corridors.progress[number],
-        forecast.others,
-    )
+    known, progress = corridors.occupancy[number], corridors.progress[number]
+    boxes, centroids = forecast.others.boxes, forecast.others.centroids
+    light_ptr, light_xy, runs = forecast.light_ptr, forecast.light_xy, path.runs
     begin, end = window(path, corridors.spans[number, 0], corridors.spans[number, 1])
     begin, end = without_repeats(path.xy, begin, end)
-    corridor = Corridor(path.xy, path.runs, begin, end, corridors.half_width)
+    corridor = Corridor(path.xy, runs, begin, end, corridors.half_width)
     reach = 1.5 * (1.0 + BAND) * corridors.half_width  # covers the corners of the square ends
-    num_boxes = len(others.radii)
+    num_boxes = len(forecast.moves)
     for index in range(known.shape[1]):
         light = index - num_boxes
         moves = light < 0 and forecast.moves[index]
         stop = last if moves else min(first + 1, last) if first == 1 else first
-        is_near = end - begin < 2
-        if light < 0 and stop > first and not is_near:
+        first_near, last_near = begin // RUN, (end - 2) // RUN  # runs
+        is_bounded = light < 0 and stop > first and end - begin >= 2
+        if is_bounded:
             # boxes move in straight lines
-            low_x, low_y, high_x, high_y = ring_bounds(others.boxes[first, index])
-            x0, y0, x1, y1 = ring_bounds(others.boxes[stop - 1, index])
+            low_x, low_y, high_x, high_y = ring_bounds(boxes[first, index])
+            x0, y0, x1, y1 = ring_bounds(boxes[stop - 1, index])
             swept = (min(low_x, x0), min(low_y, y0), max(high_x, x1), max(high_y, y1))
-            for run in range(begin // RUN, (end - 2) // RUN + 1):
-                is_near = is_near or is_run_near(path.runs, run, swept, reach)
-            if not is_near:
+            while first_near <= last_near and not is_run_near(runs, first_near, swept, reach):
+                first_near += 1
+            while first_near <= last_near and not is_run_near(runs, last_near, swept, reach):
+                last_near -= 1
+            if first_near > last_near:
                 continue
         guess = 0
         for row in range(first, stop):
+            if is_bounded and moves:
+                low_x = low_y = np.inf
+                high_x = high_y = -np.inf
+                for corner in range(4):
+                    x, y = boxes[row, index, corner, 0], boxes[row, index, corner, 1]
+                    low_x, high_x = min(low_x, x), max(high_x, x)
+                    low_y, high_y = min(low_y, y), max(high_y, y)
+                run, bounds = first_near, (low_x, low_y, high_x, high_y)
+                while run <= last_near and not is_run_near(runs, run, bounds, reach):
+                    run += 1
+                if run > last_near:
+                    continue
             if light < 0:
-                ring, middle = others.boxes[row, index], others.centroids[row, index]
-                x, y = middle[0], middle[1]
+                ring = boxes[row, index]
+                x, y = centroids[row, index, 0], centroids[row, index, 1]
             else:
-                start = forecast.light_ptr[light]
-                ring = forecast.light_xy[start : forecast.light_ptr[light + 1]]
+                ring = light_xy[light_ptr[light] : light_ptr[light + 1]]
                 x, y = centroid(ring)
             known[row, index] = occupancy(corridor, ring, True)
             if known[row, index] != CLEAR:

@@ -14,7 +14,7 @@ from shiftsim.planners.proposals.contacts import Obstacles, touches_boxes
 from shiftsim.planners.proposals.places import EgoBox, ego_corners
 from shiftsim.planners.proposals.tracker import STEPS
 from shiftsim.planners.routes.lights import RedLights
-from shiftsim.world.state import LAST_AGENT_KIND, Tracks
+from shiftsim.world.state import HEADING, LAST_AGENT_KIND, Tracks, X, Y
 
 LIGHT_TOKEN = "red_light_"
 NUM_FORECASTS = STEPS // 2 + 1  # nuPlan rule 188: every other time index has a map of its own
@@ -93,37 +93,39 @@ def _forecast(
     out: Forecast,
 ) -> None:
     """Fill in the boxes of all forecast maps."""
-    others = out.others
+    boxes, centers, centroids = out.others.boxes, out.others.centers, out.others.centroids
+    speeds, radii, is_agent = out.others.speeds, out.others.radii, out.others.is_agent
+    headings, moves, box, ring = out.headings, out.moves, np.empty((4, 2)), np.empty((4, 2))
     for index in range(len(chosen)):
         track = chosen[index]
         x, y, heading = poses[track, 0], poses[track, 1], poses[track, 2]
         length, width = sizes[track, 0], sizes[track, 1]
         vx, vy = velocities[track, 0], velocities[track, 1]
-        others.is_agent[index] = kinds[track] <= LAST_AGENT_KIND
-        speed = np.hypot(vx, vy) if others.is_agent[index] else 0.0
+        is_agent[index] = kinds[track] <= LAST_AGENT_KIND
+        speed = np.hypot(vx, vy) if is_agent[index] else 0.0
         # nuPlan rule 186: boxes move along their own axis with the full speed
         is_forward = abs(wrap_angle(heading - np.arctan2(vy, vx))) < np.pi / 2.0
         course = heading if is_forward else heading + np.pi
         step_x, step_y = speed * np.cos(course), speed * np.sin(course)
-        out.headings[index] = heading
-        others.radii[index] = 0.5 * np.hypot(length, width)
-        out.moves[index] = step_x != 0.0 or step_y != 0.0
-        box = others.boxes[0, index]
+        headings[index] = heading
+        radii[index] = 0.5 * np.hypot(length, width)
+        moves[index] = step_x != 0.0 or step_y != 0.0
         box_corners(x, y, heading, length, width, box)
         for forecast in range(NUM_FORECASTS):
             seconds = 0.1 * (2 * forecast)
-            others.speeds[forecast, index] = speed
-            others.centers[forecast, index, 0] = x + seconds * step_x
-            others.centers[forecast, index, 1] = y + seconds * step_y
-            ring = others.boxes[forecast, index]
+            speeds[forecast, index] = speed
+            centers[forecast, index, 0] = x + seconds * step_x
+            centers[forecast, index, 1] = y + seconds * step_y
             for corner in range(4):
                 ring[corner, 0] = box[corner, 0] + seconds * step_x
                 ring[corner, 1] = box[corner, 1] + seconds * step_y
+                boxes[forecast, index, corner, 0] = ring[corner, 0]
+                boxes[forecast, index, corner, 1] = ring[corner, 1]
             # nuPlan rule 187: bearings and progress are those of the ring's centroid
-            if forecast == 0 or out.moves[index]:
-                middle = centroid(ring)
-            others.centroids[forecast, index, 0] = middle[0]
-            others.centroids[forecast, index, 1] = middle[1]
+            if forecast == 0 or moves[index]:
+                middle_x, middle_y = centroid(ring)
+            centroids[forecast, index, 0] = middle_x
+            centroids[forecast, index, 1] = middle_y
 
 
 def touched(forecast: Forecast, ego: FloatArray, size: EgoBox) -> list[int]:
@@ -132,7 +134,7 @@ def touched(forecast: Forecast, ego: FloatArray, size: EgoBox) -> list[int]:
     A red light counts only once the ego is entirely on its connector.
     """
     boxes, bounds, footprint = forecast.others.boxes[0], forecast.light_bounds, np.empty((4, 2))
-    ego_corners(ego, size, footprint)
+    ego_corners(ego[X], ego[Y], ego[HEADING], size, footprint)
     found = np.flatnonzero(touches_boxes(footprint, boxes)).tolist()
     low, high = footprint.min(axis=0), footprint.max(axis=0)
     holds = (bounds[:, :2] <= low).all(axis=1) & (bounds[:, 2:] >= high).all(axis=1)

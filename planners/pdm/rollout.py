@@ -65,8 +65,7 @@ def roll_out(scene: Scene, ego: FloatArray, targets: FloatArray) -> Proposals:
     for number in range(num_paths):
         path = scene.paths.at(number)
         progress = project(path, ego[X], ego[Y], 0)[0]
-        read_pose(path, progress, proposals.poses[number, 0, 0])
-        proposals.poses[number, :, 0] = proposals.poses[number, 0, 0]
+        proposals.poses[number, :, 0] = read_pose(path, progress)
         proposals.motion[number, :, 0] = progress, ego[VX]
         ahead = STEPS * DT * abs(float(targets.max()))
         proposals.corridors.spans[number] = progress, progress + ahead
@@ -107,14 +106,13 @@ def _roll_on(
 
 
 @kernel
-def read_pose(path: Path, progress: float, out: FloatArray) -> None:
-    """Write the pose (3,) at a progress, clamped to the path, into `out`; zeros for NaN."""
+def read_pose(path: Path, progress: float) -> tuple[float, float, float]:
+    """Pose x [m], y [m], heading [rad] at a progress, clamped to the path; zeros for NaN."""
     if progress != progress:
         # nuPlan rule 191: a speed limit of 0 makes progress undefined
-        out[0], out[1], out[2] = 0.0, 0.0, 0.0
-        return
-    out[0], out[1], heading = pose_at(path, max(progress, MIN_PROGRESS))
-    out[2] = np.arctan2(np.sin(heading), np.cos(heading))
+        return 0.0, 0.0, 0.0
+    x, y, heading = pose_at(path, max(progress, MIN_PROGRESS))
+    return x, y, np.arctan2(np.sin(heading), np.cos(heading))
 
 
 @kernel
@@ -134,51 +132,58 @@ def _roll(
         of what is around is UNDECIDED; _DONE at the end.
     """
     forecast, size, model = scene.forecast, scene.size, scene.model
-    others, num_boxes, footprint = forecast.others, len(forecast.headings), np.empty((4, 2))
-    hits = np.empty(len(forecast.ignored), np.int64)
+    ignored, headings, speeds = forecast.ignored, forecast.headings, forecast.others.speeds
+    targets, ranks, end = proposals.targets, proposals.ranks, path.progress[-1]
+    motion, poses, leads = proposals.motion, proposals.poses, proposals.leads
+    known, along = proposals.corridors.occupancy[number], proposals.corridors.progress[number]
+    footprint, hits = np.empty((4, 2)), np.empty(len(ignored), np.int64)
     for step in range(first, last + 1):
         row, num_hits, farthest = step // 2, 0, -np.inf
-        known, along = proposals.corridors.occupancy[number, row], proposals.corridors.progress
         if step % 2 == 0:
             for index in range(len(hits)):
-                if known[index] != CLEAR and not forecast.ignored[index]:
+                if known[row, index] != CLEAR and not ignored[index]:
                     hits[num_hits] = index
                     num_hits += 1
-                    farthest = max(farthest, along[number, row, index])
+                    farthest = max(farthest, along[row, index])
         # nuPlan rule 192: one lead for all policies of a path, cleared once per time index; what a
         # policy does not overwrite it inherits from the one before
         lead_speed, rear = 0.0, 0.0
         for policy in range(policies[0], policies[1] + 1):
-            motion, poses = proposals.motion[number, policy], proposals.poses[number, policy]
-            leads = proposals.leads[number, policy]
-            lead, progress, pose = leads[step], motion[step - 1, 0], poses[step - 1]
+            progress, speed = (
+                motion[number, policy, step - 1, 0],
+                motion[number, policy, step - 1, 1],
+            )
             if step % 2 == 1:
                 for column in range(3):  # nuPlan rule 193: at index 1 these are zeros
-                    lead[column] = leads[step - 1, column]
+                    leads[number, policy, step, column] = leads[number, policy, step - 1, column]
             else:
-                lead[0] = path.progress[-1]
+                leads[number, policy, step, 0] = end
                 if farthest > progress:
-                    ego_corners(pose, size, footprint)
+                    x, y = poses[number, policy, step - 1, 0], poses[number, policy, step - 1, 1]
+                    heading = poses[number, policy, step - 1, 2]
+                    ego_corners(x, y, heading, size, footprint)
                     found, distance = _nearest(
-                        hits[:num_hits],
-                        along[number, row],
-                        progress,
-                        footprint,
-                        forecast,
-                        row,
-                        proposals.ranks[row],
+                        hits[:num_hits], along[row], progress, footprint, forecast, row, ranks[row]
                     )
-                    if found == _TIED or known[found] == UNDECIDED:
+                    if found == _TIED or known[row, found] == UNDECIDED:
                         return step, found
-                    lead[0] = progress + distance
-                    if found < num_boxes:
-                        turn = wrap_angle(forecast.headings[found] - pose[2])
-                        lead_speed = others.speeds[row, found] * np.cos(turn)
+                    leads[number, policy, step, 0] = progress + distance
+                    if found < len(headings):
+                        turn = wrap_angle(headings[found] - heading)
+                        lead_speed = speeds[row, found] * np.cos(turn)
                 else:
                     rear = 0.5 * size.length
-                lead[1], lead[2] = lead_speed, rear
-            follow(motion[step - 1], lead, proposals.targets[policy], model, motion[step])
-            read_pose(path, motion[step, 0], poses[step])
+                leads[number, policy, step, 1], leads[number, policy, step, 2] = lead_speed, rear
+            lead = (
+                leads[number, policy, step, 0],
+                leads[number, policy, step, 1],
+                leads[number, policy, step, 2],
+            )
+            progress, speed = follow(progress, speed, lead, targets[policy], model)
+            motion[number, policy, step, 0], motion[number, policy, step, 1] = progress, speed
+            x, y, heading = read_pose(path, progress)
+            poses[number, policy, step, 0], poses[number, policy, step, 1] = x, y
+            poses[number, policy, step, 2] = heading
     return last, _DONE
 
 
@@ -196,15 +201,15 @@ def _nearest(
 
     Something is ahead; it is _TIED where ranks are needed and not known.
     """
-    others, bounds = forecast.others, ring_bounds(footprint)
+    boxes, centers, radii = forecast.others.boxes, forecast.others.centers, forecast.others.radii
+    low_x, low_y, high_x, high_y = ring_bounds(footprint)
     x, y, radius = circle_around(footprint)
     best, found, is_tied = np.inf, -1, False
     for index in hits:
         if not along[index] > progress:
             continue
-        light = index - len(others.radii)
+        light = index - len(radii)
         if light >= 0:
-            low_x, low_y, high_x, high_y = bounds
             area = forecast.light_bounds[light]
             apart_x = max(area[0] - high_x, low_x - area[2])
             if max(apart_x, area[1] - high_y, low_y - area[3]) > best:
@@ -212,16 +217,16 @@ def _nearest(
             start, stop = forecast.light_ptr[light], forecast.light_ptr[light + 1]
             distance = ring_distance(footprint, forecast.light_xy[start:stop])
         else:
-            dx, dy = others.centers[row, index, 0] - x, others.centers[row, index, 1] - y
-            if np.hypot(dx, dy) - radius - others.radii[index] > best:
+            dx, dy = centers[row, index, 0] - x, centers[row, index, 1] - y
+            if np.hypot(dx, dy) - radius - radii[index] > best:
                 continue
-            distance = ring_distance(footprint, others.boxes[row, index])
+            distance = ring_distance(footprint, boxes[row, index])
         if distance < best:
             best, found, is_tied = distance, index, False
         elif distance == best:
             if ranks[index] < 0:
                 # which of two lights it is makes no difference
-                is_tied = is_tied or light < 0 or found < len(others.radii)
+                is_tied = is_tied or light < 0 or found < len(radii)
             elif ranks[index] < ranks[found]:
                 found = index
     if is_tied:
@@ -231,11 +236,14 @@ def _nearest(
 
 @kernel
 def follow(
-    before: FloatArray, lead: FloatArray, target: float, model: FollowingModel, out: FloatArray
-) -> None:
-    """Write progress and speed (2,) one step after `before`, behind a lead (3,)."""
+    progress: float,
+    speed: float,
+    lead: tuple[float, float, float],
+    target: float,
+    model: FollowingModel,
+) -> tuple[float, float]:
+    """Progress and speed one step later, behind a lead as in `Proposals`."""
     # nuPlan rule 191: a target speed of 0 gives NaN
-    progress, speed = before[0], before[1]
     closing = speed * (speed - lead[1]) / (2.0 * np.sqrt(model.accel_max * model.decel_max))
     wanted = model.min_gap + speed * model.headway + closing
     gap = max(lead[0] - progress - lead[2], model.min_gap)
@@ -245,4 +253,4 @@ def follow(
         accel = -model.decel_max
     elif accel > model.accel_max:
         accel = model.accel_max
-    out[0], out[1] = progress + 0.1 * speed, speed + 0.1 * accel
+    return progress + 0.1 * speed, speed + 0.1 * accel

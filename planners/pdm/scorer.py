@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.geometry.boxes import AHEAD, BEHIND, bearing, boxes_touch
+from shiftsim.geometry.boxes import AHEAD, BEHIND, bearing_cosine, boxes_touch
 from shiftsim.geometry.polylines import Path, project
 from shiftsim.geometry.rings import SLACK
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
@@ -20,7 +20,6 @@ from shiftsim.planners.proposals.contacts import (
     Obstacles,
     first_faults,
     near_others,
-    project_box,
 )
 from shiftsim.planners.proposals.places import (
     OFF_ROAD,
@@ -126,43 +125,57 @@ def _first_violations(
 
     Each of these counts until its first contact with the ego or its projection.
     """
-    states, centers, box = places.states, places.centers, np.empty((4, 2))
-    others_at, speeds = others.centers, others.speeds
+    states, centers, corners, off_lane = (
+        places.states,
+        places.centers,
+        places.corners,
+        places.off_lane,
+    )
+    others_at, speeds, boxes, centroids = (
+        others.centers,
+        others.speeds,
+        others.boxes,
+        others.centroids,
+    )
+    radii, box = others.radii, np.empty((4, 2))
     radius = 0.5 * np.hypot(size.length, size.width) + SLACK
     out = np.full(len(states), NEVER)
-    ego_speeds = np.empty(states.shape[1])
+    is_over = np.empty(len(radii), np.bool_)
     for proposal in range(len(states)):
-        for step in range(len(ego_speeds)):
-            ego_speeds[step] = np.hypot(states[proposal, step, VX], states[proposal, step, VY])
-        for index in near:
-            touching, is_over = radius + others.radii[index], False
-            for step in range(states.shape[1]):
-                if is_over or step > out[proposal]:
-                    break
-                x, y = centers[proposal, step, 0], centers[proposal, step, 1]
-                speed = ego_speeds[step]
-                reach = touching + AHEAD_SECONDS * speed
-                reach += (AHEAD_SECONDS + DT) * speeds[0, index]
+        is_over[:] = False
+        for step in range(states.shape[1]):
+            speed = np.hypot(states[proposal, step, VX], states[proposal, step, VY])
+            if speed < TTC_STOPPED or out[proposal] < step:
+                continue
+            x, y = centers[proposal, step, 0], centers[proposal, step, 1]
+            heading = states[proposal, step, HEADING]
+            cos, sin = np.cos(heading), np.sin(heading)
+            margin = radius + AHEAD_SECONDS * speed
+            for index in near:
+                reach = margin + radii[index] + (AHEAD_SECONDS + DT) * speeds[0, index]
                 dx, dy = others_at[step // 2, index, 0] - x, others_at[step // 2, index, 1] - y
-                if speed < TTC_STOPPED or dx * dx + dy * dy > reach * reach:
+                if dx * dx + dy * dy > reach * reach or is_over[index]:
                     continue
-                state = states[proposal, step]
-                cos, sin = np.cos(state[HEADING]), np.sin(state[HEADING])
+                touching = radius + radii[index]
                 for ahead in TTC_STEPS:
                     row, travel = (step + ahead) // 2, 0.1 * ahead * speed
                     dx = others_at[row, index, 0] - (x + travel * cos)
                     dy = others_at[row, index, 1] - (y + travel * sin)
-                    if is_over or dx * dx + dy * dy > touching * touching:
+                    if dx * dx + dy * dy > touching * touching or is_over[index]:
                         continue
-                    project_box(places.corners[proposal, step], state, travel, box)
-                    if not boxes_touch(box, others.boxes[row, index]):
+                    for corner in range(4):
+                        box[corner, 0] = corners[proposal, step, corner, 0] + travel * cos
+                        box[corner, 1] = corners[proposal, step, corner, 1] + travel * sin
+                    if not boxes_touch(box, boxes[row, index]):
                         continue
-                    is_over, middle = True, others.centroids[row, index]
-                    angle = bearing(state, middle[0], middle[1])
+                    is_over[index] = True
+                    rear_x, rear_y = states[proposal, step, X], states[proposal, step, Y]
+                    dx = centroids[row, index, 0] - rear_x
+                    dy = centroids[row, index, 1] - rear_y
+                    angle = np.arccos(bearing_cosine(cos, sin, dx, dy))
                     counts = angle < AHEAD
                     if not counts and not angle > BEHIND:
-                        off_lane = places.off_lane[proposal, step]
-                        counts = off_lane or in_any(intersections, state[X], state[Y])
+                        counts = off_lane[proposal, step] or in_any(intersections, rear_x, rear_y)
                     if counts:
                         out[proposal] = step
     return out

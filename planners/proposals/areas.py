@@ -10,8 +10,7 @@ import numpy as np
 import shapely
 
 from shiftsim.geometry.polylines import RUN
-from shiftsim.geometry.rings import ray_crossings, ring_bounds
-from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.planners.per_map import PerMap
 from shiftsim.world.layers import Polygons, index_polygons, meeting, square_around
 from shiftsim.world.map import VectorMap
@@ -77,36 +76,6 @@ def select_areas(road: VectorMap, x: float, y: float, half_width: float) -> IntA
     lanes = [road.block_edges.at(block) for block in meeting(road.blocks.polygons, square)]
     parks = meeting(road.car_parks.polygons, square) if len(road.car_parks) else np.zeros(0, int)
     return np.concatenate([*lanes, parks + len(road.edges)])
-
-
-@kernel
-def held_points(
-    polygons: Polygons, run_ptr: IntArray, runs: FloatArray, area: int, points: FloatArray
-) -> int:
-    """Which of some points (K, 2) an area holds in its interior, one bit each.
-
-    `run_ptr` and `runs` are those of `Areas`.
-    """
-    low_x, low_y, _, high_y = ring_bounds(points)
-    xy, ring_ptr, inside, on_boundary = polygons.xy, polygons.ring_ptr, 0, 0
-    for ring in range(polygons.poly_ptr[area], polygons.poly_ptr[area + 1]):
-        first, end = ring_ptr[ring], ring_ptr[ring + 1]
-        for run in range(run_ptr[ring], run_ptr[ring + 1]):
-            if high_y < runs[run, 0] or low_y > runs[run, 1] or low_x > runs[run, 2]:
-                continue  # most often: no ray from a point to +x meets an edge of the run
-            start = first + RUN * (run - run_ptr[ring])
-            before = start - 1 if start > first else end - 1
-            stop = min(start + RUN, end)
-            for point in range(len(points)):
-                x, y = points[point, 0], points[point, 1]
-                if y < runs[run, 0] or y > runs[run, 1] or x > runs[run, 2]:
-                    continue
-                is_odd, on_edge = ray_crossings(xy, before, start, stop, x, y)
-                if on_edge:
-                    on_boundary |= 1 << point
-                elif is_odd:
-                    inside ^= 1 << point
-    return inside & ~on_boundary
 
 
 def index_ranks(bounds: FloatArray) -> IntArray:

@@ -49,29 +49,32 @@ def comfort(states: FloatArray, bounds: ComfortBounds) -> Comfort:
     whole = SCORED + 1
     windows = ((whole, 2, 0), (8, 2, 0), (whole, 2, 1), (5, 2, 1), (5, 3, 2))
     signals = np.empty((len(states), len(SIGNALS), whole))
-    _filter_signals(states, Filters(*(make_filter(*window) for window in windows)), signals)
-    low, *high = bounds
-    highs = np.array(high)[:, None]
-    lows = np.where(np.arange(len(high))[:, None] == 0, low, -highs)
-    is_within: BoolArray = np.all((lows < signals) & (signals < highs), axis=2)
+    is_within = np.ones(signals.shape[:2], np.bool_)
+    filters = Filters(*(make_filter(*window) for window in windows))
+    _filter_signals(states, filters, np.array(bounds, np.float64), signals, is_within)
     return Comfort(signals, is_within, np.where(np.all(is_within, axis=1), 1.0, 0.0))
 
 
 @kernel
-def _filter_signals(states: FloatArray, filters: Filters, out: FloatArray) -> None:
-    """Write the signals (P, 6, 41) of states."""
+def _filter_signals(
+    states: FloatArray,
+    filters: Filters,
+    bounds: FloatArray,  # (7,) those of `ComfortBounds`
+    out: FloatArray,
+    is_within: BoolArray,
+) -> None:
+    """Write the signals (P, 6, 41) of states, and where they leave their bounds."""
     count = states.shape[1]
     raw, brief = np.empty((4, count)), np.empty(count)  # acceleration ahead, aside, any; heading
     for row in range(len(states)):
         turn, signals = 0.0, out[row]
         for step in range(count):
-            state = states[row, step]
-            raw[0, step], raw[1, step] = state[AX], state[AY]
-            raw[2, step] = np.hypot(state[AX], state[AY])
+            ahead, aside = states[row, step, AX], states[row, step, AY]
+            raw[0, step], raw[1, step], raw[2, step] = ahead, aside, np.hypot(ahead, aside)
             if step > 0:
-                change = state[HEADING] - states[row, step - 1, HEADING]
+                change = states[row, step, HEADING] - states[row, step - 1, HEADING]
                 turn -= 2.0 * np.pi * np.rint(change / (2.0 * np.pi))
-            raw[3, step] = state[HEADING] + turn
+            raw[3, step] = states[row, step, HEADING] + turn
         filter_signal(raw[0], filters.smooth, 1.0, signals[0])
         filter_signal(raw[1], filters.smooth, 1.0, signals[1])
         filter_signal(raw[2], filters.smooth_briefly, 1.0, brief)
@@ -80,3 +83,9 @@ def _filter_signals(states: FloatArray, filters: Filters, out: FloatArray) -> No
         filter_signal(brief, filters.slope, DT, signals[3])
         filter_signal(raw[3], filters.turn_accel, DT * DT, signals[4])
         filter_signal(raw[3], filters.turn_rate, DT, signals[5])
+        for number in range(len(signals)):
+            high = bounds[1 + number]
+            low = bounds[0] if number == 0 else -high
+            for step in range(count):
+                if not low < signals[number, step] < high:
+                    is_within[row, number] = False

@@ -18,7 +18,7 @@ from shiftsim.geometry.boxes import (
 from shiftsim.geometry.rings import SLACK
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.proposals.places import ProposalStates
-from shiftsim.world.state import HEADING, VX, VY
+from shiftsim.world.state import VX, VY
 
 TTC_STOPPED = 5e-3  # m/s, of the ego
 NEVER = np.inf
@@ -34,15 +34,6 @@ class Obstacles(NamedTuple):
     radii: FloatArray  # (N,) half diagonals [m]
     is_agent: BoolArray  # (N,) whether it is no static object
     ignored: BoolArray  # (N,) whether contacts with it do not count
-
-
-@kernel
-def project_box(corners: FloatArray, state: FloatArray, travel: float, out: FloatArray) -> None:
-    """Write a box (4, 2) of the ego, moved `travel` [m] along the heading of its state (11,)."""
-    cos, sin = np.cos(state[HEADING]), np.sin(state[HEADING])
-    for corner in range(4):
-        out[corner, 0] = corners[corner, 0] + travel * cos
-        out[corner, 1] = corners[corner, 1] + travel * sin
 
 
 @kernel
@@ -82,19 +73,6 @@ def near_others(places: ProposalStates, others: Obstacles, rows: int, horizon: f
             out[count] = index
             count += 1
     return out[:count]
-
-
-@kernel
-def hits(
-    others: Obstacles, row: int, index: int, box: FloatArray, circle: tuple[float, float, float]
-) -> bool:
-    """Whether a box (4, 2) and the circle around it touch one of the others at a row of time."""
-    dx = others.centers[row, index, 0] - circle[0]
-    dy = others.centers[row, index, 1] - circle[1]
-    reach = circle[2] + others.radii[index]
-    if dx * dx + dy * dy > reach * reach:
-        return False
-    return boxes_touch(box, others.boxes[row, index])
 
 
 @kernel

@@ -127,18 +127,19 @@ def drive_proposals(
 def _drive(
     poses: FloatArray, ego: FloatArray, params: LqrParameters, dt: float, out: Driven
 ) -> None:
-    ahead, last = np.empty(params.horizon), out.speeds.shape[1] - 1
+    ahead, last, state = np.empty(params.horizon), out.speeds.shape[1] - 1, np.empty(len(ego))
+    states = out.states
     for row in range(len(poses)):
-        speeds, curvatures, states = out.speeds[row], out.curvatures[row], out.states[row]
-        fit_speed(poses[row], dt, params.jerk_penalty, speeds)
-        fit_curvature(poses[row], speeds, dt, params.curvature_rate_penalty, curvatures)
+        path, speeds, curvatures = poses[row], out.speeds[row], out.curvatures[row]
+        fit_speed(path, dt, params.jerk_penalty, speeds)
+        fit_curvature(path, speeds, dt, params.curvature_rate_penalty, curvatures)
         for column in range(len(ego)):
-            states[0, column] = ego[column]
+            state[column] = states[row, 0, column] = ego[column]
         tangent = np.tan(ego[STEERING])
-        for step in range(len(states) - 1):
+        for step in range(states.shape[1] - 1):
             speed = speeds[min(step + params.horizon, last)]
-            reference = reference_at(states[step], poses[row], step, speed, curvatures, ahead)
-            accel, rate = command(states[step], reference, params)
-            tangent = turn_and_step(
-                states[step], tangent, accel, rate, params.wheel_base, dt, states[step + 1]
-            )
+            reference = reference_at(state, path, step, speed, curvatures, ahead)
+            accel, rate = command(state, reference, params)
+            tangent = turn_and_step(state, tangent, accel, rate, params.wheel_base, dt, state)
+            for column in range(len(state)):
+                states[row, step + 1, column] = state[column]

@@ -61,12 +61,6 @@ def boxes_touch(a: FloatArray, b: FloatArray) -> bool:
 
 
 @kernel
-def bearing(pose: FloatArray, x: float, y: float) -> float:
-    """Angle between the heading of a pose (3,) and the direction to a point, in [0, pi] [rad]."""
-    return np.arccos(bearing_cosine(np.cos(pose[2]), np.sin(pose[2]), x - pose[0], y - pose[1]))
-
-
-@kernel
 def bearing_cosine(cos: float, sin: float, dx: float, dy: float) -> float:
     """Cosine of a bearing, from that of the heading, its sine, and the way to the point [m]."""
     # nuPlan rule 3: the cosine is not clamped, so the angle may be NaN
@@ -93,7 +87,8 @@ def contact_type(
         return STOPPED_EGO
     if other_speed <= STOPPED_SPEED:
         return STOPPED_TRACK
-    if bearing(pose, x, y) > BEHIND:
+    cosine = bearing_cosine(np.cos(pose[2]), np.sin(pose[2]), x - pose[0], y - pose[1])
+    if np.arccos(cosine) > BEHIND:
         return ACTIVE_REAR
     if locate_in_ring(other, box[0, 0], box[0, 1]) != EXTERIOR:
         return ACTIVE_FRONT

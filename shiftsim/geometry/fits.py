@@ -17,7 +17,7 @@ class Filter(NamedTuple):
     """A filter over a window of W samples."""
 
     interior: FloatArray  # (W,) weights
-    fit: FloatArray  # (W, W) weights of the samples of the first or last window
+    fit: FloatArray  # (W, W) of each sample of the first or last window in each of its outputs
 
 
 @lru_cache
@@ -25,7 +25,7 @@ def make_filter(window: int, degree: int, order: int) -> Filter:
     """The filter that gives a derivative, 0 for the value itself, per sample to the `order`."""
     fit = fit_weights(window, degree, order)
     is_smooth_8 = (window, degree, order) == (8, 2, 0)
-    return Filter(SMOOTH_8 if is_smooth_8 else fit[window // 2].copy(), fit)
+    return Filter(SMOOTH_8 if is_smooth_8 else fit[window // 2].copy(), fit.T.copy())
 
 
 def fit_weights(window: int, degree: int, order: int, at: FloatArray | None = None) -> FloatArray:
@@ -61,16 +61,16 @@ def filter_signal(values: FloatArray, how: Filter, scale: float, out: FloatArray
     interior, fit = how.interior, how.fit
     count, window = len(values), len(fit)
     half = window // 2
+    middle, tail = out[half : count - half], out[count - half :]
+    moved, tail_fit = values[half - (window - 1) // 2 :], fit[:, window - half :]
+    out[:] = 0.0
+    for j in range(window):
+        first, weight, last = values[j], interior[j], values[count - window + j]
+        for n in range(half):
+            out[n] += fit[j, n] * first
+            tail[n] += tail_fit[j, n] * last
+        for n in range(len(middle)):
+            middle[n] += weight * moved[n + j]
     for n in range(count):
-        total = 0.0
-        if n < half:
-            for j in range(window):
-                total += fit[n, j] * values[j]
-        elif n >= count - half:
-            for j in range(window):
-                total += fit[n - count + window, j] * values[count - window + j]
-        else:
-            for j in range(window):
-                total += interior[j] * values[n - (window - 1) // 2 + j]
         # nuPlan rule 81: rounded between smoothing and differentiation, and before comparison
-        out[n] = np.rint(total / scale * 1e8) / 1e8
+        out[n] = np.rint(out[n] / scale * 1e8) / 1e8

@@ -117,15 +117,9 @@ def make_path(poses: FloatArray, progress: FloatArray | None = None) -> Path:
     xy = np.ascontiguousarray(poses[:, :2])
     if progress is None:
         progress = arc_lengths(xy, np.array([0, len(xy)]))
-    runs = np.empty((runs_of(len(xy)), 4))
+    runs = np.empty(((len(xy) - 2) // RUN + 1, 4))
     bound_runs(xy, runs)
     return Path(xy, np.unwrap(poses[:, 2]), progress, runs)
-
-
-@kernel
-def runs_of(num_points: int) -> int:
-    """How many runs a polyline of so many vertices has."""
-    return (num_points - 2) // RUN + 1
 
 
 @kernel

@@ -62,7 +62,7 @@ def _exact_orientation(ax: float, ay: float, bx: float, by: float, cx: float, cy
 
 @kernel
 def _separated_by_edges(a: FloatArray, b: FloatArray) -> bool:
-    count = len(a)
+    count, outside = len(a), False
     for index in range(count):
         ax, ay = a[index, 0], a[index, 1]
         after = index + 1 if index + 1 < count else 0
@@ -75,8 +75,8 @@ def _separated_by_edges(a: FloatArray, b: FloatArray) -> bool:
                 outside = False
                 break
         if outside:
-            return True
-    return False
+            break
+    return outside
 
 
 @kernel
@@ -129,26 +129,26 @@ def ray_crossings(
 
     The chain goes from the vertex `before` (of a whole ring the last one) to `start` … `stop` - 1.
     """
-    parity = False
+    parity = on_edge = False
     px, py = xy[before, 0], xy[before, 1]
     for index in range(start, stop):
         qx, qy = xy[index, 0], xy[index, 1]
         if qx == x and qy == y:
-            return False, True
-        if py == y and qy == y:
-            if min(px, qx) <= x <= max(px, qx):
-                return False, True
+            on_edge = True
+        elif py == y and qy == y:
+            on_edge = min(px, qx) <= x <= max(px, qx)
         elif (py > y) != (qy > y) and (px >= x or qx >= x):
             if px > x and qx > x:
                 parity = not parity
             else:
                 side = orientation(px, py, qx, qy, x, y)
-                if side == 0:
-                    return False, True
+                on_edge = side == 0
                 if (side > 0) == (qy > py):
                     parity = not parity
+        if on_edge:
+            break  # a single return: numba then needs no count of references
         px, py = qx, qy
-    return parity, False
+    return parity and not on_edge, on_edge
 
 
 @kernel

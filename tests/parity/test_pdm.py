@@ -85,12 +85,12 @@ def test_every_file_is_known(folder: Path, cases: Cases) -> None:
 
 
 def compare_idm_kernel(case: File, where: str) -> None:
-    limit, after = case["speed_limit_mps"], np.empty(2)
+    limit = case["speed_limit_mps"]
     limit = DEFAULT.fallback_velocity if np.isnan(limit) else limit
     target = DEFAULT.speed_fractions[case["policy_idx"]] * limit
     before = case.take("prev_progress_velocity", 2)
     lead = case.take("lead_progress_velocity_rear", 3)
-    rollout.follow(before, lead, target, DEFAULT.following, after)
+    after = rollout.follow(*before, tuple(lead), target, DEFAULT.following)
     case.match(where, {"next_progress_velocity": after}, TOLERANCE)
 
 
@@ -115,9 +115,8 @@ def compare_emergency_brake(case: File, where: str) -> None:
 
 def compare_path(case: File, where: str) -> None:
     poses, queries = case.take("vertices", -1, 3), case.take("query_s", -1)
-    path, at = make_path(poses), np.empty((len(queries), 3))
-    for progress, pose in zip(queries.tolist(), at, strict=True):
-        rollout.read_pose(path, progress, pose)
+    path = make_path(poses)
+    at = np.array([rollout.read_pose(path, progress) for progress in queries.tolist()])
     projection = [project(path, *xy, 0)[0] for xy in case.take("query_xy", -1, 2).tolist()]
     ours: dict[str, Any] = {"progress": path.progress, "projection": projection, "poses": at}
     ours["offset_m"] = routes.offset_poses(poses, -1.0)

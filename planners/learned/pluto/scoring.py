@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.geometry.boxes import circle_around, meets_bounds
+from shiftsim.geometry.boxes import boxes_touch, circle_around, meets_bounds
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.learned.pluto.reference import Drivable
 from shiftsim.planners.learned.pluto.world import World
@@ -17,10 +17,8 @@ from shiftsim.planners.proposals.contacts import (
     TTC_STOPPED,
     Obstacles,
     first_faults,
-    hits,
     is_at_fault,
     near_others,
-    project_box,
 )
 from shiftsim.planners.proposals.places import (
     OFF_ROAD,
@@ -39,7 +37,7 @@ from shiftsim.sim.dynamics.lqr import (
     is_stopping,
 )
 from shiftsim.world.layers import Polygons, make_polylines, meets_convex, project_on_line
-from shiftsim.world.state import NUM_STATE, STEERING_RATE, VX, VY, VehicleParameters, X, Y
+from shiftsim.world.state import HEADING, NUM_STATE, STEERING_RATE, VX, VY, VehicleParameters, X, Y
 
 LEARNED_WEIGHT = 0.3
 PROGRESS_WEIGHT, TTC_WEIGHT, SPEED_WEIGHT, COMFORT_WEIGHT = 5.0, 5.0, 2.0, 2.0
@@ -210,24 +208,32 @@ def times_to_collision(places: ProposalStates, obstacles: Obstacles, near: IntAr
     Arguments as for `collisions`.
     """
     scores, box, last = np.ones(len(places.states)), np.empty((4, 2)), places.states.shape[1] - 1
+    corners, centers = places.corners, obstacles.centers
     for proposal in range(len(scores)):
         for step in range(1, last + 1):
             state = places.states[proposal, step]
             if state[VX] < TTC_STOPPED:
                 continue
+            cos, sin = np.cos(state[HEADING]), np.sin(state[HEADING])
             for number in range(len(TTC_STEPS)):
                 ahead = TTC_STEPS[number]
                 if step + ahead > last:
                     continue
                 travel = 0.1 * ahead * state[VX]
-                project_box(places.corners[proposal, step], state, travel, box)
-                circle = circle_around(box)
+                for corner in range(4):
+                    box[corner, 0] = corners[proposal, step, corner, 0] + travel * cos
+                    box[corner, 1] = corners[proposal, step, corner, 1] + travel * sin
+                x, y, radius = circle_around(box)
                 # nuPlan rule 242: the number of the projection stands in for the time of the ego,
                 # of its place and of the object, but not of the moved box
                 then = places.states[proposal, number]
                 off_lane = places.off_lane[proposal, number]
                 for index in near:
-                    if hits(obstacles, step, index, box, circle):
+                    dx, dy = centers[step, index, 0] - x, centers[step, index, 1] - y
+                    reach = radius + obstacles.radii[index]
+                    if dx * dx + dy * dy > reach * reach:
+                        continue
+                    if boxes_touch(box, obstacles.boxes[step, index]):
                         speed, center = (
                             obstacles.speeds[number, index],
                             obstacles.centroids[number, index],

@@ -6,15 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from worlds import straight_road
 
-from shiftsim.planners.proposals.areas import (
-    areas_of,
-    held_points,
-    index_ranks,
-    make_areas,
-    select_areas,
-)
+from shiftsim.planners.proposals.areas import areas_of, index_ranks, make_areas, select_areas
+from shiftsim.planners.proposals.places import OFF_ROAD, OFF_ROUTE, EgoBox, find_places
 from shiftsim.planners.proposals.tracker import fit_speed
 from shiftsim.world.layers import make_polygons
+from shiftsim.world.state import NUM_STATE
 
 
 def test_areas_and_their_order_are_those_of_the_map():
@@ -47,12 +43,15 @@ def test_an_area_holds_the_points_that_shapely_says(seed):
     points = [corners, corners + np.array([1.0, 0.0]), 0.5 * (corners[:-1] + corners[1:])]
     points = np.concatenate([*points, rng.uniform(-30.0, 30.0, (300, 2))])
     expected = shapely.contains_properly(shapes[:, None], shapely.points(points))
-    arguments = areas.polygons, areas.run_ptr, areas.runs
+    states = np.zeros((1, len(points), NUM_STATE))
+    states[0, :, :2] = points
+    size, limits = EgoBox(0.5, 0.3, 0.1), np.zeros(len(rings))
     for area, expected_of_area in enumerate(expected):
-        for first in range(0, len(points), 5):
-            bits = held_points(*arguments, area, points[first : first + 5])
-            ours = [bool(bits >> point & 1) for point in range(len(points[first : first + 5]))]
-            assert ours == expected_of_area[first : first + 5].tolist()
+        selected = np.array([area])
+        places = find_places(states, size, areas, selected, limits, by_center=False)
+        np.testing.assert_array_equal(~places.flags[0, :, OFF_ROUTE], expected_of_area)
+        within = shapely.contains_properly(shapes[area], shapely.points(places.corners[0]))
+        np.testing.assert_array_equal(~places.flags[0, :, OFF_ROAD], within.all(axis=1))
 
 
 @settings(max_examples=20)
