@@ -61,6 +61,10 @@ class VehicleParameters(BoxParameters):
         lambda self: self.half_length - self.rear_length,
         "From the rear axle forward to the centre of the box [m].",
     )
+    length_cog_to_front_axle = derived(
+        lambda self: self.wheel_base - self.cog_position_from_rear_axle,
+        "From the centre of gravity forward to the front axle [m].",
+    )
 
     def __hash__(self) -> int:
         return hash(tuple(vars(self).values()))
@@ -127,6 +131,8 @@ class OrientedBox(_Halves):
     width = part("dimensions.width", "Width [m].")
     height = part("dimensions.height", "Height [m].")
 
+    half_height = derived(lambda self: float(self.height / 2.0), "Half the height [m].")
+
     def corner(self, point: OrientedBoxPointType) -> Point2D:
         """One point of the box."""
         if point == OrientedBoxPointType.CENTER:
@@ -179,6 +185,15 @@ class CarFootprint(OrientedBox):
     ) -> "CarFootprint":
         """From the pose of the centre."""
         return cls(center, vehicle_parameters)
+
+    @classmethod
+    def build_from_cog(
+        cls, cog_pose: StateSE2, vehicle_parameters: VehicleParameters
+    ) -> "CarFootprint":
+        """From the pose of the centre of gravity."""
+        ahead = vehicle_parameters.cog_position_from_rear_axle
+        distance = vehicle_parameters.rear_axle_to_center - ahead
+        return cls(translate_longitudinally(cog_pose, distance), vehicle_parameters)
 
     oriented_box = derived(lambda self: self, "The box itself.")
     rear_axle_to_center_dist = derived(

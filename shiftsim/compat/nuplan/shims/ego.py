@@ -1,7 +1,7 @@
 """The state of the ego, waypoints, and the motion model."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import InitVar, dataclass
 from functools import cached_property
 from typing import Any
@@ -65,6 +65,22 @@ class Waypoint(InterpolatableState):
 
     def __iter__(self) -> Iterator[Any]:
         return iter((self.time_us, *self.center, *self._velocity()))
+
+    def serialize(self) -> list[Any]:
+        """Time [us], x, y, heading, length, width, height, velocity."""
+        box = self.oriented_box
+        size = (box.length, box.width, box.height)
+        return [self.time_us, *self.center, *size, *self._velocity()]
+
+    @staticmethod
+    def deserialize(vector: Sequence[Any]) -> "Waypoint":
+        """From what `serialize` gives."""
+        time, x, y, heading, length, width, height, *velocity = vector
+        return Waypoint(
+            TimePoint(int(time)),
+            OrientedBox(StateSE2(x, y, heading), length, width, height),
+            None if None in velocity else StateVector2D(*velocity),
+        )
 
     def to_split_state(self) -> SplitState:
         """Time, position and velocity; heading; width, length, height."""
@@ -231,6 +247,14 @@ class EgoState(InterpolatableState):
     def __iter__(self) -> Iterator[Any]:
         time, x, y, *others = self._numbers()
         return iter((time, x, y, self.rear_axle.heading, *others))
+
+    @staticmethod
+    def deserialize(vector: Sequence[float], vehicle: VehicleParameters) -> "EgoState":
+        """From time [us], pose, velocity and acceleration of the rear axle, steering angle."""
+        if len(vector) != 9:
+            raise RuntimeError(f"an ego state has 9 numbers, not {len(vector)}")
+        time, x, y, heading, *others = vector
+        return EgoState.from_split_state(SplitState([time, x, y, *others], [heading], [vehicle]))
 
     def to_split_state(self) -> SplitState:
         """Numbers at the rear axle; heading; vehicle."""

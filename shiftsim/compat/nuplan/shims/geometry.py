@@ -1,7 +1,7 @@
 """Times, points, poses and vectors."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
@@ -56,6 +56,7 @@ class TimeDuration:
         """A span in seconds, cut to whole microseconds."""
         return cls.from_us(int(t_s * 1_000_000))
 
+    time_ms = derived(lambda self: self.time_us / 1e3, "The span [ms].")
     # nuPlan rule 571: a division here, a product in TimePoint
     time_s = derived(lambda self: self.time_us / 1e6, "The span [s].")
 
@@ -67,6 +68,23 @@ class TimeDuration:
     def __sub__(self, other: object) -> Any:
         if isinstance(other, TimeDuration):
             return self.from_us(self.time_us - other.time_us)
+        return NotImplemented
+
+    def __mul__(self, factor: object) -> Any:
+        if isinstance(factor, (int, float)):
+            return self.from_s(self.time_s * factor)
+        return NotImplemented
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, divisor: object) -> Any:
+        if isinstance(divisor, (int, float)):
+            return self.from_s(self.time_s / divisor)
+        return NotImplemented
+
+    def __floordiv__(self, divisor: object) -> Any:
+        if isinstance(divisor, (int, float)):
+            return self.from_s(self.time_s // divisor)
         return NotImplemented
 
     def __repr__(self) -> str:
@@ -128,6 +146,12 @@ class StateSE2(Point2D):
         cos, sin = np.cos(self.heading), np.sin(self.heading)
         return np.array([[cos, -sin, self.x], [sin, cos, self.y], [0.0, 0.0, 1.0]])
 
+    def as_matrix_3d(self) -> FloatArray:
+        """(4, 4) the same in space."""
+        out = np.eye(4)
+        out[:2, [0, 1, 3]] = self.as_matrix()[:2]
+        return out
+
     def distance_to(self, state: Point2D) -> float:
         """Distance between the positions [m]."""
         return float(np.hypot(self.x - state.x, self.y - state.y))
@@ -137,6 +161,17 @@ class StateSE2(Point2D):
         """The pose of a (3, 3) transform."""
         assert matrix.shape == (3, 3), f"a 3x3 transform is needed, not {matrix.shape}"
         return StateSE2(matrix[0, 2], matrix[1, 2], np.arctan2(matrix[1, 0], matrix[0, 0]))
+
+    @staticmethod
+    def deserialize(vector: Sequence[float]) -> "StateSE2":
+        """A pose from x, y, heading."""
+        if len(vector) != 3:
+            raise RuntimeError(f"a pose has 3 numbers, not {len(vector)}")
+        return StateSE2(*vector)
+
+    def serialize(self) -> list[float]:
+        """X, y, heading."""
+        return [self.x, self.y, self.heading]
 
     def __iter__(self) -> Iterator[float]:
         return iter((self.x, self.y, self.heading))
@@ -163,8 +198,25 @@ class ProgressStateSE2(StateSE2):
     def __init__(self, progress: float, x: float, y: float, heading: float) -> None:
         self.x, self.y, self.heading, self.progress = x, y, heading, progress
 
+    @staticmethod
+    def deserialize(vector: Sequence[float]) -> "ProgressStateSE2":
+        """From progress, x, y, heading."""
+        if len(vector) != 4:
+            raise RuntimeError(f"a pose with progress has 4 numbers, not {len(vector)}")
+        return ProgressStateSE2(*vector)
+
     def __iter__(self) -> Iterator[float]:
         return iter((self.progress, self.x, self.y, self.heading))
+
+
+@dataclass(eq=False, slots=True)
+class TemporalStateSE2(StateSE2):
+    """A pose at a moment."""
+
+    time_point: TimePoint
+
+    time_us = part("time_point.time_us", "Microseconds since the epoch.")
+    time_seconds = part("time_point.time_s", "Seconds since the epoch.")
 
 
 class StateVector2D:

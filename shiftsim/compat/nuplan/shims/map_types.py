@@ -17,6 +17,11 @@ class SemanticMapLayer(IntEnum):
     BASELINE_PATHS, BOUNDARIES, WALKWAYS, CARPARK_AREA, PUDO = range(12, 17)
     ROADBLOCK, ROADBLOCK_CONNECTOR = 17, 18
 
+    @classmethod
+    def deserialize(cls, layer: str) -> "SemanticMapLayer":
+        """A layer by its name."""
+        return cls[layer]
+
 
 # numbered from 0, as in nuPlan's map
 LaneConnectorType = IntEnum(
@@ -39,6 +44,15 @@ class TrafficLightStatusType(IntEnum):
 
     GREEN, YELLOW, RED, UNKNOWN = range(4)
 
+    def serialize(self) -> str:
+        """Its name."""
+        return self.name
+
+    @classmethod
+    def deserialize(cls, key: str) -> "TrafficLightStatusType":
+        """A status by its name."""
+        return cls[key]
+
 
 @dataclass
 class TrafficLightStatusData:
@@ -47,6 +61,15 @@ class TrafficLightStatusData:
     status: TrafficLightStatusType
     lane_connector_id: int
     timestamp: int
+
+    def serialize(self) -> dict[str, Any]:
+        """As plain values."""
+        return {**vars(self), "status": self.status.serialize()}
+
+    @classmethod
+    def deserialize(cls, data: dict[str, Any]) -> "TrafficLightStatusData":
+        """From plain values."""
+        return cls(**{**data, "status": TrafficLightStatusType.deserialize(data["status"])})
 
 
 class AbstractMap:
@@ -102,6 +125,13 @@ class LaneGraphEdgeMapObject(GraphEdgeMapObject):
     def is_same_roadblock(self, other: "LaneGraphEdgeMapObject") -> bool:
         """Whether another one is of the same roadblock."""
         return self.get_roadblock_id() == other.get_roadblock_id()
+
+    def is_adjacent_to(self, other: "LaneGraphEdgeMapObject") -> bool:
+        """Whether another one of the same roadblock shares a boundary."""
+        return self.is_same_roadblock(other) and (
+            self.right_boundary.id == other.left_boundary.id
+            or self.left_boundary.id == other.right_boundary.id
+        )
 
 
 class Lane(LaneGraphEdgeMapObject):

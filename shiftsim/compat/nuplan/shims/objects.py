@@ -50,6 +50,11 @@ class SceneObjectMetadata:
     track_token: str | None  # id of its track
     category_name: str | None = None  # name of its type in the data
 
+    @property
+    def timestamp_s(self) -> float:
+        """When it was seen [s]."""
+        return self.timestamp_us * 1e-6
+
 
 class SceneObject:
     """Something with a type and a box."""
@@ -63,6 +68,22 @@ class SceneObject:
         self.tracked_object_type = tracked_object_type
         self.metadata = metadata
         self._box = oriented_box
+
+    @classmethod
+    def from_raw_params(
+        cls,
+        token: str,
+        track_token: str,
+        timestamp_us: int,
+        track_id: int,
+        center: StateSE2,
+        size: tuple[float, float, float],
+    ) -> "SceneObject":
+        """A generic object; `size` is width, length, height [m]."""
+        width, length, height = size
+        box = OrientedBox(center, length, width, height)
+        metadata = SceneObjectMetadata(timestamp_us, token, track_id, track_token)
+        return SceneObject(TrackedObjectType.GENERIC_OBJECT, box, metadata)
 
     box = part("_box", "Its box.")
     center = part("_box.center", "Pose of the box's centre.")
@@ -159,6 +180,12 @@ class Agent(AgentTemporalState, AgentState):
             self, tracked_object_type, oriented_box, velocity, metadata, angular_velocity
         )
 
+    @classmethod
+    def from_agent_state(cls, agent: AgentState) -> "Agent":
+        """An agent without past and future."""
+        kind, turning = agent.tracked_object_type, agent.angular_velocity
+        return cls(kind, agent.box, agent.velocity, agent.metadata, turning)
+
 
 TrackedObject: TypeAlias = Any
 
@@ -169,6 +196,15 @@ class TrackedObjects:
     def __init__(self, tracked_objects: Iterable[TrackedObject] | None = None) -> None:
         self.tracked_objects: list[TrackedObject] = sorted(
             tracked_objects or (), key=lambda item: int(item.tracked_object_type)
+        )
+
+    @classmethod
+    def from_oriented_boxes(cls, boxes: Sequence[OrientedBox]) -> "TrackedObjects":
+        """Generic objects, numbered."""
+        kind = TrackedObjectType.GENERIC_OBJECT
+        return cls(
+            SceneObject(kind, box, SceneObjectMetadata(number, str(number), None, None))
+            for number, box in enumerate(boxes)
         )
 
     def get_tracked_objects_of_type(self, wanted: TrackedObjectType) -> list[TrackedObject]:
@@ -217,6 +253,11 @@ class LidarChannel(Enum):
 @dataclass
 class Observation(ABC):  # noqa: B024  # a mere common base, as in nuPlan
     """What a planner is shown of the surroundings."""
+
+    @classmethod
+    def detection_type(cls) -> str:
+        """Name of the kind of observation."""
+        return cls.__name__
 
 
 @dataclass

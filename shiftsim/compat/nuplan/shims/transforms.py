@@ -47,6 +47,11 @@ def translate_longitudinally(pose: StateSE2, distance: float) -> StateSE2:
     return StateSE2(x, pose.y + distance * np.sin(pose.heading), pose.heading)
 
 
+def translate_laterally(pose: StateSE2, distance: float) -> StateSE2:
+    """A pose moved to its left [m]."""
+    return translate_longitudinally_and_laterally(pose, 0.0, distance)
+
+
 def translate_longitudinally_and_laterally(pose: StateSE2, lon: float, lat: float) -> StateSE2:
     """A pose moved forward and to its left [m]."""
     # nuPlan rule 575: sine and cosine of heading + pi / 2 as they come out
@@ -107,6 +112,11 @@ def numpy_array_to_absolute_velocity(
     return [StateVector2D(pose.x, pose.y) for pose in moved]
 
 
+def vector_2d_from_magnitude_angle(magnitude: float, angle: float) -> StateVector2D:
+    """A vector from its length and direction [rad]."""
+    return StateVector2D(np.cos(angle) * magnitude, np.sin(angle) * magnitude)
+
+
 # nuplan.common.geometry.compute
 
 
@@ -120,6 +130,11 @@ def longitudinal_distance(reference: StateSE2, other: Point2D) -> float:
     """How far a point is ahead of a pose [m]."""
     cos, sin = np.cos(reference.heading), np.sin(reference.heading)
     return float(cos * (other.x - reference.x) + sin * (other.y - reference.y))
+
+
+def compute_distance(lhs: StateSE2, rhs: StateSE2) -> float:
+    """Distance between two positions [m]."""
+    return lhs.distance_to(rhs)
 
 
 def principal_value(angle: Any, min_: float = -np.pi) -> Any:
