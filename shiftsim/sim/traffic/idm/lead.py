@@ -6,7 +6,7 @@ The corridor is the path ahead, buffered by half the width of the agent with fla
 import numpy as np
 
 from shiftsim.geometry.corridor import Corridor, line_distance
-from shiftsim.geometry.polylines import bound_runs, runs_of
+from shiftsim.geometry.polylines import RUN, bound_runs
 from shiftsim.geometry.rings import ring_bounds
 from shiftsim.kernels import FloatArray, kernel
 from shiftsim.sim.traffic.idm.buffer import buffer_curve
@@ -27,7 +27,7 @@ def corridor_ahead(
 ) -> Corridor:
     """The corridor along a path (K, 4), of which `size` vertices count, from a progress on."""
     points = cut_path(path, size, progress, path[size - 1, PROGRESS], scratch.line)
-    line, runs = scratch.line[:points], scratch.runs[: runs_of(points)]
+    line, runs = scratch.line[:points], scratch.runs[: (points - 2) // RUN + 1]
     bound_runs(line, runs)
     scratch.outline_size[0] = -1
     return Corridor(line, runs, 0, points, half_width)

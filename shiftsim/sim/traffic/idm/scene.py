@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.geometry.polylines import runs_of
+from shiftsim.geometry.polylines import RUN
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.sim.traffic.idm.buffer import curve_capacity
 from shiftsim.world.layers import Lists, Polygons, Polylines
@@ -171,7 +171,7 @@ def _make_curves(fleet: Fleet) -> FloatArray:
 
 def _make_scratch(fleet: Fleet) -> Scratch:
     points = fleet.path.shape[1] + _EXTRA_POINTS
-    runs, outline = np.zeros((runs_of(points), 4)), np.zeros((curve_capacity(points), 2))
+    runs, outline = np.zeros(((points - 2) // RUN + 1, 4)), np.zeros((curve_capacity(points), 2))
     return Scratch(np.zeros((points, 2)), runs, outline, np.zeros(1, np.int64))
 
 
