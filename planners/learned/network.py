@@ -65,23 +65,15 @@ class Mlp(nn.Module):
 
     def over_rows(self, x: Tensor) -> Tensor:
         """The same over the last but one dimension: (B, inputs, C) to (B, outputs, C)."""
-        for layer in (self.fc1, self.act, self.fc2):
-            if isinstance(layer, Linear):
-                weight = layer.weight.expand(len(x), -1, -1)
-                x = torch.baddbmm(layer.bias[:, None], weight, x)
-            else:
-                x = layer(x)
-        return x
+        first, second = (layer.weight.expand(len(x), -1, -1) for layer in (self.fc1, self.fc2))
+        hidden = self.act(torch.baddbmm(self.fc1.bias[:, None], first, x))
+        return torch.baddbmm(self.fc2.bias[:, None], second, hidden)
 
 
 def head(inputs: int, hidden: int, outputs: int, *, bias: bool = True) -> nn.Sequential:
     """Linear, LayerNorm, ReLU, Linear; `bias` is that of the first layer."""
-    return nn.Sequential(
-        Linear(inputs, hidden, bias=bias),
-        nn.LayerNorm(hidden),
-        nn.ReLU(),
-        Linear(hidden, outputs),
-    )
+    first = Linear(inputs, hidden, bias=bias)
+    return nn.Sequential(first, nn.LayerNorm(hidden), nn.ReLU(), Linear(hidden, outputs))
 
 
 def perceptron(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
@@ -171,11 +163,8 @@ class Attention(nn.Module):
         `counts` says how many rows of `query` each scene has, `scenes` how those of `context` lie.
         """
         q, k, v = self.project(query, context, context)
-        by_scene = zip(
-            torch.split(q, list(counts)),
-            *(scenes.split(k), scenes.split(v), scenes.masks),
-            strict=True,
-        )
+        parts = (torch.split(q, list(counts)), scenes.split(k), scenes.split(v), scenes.masks)
+        by_scene = zip(*parts, strict=True)
         mixed = [self.attend(q[None], k[None], v[None], mask)[0] for q, k, v, mask in by_scene]
         return self.out_proj(torch.cat(mixed))
 

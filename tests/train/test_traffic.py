@@ -13,8 +13,7 @@ from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import ConfigError
 from shiftsim.sim.traffic.constant_velocity import ConstantVelocity
-from shiftsim.sim.traffic.learned.model import LearnedTraffic
-from shiftsim.sim.traffic.learned.network import load_weights
+from shiftsim.sim.traffic.learned.model import LearnedTraffic, load_weights
 from shiftsim.train.traffic.realism import compare
 from shiftsim.train.traffic.recipe import TrafficSettings, train_traffic
 from shiftsim.train.traffic.states import compute_labels

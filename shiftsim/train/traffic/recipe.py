@@ -22,8 +22,7 @@ from shiftsim.files import atomic_write
 from shiftsim.runs.scenarios import find_split, open_named_store
 from shiftsim.sim.traffic import Traffic, make_traffic
 from shiftsim.sim.traffic.learned.features import NUM_FEATURES
-from shiftsim.sim.traffic.learned.model import LearnedTraffic
-from shiftsim.sim.traffic.learned.network import HIDDEN, SCALES, Weights
+from shiftsim.sim.traffic.learned.model import HIDDEN, SCALES, LearnedTraffic, Weights
 from shiftsim.train.folder import OnMessage, write_table
 from shiftsim.train.jobs import divide
 from shiftsim.train.traffic.realism import compare

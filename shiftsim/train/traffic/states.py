@@ -15,8 +15,7 @@ from shiftsim.geometry.polylines import arc_lengths, point_on_polyline, project_
 from shiftsim.kernels import BoolArray, FloatArray
 from shiftsim.sim.planner import rollout_rows
 from shiftsim.sim.traffic.learned.features import AHEAD, NUM_FEATURES, PATH, REACH
-from shiftsim.sim.traffic.learned.model import LAG, LearnedTraffic
-from shiftsim.sim.traffic.learned.network import LIMITS
+from shiftsim.sim.traffic.learned.model import LAG, LIMITS, LearnedTraffic
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Tracks
 
