@@ -55,7 +55,10 @@ def outputs(network: Any, *inputs: np.ndarray) -> tuple[dict[str, Any], dict[str
         features = encoder(pictures, measured)
         policy = network.policy(features)
         beta: Any = Beta(policy.alpha, policy.beta)
-        encoded = {"cnn_flat": encoder.see(pictures), "state_latent": encoder.feel(measured)}
+        encoded = {
+            "cnn_flat": encoder.encode_raster(pictures),
+            "state_latent": encoder.state_linear(measured),
+        }
         heads = {
             "action": policy.action,
             "alpha": policy.alpha,

@@ -139,7 +139,7 @@ def test_forward(path: Path, cases: Cases) -> None:
     network = make_planner(KeyedPlanner, "base").network
     with torch.no_grad():
         scene = network.normalise(inputs)
-        route = network.dit[0].route_encoder(scene["route_lanes"])
+        route = network.dit.route_encoder(scene["route_lanes"])
         encoded = {"encoding": network.encode(scene), "route_encoding": route}
     normalised = {name: scene[name] for name in network.normalisers}
     file.below("norm.").match(file.name, normalised, NORMALISED, quantity=f"{NAME} normalised")
@@ -165,12 +165,12 @@ def sample(
     """
     network = make_planner(KeyedPlanner, variant).network
     current, absent = network.present(scene)
-    prepared, noise = network.prepare(scene, absent), torch.from_numpy(start)
+    context, noise = network.context(scene, absent), torch.from_numpy(start)
     egos, outputs = [], []
 
     def call(x: Any, number: int) -> Any:
         egos.append(x[0, 0].clone())
-        outputs.append(prepared(x, number))
+        outputs.append(network.dit(x, number, context))
         return outputs[-1]
 
     def sampled(function: Callable[[Any, int], Any]) -> Any:

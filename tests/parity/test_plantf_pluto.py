@@ -100,7 +100,7 @@ def likeliest(trajectory: Any, probability: Any) -> Any:
 
 def plantf_outputs(network: Any, inputs: Any) -> dict[str, Any]:
     with torch.no_grad():
-        said = network(inputs, predict=True)._asdict()
+        said = network(inputs)._asdict()
     made = {name: value.numpy() for name, value in said.items()}
     poses = likeliest(made["trajectory"], made["probability"])
     names = ("probability", "prediction", "trajectory")
