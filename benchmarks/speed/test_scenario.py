@@ -57,7 +57,9 @@ def runner(scenes, tmp_path_factory):
             writer.add_window(Window(name, scene.scenario_type, name, "ego", *rows, *place))
     planners = {"constant-velocity": run_planner("constant-velocity", {})}
     noises = {"none": parse_noise("none")}
-    return TaskRunner(make_config({"planners": [*planners]}), str(path), planners, noises)
+    runner = TaskRunner(make_config({"planners": [*planners]}), str(path), planners, noises)
+    runner.path = str(path)
+    return runner
 
 
 NAMES = (
@@ -72,7 +74,7 @@ NAMES = (
 
 @pytest.mark.parametrize("name", NAMES)
 def test_read(measure, runner, name):
-    store = open_store(runner.store)
+    store = open_store(runner.path)
     measure(lambda: store.read(name), calls=1, target=READ_TARGET)
 
 
@@ -181,7 +183,7 @@ def test_peak_memory_of_a_worker(runner, pytestconfig, tmp_path, monkeypatch):
     monkeypatch.setenv("SHIFTSIM_CACHE", str(tmp_path))
 
     def measured(name):
-        command = [sys.executable, "-c", MEMORY, str(runner.store), name]
+        command = [sys.executable, "-c", MEMORY, str(runner.path), name]
         out = subprocess.run(command, check=True, capture_output=True, text=True)
         return [float(word) for word in out.stdout.split()]
 
