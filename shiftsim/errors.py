@@ -6,6 +6,7 @@ from importlib import import_module
 from types import ModuleType
 
 _MAX_TEXT = 100_000  # characters
+_MAX_MESSAGE = 1000  # characters
 
 
 class ShiftsimError(Exception):
@@ -26,7 +27,10 @@ class ShiftsimError(Exception):
 
     def __init__(self, message: str, hint: str = "") -> None:
         # one line, also with the text of another library in it; Gymnasium gives an error here
-        self.message, self.hint = " ".join(str(message).splitlines()), hint
+        message = " ".join(str(message).splitlines())
+        if len(message) > _MAX_MESSAGE:
+            message = f"{message[:700]} … {message[-250:]}"
+        self.message, self.hint = message, hint
         super().__init__(self.message)
 
     def __str__(self) -> str:

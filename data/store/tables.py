@@ -216,7 +216,7 @@ class Table:
             self._file = pq.ParquetFile(
                 path, memory_map=True, pre_buffer=False, read_dictionary=self._named
             )
-        except (OSError, ValueError, pa.ArrowException) as error:
+        except (OSError, ValueError, KeyError, pa.ArrowException) as error:  # KeyError: a name
             what = (
                 "is missing"
                 if not os.path.exists(path)

@@ -116,6 +116,7 @@ def test_the_earliest_of_all_violations_is_that_of_comfort() -> None:
     late[7:], early[2] = 9.0, -9.0
     signals = constant_signals(mag_jerk=late, lon_jerk=early, yaw_rate=late)
     _, comfortable = evaluate(signals, times(10), NUPLAN)
+    assert comfortable.row.threshold == 0.0
     assert comfortable.row.violation == Violation(2, 200_000, None, -9.0)
     assert comfortable.row.value == 3.0
 
