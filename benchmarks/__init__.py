@@ -12,7 +12,7 @@ from typing import Any
 
 from shiftsim.errors import one_of
 from shiftsim.report.groups import KnownSet
-from shiftsim.report.published import Published
+from shiftsim.report.paper import Published
 
 TRACKS = ("semantic-shift", "state-drift", "edits")
 INTERPLAN_THRESHOLDS = "nuplan"  # of its edits, whatever the track's own

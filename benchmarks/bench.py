@@ -13,21 +13,23 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from shiftsim.benchmarks import INTERPLAN_THRESHOLDS, Drawn, Track, load_track
-from shiftsim.benchmarks.coverage import coverage
+from shiftsim.edits.sampling import sample_edits
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.files import whole_file, write_text
-from shiftsim.report.groups import Group, KnownSet, token_digest
-from shiftsim.report.tables import Table
+from shiftsim.files import write_text
+from shiftsim.report.groups import TRAFFIC, Group, KnownSet, distinct_sets, token_digest
+from shiftsim.report.tables import Cell, Number, Table
+from shiftsim.runs.avoidable import grade
 from shiftsim.runs.config import DEFAULT_STORE, make_config
-from shiftsim.runs.edits.avoidable import grade
-from shiftsim.runs.edits.edited import EditSet, edits_text, make_edits
+from shiftsim.runs.edited import EditSet, edits_text, make_edits
 from shiftsim.runs.execute import Progress, execute
-from shiftsim.runs.prepare import RUNS, Prepared, prepare
-from shiftsim.runs.results import Run, open_run, stored_results
+from shiftsim.runs.prepare import RUNS, RunPlan, prepare
+from shiftsim.runs.results import Run, open_run
 from shiftsim.runs.scenarios import open_edits, open_named_store
+from shiftsim.runs.tables import stored_results
 from shiftsim.sim.traffic import traffic_name
-from shiftsim.world.edits.sampling import sample_edits
 
 MANIFEST = "bench.json"
 EDITS = "edits.toml"  # what was edited, in the folder of the benchmark
@@ -44,14 +46,14 @@ class Plan:
 
     track: Track  # the track
     folder: Path  # where everything goes
-    runs: Mapping[str, Prepared]  # the runs, by the name of their folder
+    runs: Mapping[str, RunPlan]  # the runs, by the name of their folder
     own: tuple[KnownSet, ...]  # one's own lists of scenarios as a whole: recorded, then edited
     edits: str = ""  # what was drawn for it, as a file
 
     @property
     def num_tasks(self) -> int:
         """Rollouts of all runs."""
-        return sum(len(prepared.tasks) for prepared in self.runs.values())
+        return sum(len(run.tasks) for run in self.runs.values())
 
 
 def plan_bench(
@@ -112,7 +114,7 @@ def _prepared(
     modes: Sequence[str],
     folder: Path,
     edits: EditSet | None = None,
-) -> dict[str, Prepared]:
+) -> dict[str, RunPlan]:
     """The runs of some sets of scenarios, by the name of their folder."""
     runs = {}
     for name, traffic in product(sets, modes):
@@ -123,7 +125,7 @@ def _prepared(
     return runs
 
 
-def _edits(drawn: Drawn, own: Prepared, given: str, folder: Path) -> tuple[EditSet, str]:
+def _edits(drawn: Drawn, own: RunPlan, given: str, folder: Path) -> tuple[EditSet, str]:
     """The edits that are given, else those of the folder, else those that the track draws.
 
     The text is that of a file of those that were drawn.
@@ -133,7 +135,7 @@ def _edits(drawn: Drawn, own: Prepared, given: str, folder: Path) -> tuple[EditS
         return open_edits(given or str(folder / EDITS), store), ""
     read = lru_cache(maxsize=256)(store.read)
     found = [
-        sample_edits(kind, drawn.count, drawn.seed, own.tokens, read, grade, even=True)
+        sample_edits(kind, drawn.count, drawn.seed, own.selection.tokens, read, grade, even=True)
         for kind in drawn.kinds
     ]
     # all kinds in turn, so that a part of the list has all of them
@@ -169,20 +171,19 @@ def _check_folder(folder: Path, track: Track) -> None:
         )
 
 
-def _whole(prepared: Prepared) -> Prepared:
+def _whole(run: RunPlan) -> RunPlan:
     """The run on the whole list, where it is limited to its first scenarios."""
-    if not prepared.config.limit:
-        return prepared
-    out = str(prepared.folder / "whole")
-    config = replace(prepared.config, limit=0, out=out, resume=False)
-    return prepare(config, edits=prepared.edits)
+    if not run.config.limit:
+        return run
+    config = replace(run.config, limit=0, out=str(run.folder / "whole"), resume=False)
+    return prepare(config, edits=run.selection.edits)
 
 
-def _list_of(prepared: Prepared) -> KnownSet:
+def _list_of(run: RunPlan) -> KnownSet:
     """The scenarios of a run as a list."""
-    tokens = {task.token for task in (*prepared.tasks, *prepared.missing)}
-    rules = prepared.config.thresholds
-    return KnownSet(prepared.split, prepared.split, rules, len(tokens), token_digest(tokens))
+    tokens = {task.token for task in (*run.tasks, *run.missing)}
+    split, rules = run.selection.split, run.config.thresholds
+    return KnownSet(split, split, rules, len(tokens), token_digest(tokens))
 
 
 def run_bench(
@@ -210,17 +211,15 @@ def run_bench(
     if plan.edits:
         write_text(plan.folder / EDITS, plan.edits)
     text = json.dumps(manifest, indent=1, ensure_ascii=False)
-    with whole_file(plan.folder / MANIFEST) as partial:
-        partial.write_text(f"{text}\n", encoding="utf-8")
+    write_text(plan.folder / MANIFEST, f"{text}\n")
     total = _Total(plan.num_tasks, on_progress)
     out = []
-    for prepared in plan.runs.values():
-        if prepared.before == "complete":
-            out.append(open_run(prepared.folder))
-            stored = (result for result, _ in stored_results(prepared.folder))
-            total.show(Progress(len(prepared.tasks), 0, 0, news=stored))
+    for run in plan.runs.values():
+        if run.before == "complete":
+            out.append(open_run(run.folder))
+            total.show(Progress(len(run.tasks), 0, 0, news=stored_results(run.folder)))
         else:
-            out.append(execute(prepared, on_progress=total.show, argv=argv))
+            out.append(execute(run, on_progress=total.show, argv=argv))
         total.before = total.now
     return out
 
@@ -307,3 +306,61 @@ def _read_manifest(folder: Path) -> dict[str, Any] | None:
             hint="run the benchmark again with this version of shiftsim",
         )
     return found
+
+
+def coverage(track: Track, groups: Sequence[Group]) -> Table:
+    """Finished rollouts of the track's contract, by set of scenarios and planner.
+
+    A score is the track's score only where all of them are there.
+    """
+    inside = [group for group in groups if _belongs(group, track)]
+    sets = {data.name: (data.label, data.whole) for data in distinct_sets(inside)}
+    if listed := track.reference:
+        sets.setdefault(listed.name, (listed.label, listed.count))
+    rows: list[tuple[Cell, ...]] = []
+    for name, (label, whole) in sets.items():
+        for planner in dict.fromkeys(group.planner for group in inside):
+            mine = [g for g in inside if (g.data.name, g.planner) == (name, planner)]
+            done = sum(_finished(group, track) for group in mine)
+            expected = whole * track.rollouts_per_scenario
+            if any(group.data.is_interplan for group in mine):  # for reactive traffic only
+                expected //= len(track.traffic)
+            verdict = "complete" if done == expected else f"partial ({done}/{expected})"
+            counts = (Number(done, 0), Number(expected, 0))
+            rows.append((label, planner, *counts, verdict if done else "not run"))
+    missing = [name for name in track.planners if name not in {g.planner for g in inside}]
+    rules = [f"own scenarios under thresholds {track.own_thresholds}"]
+    rules += [f"{listed.label} under {listed.thresholds}"] if listed else []
+    if drawn := track.drawn:
+        rules.append(f"recorded, and with {drawn.count} edits of each of {', '.join(drawn.kinds)}")
+    notes = [
+        f"contract: traffic {', '.join(track.traffic)} × noise {', '.join(track.noise)} × seeds "
+        f"{', '.join(map(str, track.seeds))} on all scenarios; {', '.join(rules)}",
+        f"scores that are not complete are not the benchmark's; own scenarios: {track.own_note}",
+    ]
+    notes += [f"planners of the paper that are not here: {', '.join(missing)}"] if missing else []
+    header = ("set", "planner", "rollouts", "of", "verdict")
+    title = f"Coverage of the track {track.name}"
+    return Table("coverage", title, header, tuple(rows), 2, tuple(notes))
+
+
+def _belongs(group: Group, track: Track) -> bool:
+    """Whether a group is part of the contract."""
+    listed, rules = track.reference, track.own_thresholds
+    if listed and group.data.known == listed.name:
+        rules = listed.thresholds
+    elif group.data.is_interplan:
+        rules = INTERPLAN_THRESHOLDS
+    modes = [TRAFFIC[name] for name in track.traffic]
+    return (
+        group.traffic in modes
+        and group.noise in track.noise
+        and group.data.thresholds == rules
+        and group.data.controller == "lqr"
+    )
+
+
+def _finished(group: Group, track: Track) -> int:
+    wanted = (0,) if group.noise == "none" else track.seeds
+    rows = [i for i, seed in enumerate(group.seeds) if seed in wanted]
+    return int(np.isfinite(group.values[rows, :, 0]).sum())

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 
 from shiftsim.benchmarks.bench import Plan
-from shiftsim.runs.prepare import Prepared
+from shiftsim.runs.prepare import RunPlan
 from shiftsim.runs.rollouts.columns import decode_rows
 from shiftsim.runs.rollouts.files import PartWriter
 from shiftsim.runs.task import Batch, TaskRunner
@@ -41,7 +41,7 @@ def estimate(plan: Plan, *, shards: int = 1) -> list[Cost]:
 
     `shards` machines like this one share the tasks, each with the workers of the plan.
     """
-    return [cost for name, prepared in plan.runs.items() for cost in _costs(name, prepared, shards)]
+    return [cost for name, run in plan.runs.items() for cost in _costs(name, run, shards)]
 
 
 def total(costs: list[Cost]) -> Cost:
@@ -52,17 +52,14 @@ def total(costs: list[Cost]) -> Cost:
     return Cost("all", "all", tasks, work / max(1, tasks), hours, memory, disk)
 
 
-def _costs(name: str, prepared: Prepared, shards: int) -> Iterator[Cost]:
-    config = prepared.config
-    given = (config, prepared.store, prepared.planners, prepared.noises)
-    make = TaskRunner(*given, prepared.traffic, prepared.edits)
-    with closing(make) as do:
-        for planner in prepared.planners:
-            own = [batch for batch in prepared.batches if batch.planner == planner]
+def _costs(name: str, run: RunPlan, shards: int) -> Iterator[Cost]:
+    with closing(run.runner()()) as do:
+        for planner in run.planners:
+            own = [batch for batch in run.batches if batch.planner == planner]
             tasks = sum(len(batch.tasks) for batch in own)
             each, stored = _measure(do, own)
-            workers = max(1, min(prepared.workers * shards, len(own)))
-            memory = _peak() * min(prepared.workers, workers)
+            workers = max(1, min(run.workers * shards, len(own)))
+            memory = _peak() * min(run.workers, workers)
             hours = tasks * each / workers / 3600.0
             yield Cost(name, planner, tasks, each, hours, memory, round(tasks * stored))
 

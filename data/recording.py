@@ -124,8 +124,6 @@ def scenario(
 def visible_tracks(tracks: Tracks, *, without: str) -> Tracks:
     """The tracks that occur in the rows given, in nuPlan's order, except the one named."""
     index = visible_columns(tracks.valid, tracks.kinds, tracks.tokens, without)
-    if len(index) == tracks.num_tracks and (index == np.arange(len(index))).all():
-        return tracks
     return Tracks(
         tracks.valid.take(index, axis=1),
         tracks.poses.take(index, axis=1),
@@ -139,16 +137,24 @@ def visible_tracks(tracks: Tracks, *, without: str) -> Tracks:
 def visible_columns(
     valid: BoolArray, kinds: IntArray, tokens: Sequence[str], without: str
 ) -> IntArray:
-    """(N',) columns of the tracks of `valid` (R, N) that `visible_tracks` gives, in its order."""
+    """(N',) columns of the tracks of `valid` (R, N) that `visible_tracks` gives, in its order.
+
+    nuPlan rule 410: every frame lists its tracks by type, and within a type as the log does. The
+    order depends only on the rows given, so that a window of a longer recording is ordered as if it
+    had been read alone.
+    """
     first = valid.argmax(axis=0)
     seen = valid[first, np.arange(len(first))]
     if without in tokens:
         seen[tokens.index(without)] = False
-    if seen.all():
-        return order_of_columns(valid, kinds, first)
     index = np.flatnonzero(seen)
-    order: IntArray = index[order_of_columns(valid[:, index], kinds[index], first[index])]
-    return order
+    valid, kinds, first = valid[:, index], kinds[index], first[index]
+    order = np.lexsort((first, kinds))
+    if (order == kinds.argsort(kind="stable")).all():
+        return index[order]  # the oldest of a kind come first: as they are listed, whoever is there
+    before = np.zeros((len(kinds), len(kinds)), np.bool_)
+    _link_columns(np.ascontiguousarray(valid), kinds, before)
+    return index[sort_tracks(before, kinds, first)]
 
 
 def listed_lights(lights: TrafficLights) -> TrafficLights:
@@ -157,38 +163,31 @@ def listed_lights(lights: TrafficLights) -> TrafficLights:
         return TrafficLights.empty(len(lights.status))
     listed = lights.status >= 0
     seen = np.flatnonzero(listed.any(axis=0))
-    kept = seen[np.argsort(listed.argmax(axis=0)[seen], kind="stable")]
-    names = tuple(lights.connector_ids[i] for i in kept.tolist())
-    return TrafficLights(names, np.ascontiguousarray(lights.status[:, kept]))
+    order = seen[np.argsort(listed.argmax(axis=0)[seen], kind="stable")]
+    names = tuple(lights.connector_ids[i] for i in order.tolist())
+    return TrafficLights(names, np.ascontiguousarray(lights.status[:, order]))
 
 
-def order_of_columns(valid: BoolArray, kinds: IntArray, first: IntArray) -> IntArray:
-    """Order of dense tracks (R, N), such that every frame lists its tracks as nuPlan does.
+def sort_tracks(before: BoolArray, kinds: IntArray, first: IntArray) -> IntArray:
+    """(N,) indices of tracks by kind, then as the frames list them, then by first appearance.
 
-    nuPlan rule 410: by type, and within a type as the log lists them. The order depends only on the
-    rows given, so that a window of a longer recording is ordered as if it had been read alone.
-    `first` (N,) is the first row of each, all of which occur.
+    `before` (N, N) tells whether one directly precedes another in a frame, `first` (N,) the frame
+    in which each appears first, which decides where frames contradict each other.
     """
     order = np.lexsort((first, kinds))
-    if (order == kinds.argsort(kind="stable")).all():
-        return order  # the oldest of a kind come first: as they are listed, whoever is there
-    before = np.zeros((len(kinds), len(kinds)), np.bool_)
-    _link_columns(np.ascontiguousarray(valid), kinds, before)
-    found: IntArray = sort_tracks(before, kinds, first)
-    return found
+    _move_behind(np.ascontiguousarray(before), kinds, order)
+    return order
 
 
 @kernel
 def _link_columns(valid: BoolArray, kinds: IntArray, before: BoolArray) -> None:
+    """Mark which track directly precedes which one of its kind in a row."""
     last = np.full(16, -1)
     for frame in range(valid.shape[0]):
-        if frame > 0 and _is_same(valid, frame):
-            continue  # it tells nothing new
-        for kind in range(len(last)):
-            last[kind] = -1
-        for track in range(valid.shape[1]):
-            if not valid[frame, track]:
-                continue
+        if frame > 0 and (valid[frame] == valid[frame - 1]).all():
+            continue
+        last[:] = -1
+        for track in np.flatnonzero(valid[frame]):
             kind = kinds[track]
             if last[kind] >= 0:
                 before[last[kind], track] = True
@@ -196,54 +195,22 @@ def _link_columns(valid: BoolArray, kinds: IntArray, before: BoolArray) -> None:
 
 
 @kernel
-def _is_same(valid: BoolArray, frame: int) -> bool:
-    """Whether a frame has the tracks of the one before."""
-    same = True
-    for track in range(valid.shape[1]):
-        same &= valid[frame, track] == valid[frame - 1, track]
-    return same
-
-
-@kernel
-def sort_tracks(before: BoolArray, kinds: IntArray, first: IntArray) -> IntArray:
-    """(N,) indices of tracks by kind, then as the frames list them, then by first appearance.
-
-    `before` (N, N) tells whether one directly precedes another in a frame, `first` (N,) the frame
-    in which each appears first, which decides where frames contradict each other.
-    """
+def _move_behind(before: BoolArray, kinds: IntArray, order: IntArray) -> None:
+    """Sort tracks that are ordered by kind and age such that each stands behind those before it."""
     num = len(kinds)
     waiting = np.zeros(num, np.int64)
-    for a in range(num):
-        for b in range(num):
-            if before[a, b]:
-                waiting[b] += 1
-    out = np.empty(num, np.int64)  # by kind and age; those from `place` on have none yet
     for track in range(num):
-        place = track
-        while place > 0 and (kinds[out[place - 1]], first[out[place - 1]]) > (
-            kinds[track],
-            first[track],
-        ):
-            place -= 1
-        _insert(out, track, place, track)
+        waiting += before[track]
     for place in range(num):
         best = place  # the oldest where all of its kind wait
         for other in range(place, num):
-            if kinds[out[other]] != kinds[out[place]]:
+            if kinds[order[other]] != kinds[order[place]]:
                 break
-            if waiting[out[other]] <= 0:
+            if waiting[order[other]] <= 0:
                 best = other
                 break
-        _insert(out, best, place, out[best])
-        for track in range(num):
-            if before[out[place], track]:
-                waiting[track] -= 1
-    return out
-
-
-@kernel
-def _insert(order: IntArray, gap: int, place: int, track: int) -> None:
-    """Move what stands from `place` on by one, up to the gap, and put a track there."""
-    for other in range(gap, place, -1):
-        order[other] = order[other - 1]
-    order[place] = track
+        chosen = order[best]
+        for other in range(best, place, -1):
+            order[other] = order[other - 1]
+        order[place] = chosen
+        waiting -= before[chosen]

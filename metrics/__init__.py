@@ -1,7 +1,7 @@
 """Closed-loop metrics and the score of one rollout, from its arrays and the map alone.
 
-`compute_metrics` is `judge(measure(log, road), thresholds)`: the geometry is measured once, and any
-number of threshold profiles can be applied to it.
+`compute_metrics` is `evaluate(measure(log, road), thresholds)`: the geometry is measured once, and
+any number of threshold profiles can be applied to it.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,7 +27,7 @@ from shiftsim.metrics.score import (
     WEIGHTS,
     Measurements,
     MetricResult,
-    judge,
+    evaluate,
     measure,
 )
 from shiftsim.sim.log import SimulationLog
@@ -55,7 +55,7 @@ __all__ = [
     "Violation",
     "add_metrics",
     "compute_metrics",
-    "judge",
+    "evaluate",
     "load_metric",
     "measure",
     "thresholds_of",
@@ -84,12 +84,12 @@ def compute_metrics(
 
     Example:
         ```python
-        scenario = shiftsim.open_store("demo")["03b23c"]
+        scenario = shiftsim.open_store("demo")["01f13e"]
         result = shiftsim.score(shiftsim.simulate(scenario, "idm"), scenario.map)
         print(result.score, result.scores)
         ```
     """
-    result = judge(measure(log, road), thresholds)
+    result = evaluate(measure(log, road), thresholds)
     return add_metrics(result, log, road, own) if own else result
 
 

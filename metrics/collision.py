@@ -1,15 +1,20 @@
 """Collisions: first contact with every track, who is at fault, and the score.
 
-In kernels a box is a row (x, y, cos h, sin h, h, half length, half width, half diagonal). Most
-pairs are decided by distances with a margin; the rest exactly, on corners.
+In kernels a box is a row (x, y, cos h, sin h, h, half length, half width, half diagonal).
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.geometry.boxes import BEHIND, bearing, box_corners, front_touches
-from shiftsim.geometry.rings import convex_intersect
+from shiftsim.geometry.boxes import (
+    ACTIVE_FRONT,
+    ACTIVE_LATERAL,
+    STOPPED_TRACK,
+    box_corners,
+    contact_type,
+)
+from shiftsim.geometry.rings import SLACK, convex_intersect
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.metrics.result import (
     Collision,
@@ -30,10 +35,7 @@ from shiftsim.world.state import (
 
 NAME = "no_ego_at_fault_collisions"
 COLLISION_TYPES = ("stopped_ego", "stopped_track", "active_rear", "active_front", "active_lateral")
-STOPPED_EGO, STOPPED_TRACK, ACTIVE_REAR, ACTIVE_FRONT, ACTIVE_LATERAL = range(5)
-STOPPED_SPEED = 5e-2  # m/s, nuPlan at-fault collisions
 BOX_SIZE = 8  # numbers that make a box in kernels
-_MARGIN = 1e-6  # m, far above rounding: gaps beyond it need no exact test
 GROUPS = {
     "VRUs": (AgentKind.PEDESTRIAN, AgentKind.BICYCLE),
     "vehicles": (AgentKind.VEHICLE,),
@@ -138,7 +140,7 @@ def at_fault_counts(collisions: tuple[Collision, ...]) -> dict[str, int]:
     }
 
 
-def judge(collisions: tuple[Collision, ...], thresholds: Thresholds) -> MetricPart:
+def evaluate(collisions: tuple[Collision, ...], thresholds: Thresholds) -> MetricPart:
     """Score of the collisions: the product over the groups."""
     counts = at_fault_counts(collisions)
     allowed = (
@@ -150,10 +152,10 @@ def judge(collisions: tuple[Collision, ...], thresholds: Thresholds) -> MetricPa
     for number, free in zip(counts.values(), allowed, strict=True):
         score *= max(0.0, 1.0 - number / (free + 1))
     total = sum(counts.values())
-    blamed = [c for c in collisions if c.at_fault]
+    at_fault = [c for c in collisions if c.at_fault]
     violation = None
-    if blamed:
-        worst = blamed[0]
+    if at_fault:
+        worst = at_fault[0]
         violation = Violation(worst.iteration, worst.time_us, worst.token, worst.delta_v)
     statistics = [
         Statistic(NAME, NAME, "boolean", "BOOLEAN", float(total == 0)),
@@ -163,7 +165,7 @@ def judge(collisions: tuple[Collision, ...], thresholds: Thresholds) -> MetricPa
         name = f"number_of_at_fault_collisions_with_{group}"
         statistics.append(Statistic(NAME, name, "count", "COUNT", float(number)))
     for group, kinds in GROUPS.items():
-        statistics += _energies(group, [c.delta_v for c in blamed if c.kind in kinds])
+        statistics += _energies(group, [c.delta_v for c in at_fault if c.kind in kinds])
     row = MetricRow(NAME, score, float(total), "count", 0.0, violation)
     return MetricPart(row, tuple(statistics))
 
@@ -190,29 +192,8 @@ def set_box(box: FloatArray, pose: FloatArray, length: float, width: float) -> N
     """Write a box (8,) from its pose (3,) and size [m]."""
     box[0], box[1], box[4] = pose[0], pose[1], pose[2]
     box[2], box[3] = np.cos(pose[2]), np.sin(pose[2])
-    set_size(box, length, width)
-
-
-@kernel
-def set_size(box: FloatArray, length: float, width: float) -> None:
-    """Write the size of a box (8,) [m]."""
     box[5], box[6] = 0.5 * length, 0.5 * width
     box[7] = 0.5 * np.sqrt(length * length + width * width)
-
-
-@kernel
-def _set_corners(box: FloatArray, out: FloatArray) -> None:
-    box_corners(box[0], box[1], box[4], 2.0 * box[5], 2.0 * box[6], out)
-
-
-@kernel
-def _gap(a: FloatArray, b: FloatArray) -> float:
-    """Largest gap between two boxes along the axes of `a`; negative where they overlap [m]."""
-    dx, dy = b[0] - a[0], b[1] - a[1]
-    cos, sin = abs(a[2] * b[2] + a[3] * b[3]), abs(a[2] * b[3] - a[3] * b[2])
-    lon = abs(dx * a[2] + dy * a[3]) - a[5] - b[5] * cos - b[6] * sin
-    lat = abs(dx * a[3] - dy * a[2]) - a[6] - b[5] * sin - b[6] * cos
-    return max(lon, lat)
 
 
 @kernel
@@ -222,43 +203,26 @@ def collide(a: FloatArray, b: FloatArray, corners: FloatArray) -> bool:
     reach = a[7] + b[7]
     if not dx * dx + dy * dy < reach * reach:
         return False
-    gap = max(_gap(a, b), _gap(b, a))
-    if abs(gap) > _MARGIN:
-        return gap < 0.0
-    _set_corners(a, corners[0])
-    _set_corners(b, corners[1])
+    # most that are near one another are clearly apart along an axis of the first
+    cos, sin = abs(a[2] * b[2] + a[3] * b[3]), abs(a[2] * b[3] - a[3] * b[2])
+    lon = abs(dx * a[2] + dy * a[3]) - a[5] - b[5] * cos - b[6] * sin
+    lat = abs(dx * a[3] - dy * a[2]) - a[6] - b[5] * sin - b[6] * cos
+    if max(lon, lat) > SLACK:
+        return False
+    box_corners(a[0], a[1], a[4], 2.0 * a[5], 2.0 * a[6], corners[0])
+    box_corners(b[0], b[1], b[4], 2.0 * b[5], 2.0 * b[6], corners[1])
     return convex_intersect(corners[0], corners[1])
-
-
-@kernel
-def _contact_type(
-    state: FloatArray,
-    speed: float,
-    track: FloatArray,
-    track_speed: float,
-    corners: FloatArray,
-    ring: FloatArray,
-) -> int:
-    """Position in `COLLISION_TYPES` of a contact; `ring` (4, 2) is scratch."""
-    if speed <= STOPPED_SPEED:
-        return STOPPED_EGO
-    if track_speed <= STOPPED_SPEED:
-        return STOPPED_TRACK
-    if bearing(state, track[0], track[1]) > BEHIND:
-        return ACTIVE_REAR
-    _set_corners(track, ring)
-    return ACTIVE_FRONT if front_touches(corners, ring) else ACTIVE_LATERAL
 
 
 @kernel
 def _first_contacts(ego: Ego, tracks: FlatTracks, out: Contacts) -> None:
     box, other, scratch = np.empty(BOX_SIZE), np.empty(BOX_SIZE), np.empty((2, 4, 2))
-    poses, sizes = tracks.poses, tracks.sizes
-    num_samples, num_tracks = tracks.valid.shape
+    valid, poses, sizes, first = tracks.valid, tracks.poses, tracks.sizes, out.first
+    num_samples, num_tracks = valid.shape
     for i in range(num_samples):
         set_box(box, ego.centers[i], ego.size[0], ego.size[1])
         for j in range(num_tracks):
-            if not tracks.valid[i, j] or out.first[j] < num_samples:
+            if not valid[i, j] or first[j] < num_samples:
                 continue
             dx, dy = poses[i, j, 0] - box[0], poses[i, j, 1] - box[1]
             reach = box[7] + 0.5 * (sizes[i, j, 0] + sizes[i, j, 1])
@@ -270,7 +234,8 @@ def _first_contacts(ego: Ego, tracks: FlatTracks, out: Contacts) -> None:
             v, w = ego.speeds[i], 0.0
             if not tracks.is_static[j]:
                 w = np.hypot(tracks.velocities[i, j, 0], tracks.velocities[i, j, 1])
-            out.first[j] = i
-            out.types[j] = _contact_type(ego.states[i], v, other, w, ego.corners[i], scratch[0])
+            # `collide` left the corners of the track
+            kind = contact_type(ego.states[i], v, ego.corners[i], other[0], other[1], w, scratch[1])
+            first[j], out.types[j] = i, kind
             angle = ego.states[i, 2] - poses[i, j, 2]
             out.delta_v[j] = 0.5 * np.sqrt(max(0.0, v * v + w * w - 2.0 * v * w * np.cos(angle)))

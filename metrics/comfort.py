@@ -5,14 +5,13 @@ first and last half windows lie on the polynomial fitted to the first or last wi
 shorter than the window lie on one fit altogether.
 """
 
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from shiftsim.errors import DataError
-from shiftsim.geometry.fits import fit_weights
-from shiftsim.kernels import FloatArray, IntArray, kernel
+from shiftsim.geometry.fits import Filter, filter_signal, make_filter
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.metrics.result import (
     MetricPart,
     MetricRow,
@@ -27,16 +26,6 @@ from shiftsim.world.state import AX, AY, HEADING, center_accelerations
 NAME = "ego_is_comfortable"
 MIN_SAMPLES = 4  # the yaw acceleration is a cubic fit
 _SMOOTH_WINDOW, _JERK_WINDOW, _YAW_WINDOW = 8, 15, 5  # samples
-# nuPlan rule 79: an even window is centred half a sample ahead, so that interior output n is the
-# fitted value at n + 1/2, with a jump to the edge fits
-_SMOOTH_INTERIOR = np.array([-3.0, 3.0, 7.0, 9.0, 9.0, 7.0, 3.0, -3.0]) / 32.0
-
-
-class Filter(NamedTuple):
-    """A filter over a window of W samples."""
-
-    interior: FloatArray  # (W,) weights
-    fit: FloatArray  # (W, W) weights of the samples of the first or last window
 
 
 class Filters(NamedTuple):
@@ -135,7 +124,7 @@ def within_bounds(signals: ComfortSignals, thresholds: Thresholds) -> list[bool]
     ]
 
 
-def judge(
+def evaluate(
     signals: ComfortSignals, time_us: IntArray, thresholds: Thresholds
 ) -> tuple[list[MetricPart], MetricPart]:
     """The six unscored signals in the order of `BOUNDED_SIGNALS`, and the comfort score."""
@@ -199,56 +188,16 @@ def _unwrap(angles: FloatArray) -> FloatArray:
 
 def filters_of(count: int) -> Filters:
     """The filters of signals with so many samples."""
-    return _filters_of(min(count, _JERK_WINDOW))
-
-
-@lru_cache
-def _filters_of(count: int) -> Filters:
     windows = (
         (_SMOOTH_WINDOW, 2, 0),
         (_JERK_WINDOW, 2, 1),
         (_YAW_WINDOW, 2, 1),
         (_YAW_WINDOW, 3, 2),
     )
-    smooth, *others = (
-        _with_interior(fit_weights(min(window, count), degree, order))
-        for window, degree, order in windows
-    )
-    if count >= _SMOOTH_WINDOW:
-        smooth = smooth._replace(interior=_SMOOTH_INTERIOR)
-    return Filters(smooth, *others)
-
-
-def _with_interior(fit: FloatArray) -> Filter:
-    return Filter(fit[len(fit) // 2].copy(), fit)
+    return Filters(*(make_filter(min(window, count), *order) for window, *order in windows))
 
 
 def _filtered(values: FloatArray, how: Filter, scale: float) -> FloatArray:
     out = np.empty(len(values))
     filter_signal(values, how, scale, out)
     return out
-
-
-@kernel
-def filter_signal(values: FloatArray, how: Filter, scale: float, out: FloatArray) -> None:
-    """Filter a signal (K,), divide it by `scale`, round it to 8 decimals; `out` (K,) is written.
-
-    Output n is the sum of the samples from n - (W - 1) // 2 on, weighted by the interior; at the
-    edges the fit gives it from the first or last W samples, W <= K.
-    """
-    interior, fit = how.interior, how.fit
-    count, window = len(values), len(fit)
-    half = window // 2
-    for n in range(count):
-        total = 0.0
-        if n < half:
-            for j in range(window):
-                total += fit[n, j] * values[j]
-        elif n >= count - half:
-            for j in range(window):
-                total += fit[n - count + window, j] * values[count - window + j]
-        else:
-            for j in range(window):
-                total += interior[j] * values[n - (window - 1) // 2 + j]
-        # nuPlan rule 81: rounded between smoothing and differentiation, and before comparison
-        out[n] = np.rint(total / scale * 1e8) / 1e8

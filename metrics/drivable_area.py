@@ -40,7 +40,7 @@ def measure(
     return out
 
 
-def judge(
+def evaluate(
     area: DrivableArea, time_us: IntArray, thresholds: Thresholds
 ) -> tuple[MetricPart, MetricPart]:
     """Score with the tolerance on the distance, and the unscored result without it."""
@@ -86,43 +86,11 @@ def _corner_violations(
                     best = _distance_below(edges, route.edges[i, index], x, y, best)
                 if found[corner] >= 0:
                     best = _distance_below(drivable, found[corner], x, y, best)
-                if best == np.inf:
-                    distances[i, corner] = _scan(drivable, x, y, found, corner)
-                else:
-                    distances[i, corner] = _scan_near(drivable, x, y, best, found, corner)
-
-
-@kernel
-def _scan(polygons: Polygons, x: float, y: float, found: IntArray, corner: int) -> float:
-    """Distance of a point from the nearest polygon, whose index goes to `found[corner]` [m]."""
-    best = np.inf
-    for poly in range(len(polygons.bounds)):
-        distance = _distance_below(polygons, poly, x, y, best)
-        if distance < best:
-            best, found[corner] = distance, poly
-    return best
-
-
-@kernel
-def _scan_near(
-    polygons: Polygons, x: float, y: float, limit: float, found: IntArray, corner: int
-) -> float:
-    """The same where the nearest polygon is known to be no farther than `limit`: by the grid."""
-    best = limit
-    x0, y0, cell = polygons.grid[0], polygons.grid[1], polygons.grid[2]
-    first = max(int(np.floor((x - limit - x0) / cell)), 0)
-    last = min(int(np.floor((x + limit - x0) / cell)), polygons.shape[0] - 1)
-    low = max(int(np.floor((y - limit - y0) / cell)), 0)
-    high = min(int(np.floor((y + limit - y0) / cell)), polygons.shape[1] - 1)
-    for ix in range(first, last + 1):
-        for iy in range(low, high + 1):
-            at = ix * polygons.shape[1] + iy
-            for entry in range(polygons.cell_ptr[at], polygons.cell_ptr[at + 1]):
-                poly = polygons.cell_items[entry]
-                distance = _distance_below(polygons, poly, x, y, best)
-                if distance < best:
-                    best, found[corner] = distance, poly
-    return best
+                for poly in range(len(drivable.bounds)):
+                    distance = _distance_below(drivable, poly, x, y, best)
+                    if distance < best:
+                        best, found[corner] = distance, poly
+                distances[i, corner] = best
 
 
 @kernel

@@ -16,8 +16,8 @@ from shiftsim.metrics.result import MetricRow, Statistic
 from shiftsim.metrics.route import EdgeLists, driven_route
 from shiftsim.metrics.score import MULTIPLIERS, WEIGHTS, MetricResult
 from shiftsim.sim.log import SimulationLog
+from shiftsim.world.events import RolloutEvents
 from shiftsim.world.map import NONE, VectorMap
-from shiftsim.world.script import Script
 from shiftsim.world.state import center_poses
 
 LANES = "lane_changes_to_goal"
@@ -52,7 +52,7 @@ class LaneChanges:
 
 
 def role_of(metric: str, sorts: str) -> tuple[str, float | None]:
-    """Role (`multiplier`, `weighted` or empty) and weight of a metric; `sorts` as in `Script`.
+    """Role (`multiplier`, `weighted`, empty) and weight of a metric; `sorts` as in `RolloutEvents`.
 
     nuPlan rule 714: where an obstacle is to be passed, passing it takes the place of the driving
     direction, which then is weighted; beside a pedestrian both are multipliers.
@@ -94,7 +94,7 @@ def final_score(types: Sequence[tuple[int, float]], weights: Sequence[float]) ->
 
 
 def add_interplan(
-    result: MetricResult, log: SimulationLog, road: VectorMap, script: Script
+    result: MetricResult, log: SimulationLog, road: VectorMap, script: RolloutEvents
 ) -> MetricResult:
     """The result with interPlan's metrics and its score.
 
@@ -180,6 +180,11 @@ def simplified(route: EdgeLists) -> list[list[int]]:
         if edges and (not out or set(edges).isdisjoint(out[-1])):
             out.append(edges)
     return out
+
+
+def driven_lanes(road: VectorMap, centers: FloatArray) -> list[int]:
+    """The first edge of each stretch that box centres (K, 3) were on, as nuPlan simplifies it."""
+    return [edges[0] for edges in simplified(driven_route(road, centers))]
 
 
 def changes_between(road: VectorMap, lane: int, goal: int) -> int | None:

@@ -42,7 +42,7 @@ def lane_changes(map: VectorMap, corners: EdgeLists) -> LaneChanges:
     return LaneChanges(states, start, end, failed > 0)
 
 
-def judge(lanes: LaneChanges, time_us: IntArray, thresholds: Thresholds) -> MetricPart:
+def evaluate(lanes: LaneChanges, time_us: IntArray, thresholds: Thresholds) -> MetricPart:
     """Number and duration of the lane changes, and the share that failed."""
     count = len(lanes.start)
     statistics = [Statistic(NAME, f"number_of_{NAME}", "count", "COUNT", float(count))]
@@ -76,41 +76,6 @@ def _in_extended(items: IntArray, count: int, neighbours: Lists, value: int) -> 
 
 
 @kernel
-def _linked(
-    fl: IntArray,
-    rl: IntArray,
-    rr: IntArray,
-    fr: IntArray,
-    size: IntArray,
-    incoming: Lists,
-    outgoing: Lists,
-    out: IntArray,
-) -> int:
-    """Write the edges that connect the lanes of the corners; how many, or -1 for none."""
-    connected = False
-    for index in range(size[1]):
-        connected = connected or _in_extended(rr, size[2], outgoing, rl[index])
-    for index in range(size[2]):
-        connected = connected or _in_extended(rl, size[1], outgoing, rr[index])
-    if not connected:
-        return -1
-    found = 0
-    for index in range(size[2]):
-        first, last = outgoing.ptr[rr[index]], outgoing.ptr[rr[index] + 1]
-        for item in range(first - 1, last):
-            edge = rr[index] if item < first else outgoing.items[item]
-            if (
-                not has(out, found, edge)
-                and _in_extended(fl, size[0], incoming, edge)
-                and _in_extended(fr, size[3], incoming, edge)
-                and _in_extended(rl, size[1], outgoing, edge)
-            ):
-                out[found] = edge
-                found += 1
-    return found if found > 0 else -1
-
-
-@kernel
 def _common(
     lists: IntArray, size: IntArray, incoming: Lists, outgoing: Lists, out: IntArray
 ) -> int:
@@ -127,7 +92,28 @@ def _common(
         if has(rl, size[1], edge) and has(rr, size[2], edge) and has(fr, size[3], edge):
             out[found] = edge
             found += 1
-    return found if found > 0 else _linked(fl, rl, rr, fr, size, incoming, outgoing, out)
+    if found > 0:
+        return found
+    connected = False
+    for index in range(size[1]):
+        connected = connected or _in_extended(rr, size[2], outgoing, rl[index])
+    for index in range(size[2]):
+        connected = connected or _in_extended(rl, size[1], outgoing, rr[index])
+    if not connected:
+        return -1
+    for index in range(size[2]):
+        first, last = outgoing.ptr[rr[index]], outgoing.ptr[rr[index] + 1]
+        for item in range(first - 1, last):
+            edge = rr[index] if item < first else outgoing.items[item]
+            if (
+                not has(out, found, edge)
+                and _in_extended(fl, size[0], incoming, edge)
+                and _in_extended(fr, size[3], incoming, edge)
+                and _in_extended(rl, size[1], outgoing, edge)
+            ):
+                out[found] = edge
+                found += 1
+    return found if found > 0 else -1
 
 
 @kernel

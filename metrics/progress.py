@@ -83,7 +83,7 @@ def _changes(route: EdgeLists) -> BoolArray:
     return changed | (route.counts > 1)
 
 
-def judge(progress: Progress, thresholds: Thresholds) -> tuple[MetricPart, MetricPart]:
+def evaluate(progress: Progress, thresholds: Thresholds) -> tuple[MetricPart, MetricPart]:
     """Score of the progress ratio, and of making progress."""
     floor = thresholds.score_progress
     ego, expert = float(np.sum(progress.ego)), float(np.sum(progress.expert))
@@ -126,7 +126,9 @@ def windowed(progress: FloatArray, time_us: IntArray, horizon: float) -> FloatAr
     return sums
 
 
-def judge_direction(progress: FloatArray, time_us: IntArray, thresholds: Thresholds) -> MetricPart:
+def evaluate_direction(
+    progress: FloatArray, time_us: IntArray, thresholds: Thresholds
+) -> MetricPart:
     """Score 1, 0.5 or 0 by the largest regress within a window."""
     horizon = thresholds.driving_direction_horizon
     sums = windowed(progress, time_us, horizon)

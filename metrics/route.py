@@ -156,13 +156,7 @@ def _driven_route(lanes: Lanes, intersections: Polygons, poses: FloatArray, out:
                     # nuPlan rule 69: an empty selection leaves the list as it was found
                     count = kept if kept > 0 else count
         counts[i] = count
-    _clean_up(lanes, lists, counts)
-    return -1
-
-
-@kernel
-def _clean_up(lanes: Lanes, lists: IntArray, counts: IntArray) -> None:
-    """Narrow the list of each sample down by that of the next one, from the end on."""
+    # then the list of each sample is narrowed down by that of the next one, from the end on
     for i in range(len(counts) - 2, -1, -1):
         if counts[i] < 2:
             continue
@@ -188,6 +182,7 @@ def _clean_up(lanes: Lanes, lists: IntArray, counts: IntArray) -> None:
                     lists[i, kept] = original[index]
                     kept += 1
             counts[i] = kept if kept > 0 else counts[i]
+    return -1
 
 
 @kernel

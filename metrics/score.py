@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shiftsim.errors import DataError
-from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.metrics import (
     collision,
     comfort,
@@ -103,7 +103,7 @@ class MetricResult:
 
 
 def measure(log: SimulationLog, map: VectorMap) -> Measurements:
-    """Measure one rollout; `judge` applies thresholds to the result.
+    """Measure one rollout; `evaluate` applies thresholds to the result.
 
     Args:
         log: The rollout.
@@ -144,7 +144,7 @@ def measure(log: SimulationLog, map: VectorMap) -> Measurements:
     )
 
 
-def judge(measurements: Measurements, thresholds: str | Thresholds = "nuplan") -> MetricResult:
+def evaluate(measurements: Measurements, thresholds: str | Thresholds = "nuplan") -> MetricResult:
     """Apply one threshold profile to a measured rollout."""
     profile = thresholds_of(thresholds)
     parts = _parts(measurements, profile)
@@ -180,21 +180,21 @@ def closed_loop_score(scores: Mapping[str, float | None]) -> float:
 
 
 def _parts(m: Measurements, profile: Thresholds) -> list[MetricPart]:
-    signals, comfortable = comfort.judge(m.comfort, m.time_us, profile)
-    along, making = progress.judge(m.progress, profile)
-    area, corners = drivable_area.judge(m.drivable, m.time_us, profile)
+    signals, comfortable = comfort.evaluate(m.comfort, m.time_us, profile)
+    along, making = progress.evaluate(m.progress, profile)
+    area, corners = drivable_area.evaluate(m.drivable, m.time_us, profile)
     return [
-        lane_change.judge(m.lanes, m.time_us, profile),
+        lane_change.evaluate(m.lanes, m.time_us, profile),
         *signals,
         along,
         area,
         corners,
-        collision.judge(m.collisions, profile),
-        time_to_collision.judge(m.ttc, m.time_us, profile),
-        speed_limit.judge(m.overspeed, m.time_us, profile),
+        collision.evaluate(m.collisions, profile),
+        time_to_collision.evaluate(m.ttc, m.time_us, profile),
+        speed_limit.evaluate(m.overspeed, m.time_us, profile),
         comfortable,
         making,
-        progress.judge_direction(m.lane_progress, m.time_us, profile),
+        progress.evaluate_direction(m.lane_progress, m.time_us, profile),
     ]
 
 
@@ -218,23 +218,13 @@ def _check(log: SimulationLog, tracks: collision.FlatTracks) -> None:
             raise DataError(
                 f"{where}: {name} {STATE_COLUMNS[column]} at sample {row} is not finite"
             )
-    row, column = find_broken(tracks)
-    if row >= 0:
+    poses, sizes = tracks.poses, tracks.sizes
+    # not finite as soon as one of them is
+    total = poses[..., 0] + poses[..., 1] + poses[..., 2] + sizes[..., 0] + sizes[..., 1]
+    is_broken = tracks.valid & ~np.isfinite(total)
+    if is_broken.any():
+        row, column = (int(i) for i in np.argwhere(is_broken)[0])
         raise DataError(
             f"{where}: track {log.tracks.tokens[column]!r} at sample {row} has a pose or size "
             "that is not finite"
         )
-
-
-@kernel
-def find_broken(tracks: collision.FlatTracks) -> tuple[int, int]:
-    """Sample and track of the first pose or size that is not finite; -1, -1 where all are."""
-    poses, sizes = tracks.poses, tracks.sizes
-    for row in range(tracks.valid.shape[0]):
-        for column in range(tracks.valid.shape[1]):
-            # not finite as soon as one of them is
-            total = poses[row, column, 0] + poses[row, column, 1] + poses[row, column, 2]
-            total += sizes[row, column, 0] + sizes[row, column, 1]
-            if tracks.valid[row, column] and not np.isfinite(total):
-                return row, column
-    return -1, -1

@@ -37,7 +37,7 @@ def overspeed(map: VectorMap, route: EdgeLists, speed: FloatArray) -> FloatArray
     return np.where(over > 0.0, over, 0.0)  # NaN: no limit
 
 
-def judge(over: FloatArray, time_us: IntArray, thresholds: Thresholds) -> MetricPart:
+def evaluate(over: FloatArray, time_us: IntArray, thresholds: Thresholds) -> MetricPart:
     """Score by the over-speed integrated over the rollout."""
     score, violation = 1.0, first_violation(over > 0.0, over, time_us)
     if violation is not None:

@@ -14,7 +14,6 @@ from shiftsim.metrics.collision import (
     FlatTracks,
     collide,
     set_box,
-    set_size,
 )
 from shiftsim.metrics.result import (
     Collision,
@@ -36,9 +35,6 @@ HORIZON = 3.0  # s
 _NUM_TESTS = 29
 # nuPlan rule 64: the ego stands below a tenth of the speed that counts for collisions
 _STOPPED_SPEED = 5e-3  # m/s
-_AHEAD, _BESIDE, _BEHIND = range(3)
-_WELL_AHEAD = float(np.cos(AHEAD)) + 1e-9  # more than rounding can change a cosine by
-_WELL_BESIDE = float(np.cos(AHEAD)) - 1e-9  # likewise, and of the angle behind with a minus
 
 
 class TimeToCollision(NamedTuple):
@@ -69,7 +65,7 @@ def time_to_collision(
     return TimeToCollision(values, partners, named.tokens)
 
 
-def judge(ttc: TimeToCollision, time_us: IntArray, thresholds: Thresholds) -> MetricPart:
+def evaluate(ttc: TimeToCollision, time_us: IntArray, thresholds: Thresholds) -> MetricPart:
     """Score 1 where the bound is exceeded at every sample."""
     bound = thresholds.least_min_ttc
     lowest = float(ttc.values.min())
@@ -101,9 +97,10 @@ def _time_to_collision(
     """Write the time to collision of every sample."""
     speeds, poses, sizes = ego.speeds, tracks.poses, tracks.sizes
     num_samples, num_tracks = tracks.valid.shape
+    valid, is_static, velocities = tracks.valid, tracks.is_static, tracks.velocities
     boxes, steps = np.empty((num_tracks + 1, BOX_SIZE)), np.empty((num_tracks + 1, 2))
-    kept, swept = np.empty(num_tracks, np.int64), np.empty((2, BOX_SIZE))
-    scratch = np.empty((2, 4, 2))
+    listed, scratch, own = np.empty(num_tracks, np.int64), np.empty((2, 4, 2)), boxes[0]
+    own_swept, swept = np.empty(BOX_SIZE), np.empty(BOX_SIZE)
     for i in range(num_samples):
         ttc[i] = np.inf
         if partners[i] >= 0:
@@ -112,26 +109,29 @@ def _time_to_collision(
         if speeds[i] <= _STOPPED_SPEED:
             continue
         num, beside = 0, 0  # beside: 0 not asked yet, 1 tracks beside count, -1 they do not
-        set_box(boxes[0], ego.centers[i], ego.size[0], ego.size[1])
-        _set_step(boxes[0], speeds[i], steps[0])
-        _stretch(boxes[0], speeds[i], swept[0])
-        x, y, cos, sin = ego.states[i, 0], ego.states[i, 1], boxes[0, 2], boxes[0, 3]
-        middle_x, middle_y, lon, lat = swept[0, 0], swept[0, 1], swept[0, 5], swept[0, 6]
+        set_box(own, ego.centers[i], ego.size[0], ego.size[1])
+        # nuPlan rule 66: along the heading, whatever the direction of the velocity
+        steps[0, 0] = own[2] * speeds[i] * STEP
+        steps[0, 1] = own[3] * speeds[i] * STEP
+        _stretch(own, speeds[i], own_swept)
+        x, y, cos, sin = ego.states[i, 0], ego.states[i, 1], own[2], own[3]
+        middle_x, middle_y, lon, lat = own_swept[0], own_swept[1], own_swept[5], own_swept[6]
         for j in range(num_tracks):
-            if not tracks.valid[i, j] or first[j] <= i:
+            if not valid[i, j] or first[j] <= i:
                 continue
-            vx = 0.0 if tracks.is_static[j] else tracks.velocities[i, j, 0]
-            vy = 0.0 if tracks.is_static[j] else tracks.velocities[i, j, 1]
+            vx = 0.0 if is_static[j] else velocities[i, j, 0]
+            vy = 0.0 if is_static[j] else velocities[i, j, 1]
             # generous: what is elongated and further away than this cannot touch
             reach = 0.5 * (sizes[i, j, 0] + sizes[i, j, 1]) + HORIZON * np.sqrt(vx * vx + vy * vy)
             reach += SLACK
             dx, dy = poses[i, j, 0] - middle_x, poses[i, j, 1] - middle_y
             if abs(dx * cos + dy * sin) > lon + reach or abs(dx * sin - dy * cos) > lat + reach:
                 continue
-            place = _place(bearing_cosine(cos, sin, poses[i, j, 0] - x, poses[i, j, 1] - y))
-            if place == _BEHIND:
+            cosine = bearing_cosine(cos, sin, poses[i, j, 0] - x, poses[i, j, 1] - y)
+            angle = np.arccos(cosine)  # beside where it is NaN
+            if angle > BEHIND:
                 continue
-            if place == _BESIDE:
+            if not angle < AHEAD:
                 if beside == 0:
                     # nuPlan rule 65: tracks beside the ego count between lanes and in intersections
                     beside = 1 if not is_common[i] or in_any(intersections, x, y) else -1
@@ -140,36 +140,29 @@ def _time_to_collision(
             box = boxes[num + 1]
             set_box(box, poses[i, j], sizes[i, j, 0], sizes[i, j, 1])
             speed = np.hypot(vx, vy)
-            _stretch(box, speed, swept[1])
-            if collide(swept[0], swept[1], scratch):
-                _set_step(box, speed, steps[num + 1])
-                kept[num] = j
+            _stretch(box, speed, swept)
+            if collide(own_swept, swept, scratch):
+                steps[num + 1, 0], steps[num + 1, 1] = box[2] * speed * STEP, box[3] * speed * STEP
+                listed[num] = j
                 num += 1
-        hit = _first_hit(boxes[: num + 1], steps, scratch)
-        if hit[0] > 0:
-            # nuPlan rule 63: times are numpy's arange, whose values are multiples of the step
-            ttc[i], partners[i] = STEP * hit[0], kept[hit[1]]
-
-
-@kernel
-def _place(cosine: float) -> int:
-    """Where a track is whose bearing from the ego has this cosine; beside where it has none."""
-    # most often without an arc cosine
-    if _WELL_AHEAD < cosine <= 1.0:
-        return _AHEAD
-    if abs(cosine) < _WELL_BESIDE:
-        return _BESIDE
-    angle = np.arccos(cosine)
-    if angle < AHEAD:
-        return _AHEAD
-    return _BEHIND if angle > BEHIND else _BESIDE
-
-
-@kernel
-def _set_step(box: FloatArray, speed: float, step: FloatArray) -> None:
-    # nuPlan rule 66: along the heading, whatever the direction of the velocity
-    step[0] = box[2] * speed * STEP
-    step[1] = box[3] * speed * STEP
+        hit = 0
+        for k in range(1, _NUM_TESTS + 1 if num > 0 else 1):
+            # nuPlan rule 67: positions accumulate rounding step by step
+            own[0] += steps[0, 0]
+            own[1] += steps[0, 1]
+            for index in range(1, num + 1):
+                boxes[index, 0] += steps[index, 0]
+                boxes[index, 1] += steps[index, 1]
+                dx, dy = boxes[index, 0] - own[0], boxes[index, 1] - own[1]
+                reach = own[7] + boxes[index, 7]
+                # most are too far away, which is decided without a call
+                if dx * dx + dy * dy <= reach * reach and collide(own, boxes[index], scratch):
+                    hit = index
+                    break
+            if hit > 0:
+                # nuPlan rule 63: times are numpy's arange, whose values are multiples of the step
+                ttc[i], partners[i] = STEP * k, listed[hit - 1]
+                break
 
 
 @kernel
@@ -180,24 +173,5 @@ def _stretch(box: FloatArray, speed: float, out: FloatArray) -> None:
         out[index] = box[index]
     out[0] += 0.5 * distance * box[2]
     out[1] += 0.5 * distance * box[3]
-    set_size(out, 2.0 * box[5] + distance, 2.0 * box[6])
-
-
-@kernel
-def _first_hit(boxes: FloatArray, steps: FloatArray, scratch: FloatArray) -> tuple[int, int]:
-    """First step at which box 0 meets another, and which; 0 when none does. Moves the boxes."""
-    if len(boxes) < 2:
-        return 0, 0
-    for k in range(1, _NUM_TESTS + 1):
-        # nuPlan rule 67: positions accumulate rounding step by step
-        boxes[0, 0] += steps[0, 0]
-        boxes[0, 1] += steps[0, 1]
-        for index in range(1, len(boxes)):
-            boxes[index, 0] += steps[index, 0]
-            boxes[index, 1] += steps[index, 1]
-            dx, dy = boxes[index, 0] - boxes[0, 0], boxes[index, 1] - boxes[0, 1]
-            reach = boxes[0, 7] + boxes[index, 7]
-            # most are too far away, which is told without a call
-            if dx * dx + dy * dy <= reach * reach and collide(boxes[0], boxes[index], scratch):
-                return k, index - 1
-    return 0, 0
+    length, width = 2.0 * box[5] + distance, 2.0 * box[6]
+    out[5], out[7] = 0.5 * length, 0.5 * np.sqrt(length * length + width * width)

@@ -17,7 +17,7 @@ import numpy as np
 from shiftsim.files import place_of
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.kernels import FloatArray, IntArray
-from shiftsim.planners.original import Original
+from shiftsim.planners.prototype import PlannerPrototype
 from shiftsim.sim.loop import Rollout
 from shiftsim.sim.plan_check import FAR, SHORT, find_fault, is_short
 from shiftsim.world.scenario import Scenario
@@ -75,26 +75,26 @@ def check_planner(planner: Any, scenario: Scenario, other: Scenario | None = Non
 
     Example:
         ```python
-        scenario = shiftsim.open_store("demo")["03b23c"]
+        scenario = shiftsim.open_store("demo")["01f13e"]
         for found in shiftsim.check_planner(shiftsim.load_planner("idm"), scenario):
             print(found.severity, found.message)
         ```
     """
     findings: list[Finding] = []
     is_made = isinstance(planner, type) or not hasattr(planner, "plan")
-    subject = _make(planner, findings) if is_made else planner
-    if subject is None or not _has_methods(subject, findings):
+    candidate = _make(planner, findings) if is_made else planner
+    if candidate is None or not _has_methods(candidate, findings):
         return findings
-    copy = _second(planner if is_made else None, subject, findings)
-    original = Original(lambda: subject)
+    copy = _second(planner if is_made else None, candidate, findings)
+    prototype = PlannerPrototype(lambda: candidate)
     seconds: list[float] = []
-    first = _drive(subject, scenario, findings, seconds=seconds)
+    first = _drive(candidate, scenario, findings, seconds=seconds)
     if first is not None:
-        _check_repeats(subject, copy, first, scenario, findings)
+        _check_repeats(candidate, copy, first, scenario, findings)
         if other is not None and not any(found.severity == "error" for found in findings):
-            _check_company(original, first, scenario, other, findings)
+            _check_company(prototype, first, scenario, other, findings)
         findings.append(_run_time(np.array(seconds[1:] or seconds)))
-    once = dict.fromkeys(findings)  # what holds of every drive is said once
+    once = dict.fromkeys(findings)  # what holds of every drive is listed once
     return sorted(once, key=lambda found: ("error", "warning", "note").index(found.severity))
 
 
@@ -162,7 +162,9 @@ def _drive(
             if seconds is not None:
                 seconds.append(perf_counter() - began)
             plans.append(plan)
-            found = _judge(plan, observation.ego.values, scenario.iteration_times[len(plans) - 1 :])
+            found = _check_plan(
+                plan, observation.ego.values, scenario.iteration_times[len(plans) - 1 :]
+            )
             if found is not None and found.check not in seen:  # the others look the same
                 seen.add(found.check)
                 where = f"iteration {observation.iteration}: {found.message}"
@@ -186,7 +188,7 @@ def _drive(
     return plans
 
 
-def _judge(plan: object, ego: FloatArray, times: IntArray) -> Finding | None:
+def _check_plan(plan: object, ego: FloatArray, times: IntArray) -> Finding | None:
     """What is wrong with one plan of an ego (11,), at the first of the times [us]."""
     now_us = int(times[0])
     fault = find_fault(plan, now_us, int(times[1]))
@@ -240,33 +242,37 @@ def _check_start(plan: Trajectory, now_us: int, ego: FloatArray) -> Finding | No
 def _check_repeats(
     planner: Any, copy: Any, first: Plans, scenario: Scenario, findings: list[Finding]
 ) -> None:
-    for subject, check, text in (
+    for candidate, check, text in (
         (copy, "deterministic", "two planners of the same make differ"),
         (planner, "survives reset", "after a reset the planner differs"),
     ):
-        again = None if subject is None else _drive(subject, scenario, findings, calls=CALLS)
-        if again is not None and (where := _first_difference(first, again)) is not None:
+        repeated = None if candidate is None else _drive(candidate, scenario, findings, calls=CALLS)
+        if repeated is not None and (where := _first_difference(first, repeated)) is not None:
             findings.append(_error(check, f"{text} at iteration {where}"))
             return
 
 
 def _check_company(
-    original: Original, first: Plans, scenario: Scenario, other: Scenario, findings: list[Finding]
+    prototype: PlannerPrototype,
+    first: Plans,
+    scenario: Scenario,
+    other: Scenario,
+    findings: list[Finding],
 ) -> None:
     """Drive another scenario, then the same one again, as a worker would."""
     elsewhere: list[Finding] = []
-    _drive(original.copy(), other, elsewhere)
+    _drive(prototype.copy(), other, elsewhere)
     findings.extend(
         replace(found, message=f"scenario {other.token}, {found.message}")
         for found in elsewhere
         if found.check not in {known.check for known in findings}
     )
     failed: list[Finding] = []
-    again = _drive(original.copy(), scenario, failed)
-    if again is None:
+    repeated = _drive(prototype.copy(), scenario, failed)
+    if repeated is None:
         text = f"after scenario {other.token}, {failed[-1].message}"
         findings.append(_error("company", text))
-    elif (where := _first_difference(first, again)) is not None:
+    elif (where := _first_difference(first, repeated)) is not None:
         text = f"after scenario {other.token} the planner differs at iteration {where}"
         findings.append(_error("company", text))
 

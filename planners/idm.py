@@ -10,21 +10,20 @@ import shapely
 
 from shiftsim.errors import PlannerError
 from shiftsim.geometry.boxes import box_corners, boxes_to_corners, wrap_angle
-from shiftsim.geometry.polylines import CLEAR, HIT, OPEN, Path, corridor_polygon, pose_at
-from shiftsim.kernels import FloatArray, IntArray, kernel
-from shiftsim.planners.routes.corridor import (
-    MET,
-    UNKNOWN,
-    Index,
-    Objects,
-    Survey,
-    find_lead,
-    find_sides,
-    is_tied,
-    lead_speed,
-    make_survey,
-    start_survey,
+from shiftsim.geometry.corridor import (
+    BAND,
+    CLEAR,
+    HIT,
+    UNDECIDED,
+    Corridor,
+    corridor_polygon,
+    line_distance,
+    occupancy,
+    without_repeats,
 )
+from shiftsim.geometry.polylines import RUN, Path, bound_runs, pose_at
+from shiftsim.geometry.rings import SLACK, ring_bounds, rings_touch
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.planners.routes.graph import (
     HINT,
     LanePath,
@@ -34,6 +33,14 @@ from shiftsim.planners.routes.graph import (
     lanes_of,
     search_levels,
     sub_path,
+)
+from shiftsim.planners.routes.lead import (
+    OVERLAPPING,
+    UNKNOWN,
+    Objects,
+    find_lead,
+    keep_one_overlap,
+    make_objects,
 )
 from shiftsim.planners.routes.lights import LightWatch, RedLights
 from shiftsim.sim.dynamics.idm import idm_acceleration
@@ -127,20 +134,6 @@ def build_path(road: VectorMap, lanes: list[int]) -> LanePath:
     return path
 
 
-def exact_sides(
-    line: FloatArray, half_width: float, footprint: FloatArray, objects: Objects, unsure: list[int]
-) -> list[int]:
-    """HIT or CLEAR for each of some OPEN objects, by the polygon nuPlan uses.
-
-    The corridor is the stretch of path (K, 3), buffered by `half_width` [m], and the `footprint`
-    (4, 2) of the ego.
-    """
-    corridor = corridor_polygon(shapely.LineString(line[:, :2]), half_width)
-    corridor = corridor.union(shapely.Polygon(footprint))
-    rings = (objects.xy[objects.ptr[index] : objects.ptr[index + 1]] for index in unsure)
-    return [HIT if corridor.intersects(shapely.Polygon(ring)) else CLEAR for ring in rings]
-
-
 class Policy(NamedTuple):
     """What drives along the path."""
 
@@ -221,23 +214,28 @@ class Idm:
         red = self._lights.at(observation.lights)
         objects = objects_around(observation.history.tracks, centers[0], red)
         count = len(objects.speeds)
-        survey = make_survey(path.driven, 0.5 * policy.width, count)
-        sides, footprint = np.full((STEPS, count), UNKNOWN), np.empty((4, 2))
-        step, tree = 0, Index(objects)
+        apart, footprint = np.empty(count), np.empty((4, 2))
+        known, step = np.full((STEPS, count), UNKNOWN), 0
+        trees: dict[tuple[int, ...], shapely.STRtree] = {}
         while True:
             step, lead = _roll_on(
-                step, path.driven, objects, policy, centers, motion, survey, sides, footprint
+                step, path.driven, objects, policy, centers, motion, apart, known, footprint
             )
             if lead == _DONE:
                 break
-            unsure = np.flatnonzero(sides[step] == OPEN).tolist() if lead == _TIED else [lead]
-            if unsure:
-                line = _look_ahead(path.driven, motion[step, 0], self.target_velocity)
-                half_width = 0.5 * policy.width
-                sides[step, unsure] = exact_sides(line, half_width, footprint, objects, unsure)
+            unsure = np.flatnonzero(known[step] == UNDECIDED) if lead == _TIED else [lead]
+            if len(unsure):
+                line = sub_path(path.driven, *_reach(path.driven, motion[step, 0], policy))
+                corridor = corridor_polygon(shapely.LineString(line[:, :2]), 0.5 * policy.width)
+                corridor = corridor.union(shapely.Polygon(footprint))
+            for index in unsure:
+                ring = objects.xy[objects.ptr[index] : objects.ptr[index + 1]]
+                touches = corridor.intersects(shapely.Polygon(ring))
+                known[step, index] = HIT if touches else CLEAR
             if lead == _TIED:
-                tree.settle(sides[step], footprint)
-        centers[0] = _pose(path.driven, start)
+                keep_one_overlap(objects, known[step], footprint, trees)
+        centers[0] = pose_at(path.driven, start)
+        centers[0, 2] = wrap_angle(centers[0, 2])
         return centers, motion[:, 1]
 
     def _make_path(self, scene: SceneInfo, observation: Observation) -> LanePath:
@@ -273,7 +271,7 @@ def objects_around(tracks: Tracks, center: FloatArray, red: RedLights) -> Object
     speeds = np.hypot(velocities[:, 0], velocities[:, 1])
     speeds[tracks.kinds[near] > LAST_AGENT_KIND] = 0.0
     count, nothing = len(near), np.zeros(len(red.lanes))
-    return Objects(
+    return make_objects(
         np.concatenate([boxes_to_corners(poses, sizes).reshape(-1, 2), red.xy]),
         np.concatenate([4 * np.arange(count), 4 * count + red.ptr]),
         np.concatenate([poses[:, 2], nothing]),
@@ -281,23 +279,12 @@ def objects_around(tracks: Tracks, center: FloatArray, red: RedLights) -> Object
     )
 
 
-def _look_ahead(path: Path, progress: float, target: float) -> FloatArray:
-    """(K, 3) the stretch of path that the ego would cover at its target velocity."""
-    stretch: FloatArray = sub_path(path, *_reach(path, progress, target))
-    return stretch
-
-
 @kernel
-def _reach(path: Path, progress: float, target: float) -> tuple[float, float]:
-    """Progress at the start and at the end of the stretch that would be covered [m]."""
+def _reach(path: Path, progress: float, policy: Policy) -> tuple[float, float]:
+    """Progress at the ends of the stretch that would be covered at the target velocity [m]."""
     end = path.progress[-1]
-    return min(max(progress, 0.0), end), min(max(progress + abs(target) * HORIZON, 0.0), end)
-
-
-@kernel
-def _pose(path: Path, progress: float) -> tuple[float, float, float]:
-    x, y, heading = pose_at(path, progress)
-    return x, y, wrap_angle(heading)
+    ahead = progress + abs(policy.target_velocity) * HORIZON
+    return min(max(progress, 0.0), end), min(max(ahead, 0.0), end)
 
 
 @kernel
@@ -311,6 +298,12 @@ def _accelerate(policy: Policy, speed: float, gap: float, speed_ahead: float) ->
 
 
 @kernel
+def _speed_along(objects: Objects, index: int, heading: float) -> float:
+    """Speed of an object along a heading [m/s]."""
+    return objects.speeds[index] * np.cos(wrap_angle(objects.headings[index] - heading))
+
+
+@kernel
 def _roll_on(
     first: int,  # row that is known
     path: Path,
@@ -318,43 +311,67 @@ def _roll_on(
     policy: Policy,
     centers: FloatArray,  # (17, 3) box centres x [m], y [m], heading [rad]
     motion: FloatArray,  # (17, 2) progress [m] and speed [m/s]
-    survey: Survey,
-    sides: IntArray,  # (16, M) side of every object at every step, decided as far as needed
+    apart: FloatArray,  # (M,) distances of the objects from the path, inf where they are far [m]
+    known: IntArray,  # (16, M) what every object is to the corridor at every step, or UNKNOWN
     footprint: FloatArray,  # (4, 2) receives the corners of the ego in the row returned [m]
 ) -> tuple[int, int]:
     """Fill the rows behind `first` until the end, or until it is open what the lead is.
 
     Returns:
-        The row, and the OPEN object to decide, _TIED where several are touched, or _DONE.
+        The row, and the UNDECIDED object to decide, _TIED where several are touched, or _DONE.
     """
-    length, width, target = policy.length, policy.width, policy.target_velocity
-    ends, accels = np.empty((4, 2)), np.empty(len(objects.speeds))
+    length, half_width, count = policy.length, 0.5 * policy.width, len(objects.speeds)
+    xy, ptr = objects.xy, objects.ptr
+    radius = 0.5 * np.hypot(length, policy.width) + SLACK  # of the footprint, which is on the path
+    reach = 1.5 * (1.0 + BAND) * half_width  # of the corridor, the corners of its ends included
     if first == 0:
-        start_survey(survey, path, objects, motion[0, 0] + STEP * min(motion[0, 1], 0.0))
+        # objects stand still: what is far from the whole path is far from every stretch of it
+        progress = motion[0, 0] + STEP * min(motion[0, 1], 0.0)
+        begin = max(min(np.searchsorted(path.progress, progress), len(path.xy) - 1) - 1, 0)
+        ahead = Corridor(path.xy, path.runs, begin, len(path.xy), half_width)
+        for index in range(count):
+            ring = xy[ptr[index] : ptr[index + 1]]
+            apart[index] = line_distance(ahead, ring, ring_bounds(ring), 0.0, max(radius, reach))
     for step in range(first, STEPS):
-        x, y, heading = centers[step, 0], centers[step, 1], centers[step, 2]
-        progress, speed = motion[step, 0], motion[step, 1]
-        box_corners(x, y, heading, length, width, footprint)
-        low, high = _reach(path, progress, target)
-        find_sides(path, low, high, footprint, objects, survey, ends, sides[step])
+        progress, speed, heading = motion[step, 0], motion[step, 1], centers[step, 2]
+        box_corners(centers[step, 0], centers[step, 1], heading, length, policy.width, footprint)
+        low, high = _reach(path, progress, policy)
+        poses = sub_path(path, low, high)
+        line, runs = np.empty((len(poses), 2)), np.empty(((len(poses) - 2) // RUN + 1, 4))
+        for vertex in range(len(poses)):
+            line[vertex, 0], line[vertex, 1] = poses[vertex, 0], poses[vertex, 1]
+        bound_runs(line, runs)
+        begin, end = without_repeats(line, 0, len(line))
+        corridor = Corridor(line, runs, begin, end, half_width)
+        for index in range(count):
+            if known[step, index] != UNKNOWN:
+                continue
+            known[step, index] = CLEAR
+            if step > 0 and apart[index] > radius and apart[index] > reach:
+                continue
+            ring = xy[ptr[index] : ptr[index + 1]]
+            if rings_touch(footprint, ring):
+                known[step, index] = OVERLAPPING
+            elif apart[index] <= reach:
+                known[step, index] = occupancy(corridor, ring, True)
         # nuPlan rule 158: all objects stand still during the roll-out; their speeds count only here
-        lead, gap = find_lead(footprint, objects, survey.bounds, sides[step])
+        lead, gap = find_lead(footprint, objects, known[step])
         if lead < 0:
             accel = _accelerate(policy, speed, path.progress[-1] - progress - 0.5 * length, 0.0)
-        elif sides[step, lead] == OPEN:
+        elif known[step, lead] == UNDECIDED:
             return step, lead
         else:
-            accel = _accelerate(policy, speed, gap, lead_speed(objects, lead, heading))
-        if lead >= 0 and sides[step, lead] == MET:
-            for index in range(len(accels)):
-                if sides[step, index] == MET:
-                    speed_ahead = lead_speed(objects, index, heading)
-                    accels[index] = _accelerate(policy, speed, gap, speed_ahead)
+            accel = _accelerate(policy, speed, gap, _speed_along(objects, lead, heading))
+        if lead >= 0 and known[step, lead] == OVERLAPPING:
             # most often the ego brakes as hard as it can for each of them
-            if is_tied(sides[step], accels, lead):
-                return step, _TIED
+            for index in range(lead + 1, count):
+                if known[step, index] == OVERLAPPING:
+                    speed_ahead = _speed_along(objects, index, heading)
+                    if _accelerate(policy, speed, gap, speed_ahead) != accel:
+                        return step, _TIED
         motion[step + 1, 0] = progress + STEP * speed
         motion[step + 1, 1] = max(0.0, speed + STEP * accel)
-        x, y, heading = _pose(path, motion[step + 1, 0])
-        centers[step + 1, 0], centers[step + 1, 1], centers[step + 1, 2] = x, y, heading
+        x, y, heading = pose_at(path, motion[step + 1, 0])
+        centers[step + 1, 0], centers[step + 1, 1] = x, y
+        centers[step + 1, 2] = wrap_angle(heading)
     return STEPS, _DONE

@@ -5,18 +5,17 @@ NumPy alone. What it computes is the same, and so are the scores.
 """
 
 import os
-import subprocess
 import sys
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from shiftsim.errors import PlannerError
 from shiftsim.planners import stub
-from shiftsim.planners.original import Original
+from shiftsim.planners.prototype import PlannerPrototype
 from shiftsim.planners.registry import load_planner, planner_fingerprint
+from shiftsim.processes import Process
 from shiftsim.sim import planner as interface
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world import layers, state
@@ -29,7 +28,6 @@ _GIVEN = (
     *(layers.Layer, layers.Polygons, layers.Polylines, layers.Lists),
     *(state.Tracks, state.TrafficLights, state.VehicleParameters),
 )
-_PATIENCE = 5.0  # s, for a planner to release what it holds
 _RETURNED = {kind.__name__: kind for kind in (Trajectory, Command)}
 
 
@@ -45,7 +43,7 @@ class Isolated:
         """
         self.name, self.degraded = spec, ""
         self._given = (spec, dict(arguments), python)
-        self._process: Any = None
+        self._process: Process | None = None
         self._map: VectorMap | None = None
         self._about: Any = None
 
@@ -70,18 +68,17 @@ class Isolated:
 
     def _started(self) -> Any:
         """What the child says of its planner; it is started where there is none."""
-        if self._process is not None and self._process.poll() is None:
+        if self._process is not None and self._process.popen.poll() is None:
             return self._about
         self.close()
         self._map = None
         spec, arguments, python = self._given
-        words = [python or sys.executable, stub.__file__, str(os.getpid())]
-        pipe = subprocess.PIPE
+        interpreter = python or sys.executable
         try:
-            self._process = subprocess.Popen(words, stdin=pipe, stdout=pipe, process_group=0)
+            self._process = Process([interpreter, stub.__file__])
         except OSError as error:
             raise PlannerError(
-                f"planner {spec!r}: {words[0]!r} cannot be started ({error.strerror})",
+                f"planner {spec!r}: {interpreter!r} cannot be started ({error.strerror})",
                 hint="--planner-python takes the path of a Python interpreter",
             ) from error
         plain = {name: str(v) if isinstance(v, Path) else v for name, v in arguments.items()}
@@ -114,15 +111,15 @@ class Isolated:
         return plan
 
     def _ask(self, verb: str, value: object) -> Any:
+        process = self._process
+        assert process is not None
         try:
-            stub.write(self._process.stdin, (verb, value))
-            state, answer = stub.read(self._process.stdout, _RETURNED)
-        except (OSError, EOFError, ValueError) as error:
-            self._process.kill()
-            code = self._process.wait()
-            end = f"by signal {-code}" if code < 0 else f"with code {code}"
+            stub.write(process.connection, (verb, value))
+            state, answer = stub.read(process.connection, _RETURNED)
+        except (OSError, EOFError, TypeError, ValueError) as error:
+            process.kill()
             raise PlannerError(
-                f"the process of planner {self.name!r} ended {end}",
+                f"the process of planner {self.name!r} {process.end()}",
                 hint="what it wrote to the standard error may say why",
             ) from error
         if state == "failed":
@@ -135,16 +132,8 @@ class Isolated:
     def close(self) -> None:
         """End the process, once its planner has released what it holds."""
         process, self._process = self._process, None
-        if process is None:
-            return
-        with suppress(OSError):  # of what is still to be written
-            process.stdin.close()
-        try:
-            process.wait(_PATIENCE)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        process.stdout.close()
+        if process is not None:
+            process.end()
 
     def __del__(self) -> None:
         if self._process is not None:
@@ -154,6 +143,6 @@ class Isolated:
 def at_home(hello: Mapping[str, Any]) -> tuple[Any, dict[str, Any], dict[str, Any]]:
     """In the child: what makes planners, the classes of what they are given, and a fingerprint."""
     spec, arguments = hello["spec"], hello["arguments"]
-    original = Original(lambda: load_planner(spec, arguments))
+    prototype = PlannerPrototype(lambda: load_planner(spec, arguments))
     classes = {kind.__name__: kind for kind in _GIVEN}
-    return original.copy, classes, planner_fingerprint(spec, arguments)
+    return prototype.copy, classes, planner_fingerprint(spec, arguments)

@@ -14,7 +14,7 @@ import sys
 import types
 import typing
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -73,7 +73,7 @@ def planner_factory(spec: str) -> Any:
 
     Raises:
         ConfigError: There is none.
-        MissingExtraError: It needs more of nuPlan's devkit than its stand-ins have.
+        MissingExtraError: It needs more of nuPlan's devkit than its shims have.
     """
     for prefix, adapter in _ADAPTERS.items():
         if spec.startswith(prefix):
@@ -167,11 +167,24 @@ class RunPlanner:
     fingerprint: Mapping[str, Any]  # all that tells it from another planner, as JSON values
     in_batches: bool = False  # whether it answers for several scenarios at once
     ask: Any = None  # of `LearnedPlanner.asking`, where another process has the network
+    # the instance that was made to check the planner, until it is used; stays in this process
+    first: list[Planner] = field(default_factory=list, compare=False)
+
+    def __reduce__(self) -> Any:
+        given = (self.name, self.source, self.arguments, self.fingerprint)
+        return RunPlanner, (*given, self.in_batches, self.ask)
+
+    def close(self) -> None:
+        """Let the instance of the check release what it holds, where nobody has used it."""
+        while self.first:
+            close_planner(self.first.pop())
 
     def make(self) -> Planner:
-        """An instance of its own for one worker."""
+        """An instance of its own for one process."""
         if self.ask is not None:
             return cast(Planner, planner_factory(self.source).asking(self.ask))
+        if self.first:
+            return self.first.pop()
         if isinstance(self.source, str):
             return load_planner(self.source, self.arguments)
         if inspect.isclass(self.source):
@@ -204,7 +217,7 @@ class RunPlanner:
 
 
 def run_planner(source: Any, arguments: Mapping[str, Any]) -> RunPlanner:
-    """A planner given by name, class or instance; it is made once to see that it works.
+    """A planner given by name, class or instance; the first instance is made, to see that it works.
 
     Raises:
         ShiftsimError: It does not exist, or cannot be made.
@@ -219,7 +232,7 @@ def run_planner(source: Any, arguments: Mapping[str, Any]) -> RunPlanner:
     found = RunPlanner(name, source, arguments, fingerprint)
     planner = _made(name, found.make)
     _require_methods(name, planner)
-    close_planner(planner)
+    found.first.append(planner)
     if not hasattr(source, "identify") and sees_recording(planner):
         fingerprint = {**fingerprint, "sees_recording": True}
     in_batches = isinstance(planner, BatchPlanner)

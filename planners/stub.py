@@ -1,7 +1,7 @@
 """The other end of `--isolate`: serves one planner in a process of its own.
 
 This file runs by itself, with NumPy and Python 3.9 or newer. A message is a tree of plain values as
-JSON, behind its length, and then the bytes of its arrays; nothing that comes can name code.
+JSON, and then the bytes of its arrays; nothing that comes can name code.
 """
 
 import sys
@@ -16,9 +16,10 @@ import importlib
 import json
 import os
 import signal
-import struct
+import socket
 import traceback
 import types
+from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
@@ -26,20 +27,17 @@ import numpy as np
 _KINDS = "biuf"  # of arrays that can be sent
 
 
-def write(stream: Any, value: Any) -> None:
+def write(connection: Any, value: Any) -> None:
     """Send a value; what cannot be sent arrives as an empty object of a class of that name."""
     arrays: Any = []
-    head = json.dumps(_pack(value, arrays)).encode()
-    stream.write(struct.pack("<Q", len(head)) + head)
+    connection.send_bytes(json.dumps(_pack(value, arrays)).encode())
     for array in arrays:
-        stream.write(array.tobytes())
-    stream.flush()
+        connection.send_bytes(array.tobytes())
 
 
-def read(stream: Any, classes: Any) -> Any:
+def read(connection: Any, classes: Any) -> Any:
     """What was sent; `classes` makes records, by name."""
-    (size,) = struct.unpack("<Q", _exactly(stream, 8))
-    return _unpack(json.loads(_exactly(stream, size)), stream, classes)
+    return _unpack(json.loads(connection.recv_bytes()), connection, classes)
 
 
 def _pack(value: Any, arrays: Any) -> Any:
@@ -65,9 +63,9 @@ def _pack(value: Any, arrays: Any) -> Any:
     return {"?": type(value).__name__}
 
 
-def _unpack(tree: Any, stream: Any, classes: Any) -> Any:
+def _unpack(tree: Any, connection: Any, classes: Any) -> Any:
     if isinstance(tree, list):
-        return tuple(_unpack(item, stream, classes) for item in tree)
+        return tuple(_unpack(item, connection, classes) for item in tree)
     if not isinstance(tree, dict):
         return tree
     ((sign, content),) = tree.items()
@@ -75,24 +73,15 @@ def _unpack(tree: Any, stream: Any, classes: Any) -> Any:
         kind, shape = np.dtype(content[0]), tuple(content[1])
         if kind.kind not in _KINDS:
             raise ValueError("an array of " + content[0])
-        data = _exactly(stream, kind.itemsize * int(np.prod(shape, dtype=np.int64)))
-        return np.ndarray(shape, kind, data)  # read-only, as bytes are
+        return np.ndarray(shape, kind, connection.recv_bytes())  # read-only, as bytes are
     if sign == "%":
-        return {
-            _unpack(key, stream, classes): _unpack(item, stream, classes) for key, item in content
-        }
+        pairs = [[_unpack(item, connection, classes) for item in pair] for pair in content]
+        return dict(pairs)
     if sign == "?":
         return type(content, (), {})()
     name, names, parts = content
-    values = [_unpack(part, stream, classes) for part in parts]
+    values = [_unpack(part, connection, classes) for part in parts]
     return classes.get(name, Record)(**dict(zip(names, values)))  # noqa: B905
-
-
-def _exactly(stream: Any, size: int) -> Any:
-    data = stream.read(size)
-    if len(data) != size:
-        raise EOFError
-    return data
 
 
 class Record:
@@ -195,14 +184,16 @@ def _main() -> None:
         ctypes.CDLL(None).prctl(1, int(signal.SIGKILL))  # PR_SET_PDEATHSIG: end with the parent
         if os.getppid() != int(sys.argv[1]):
             return
-    source, sink = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
-    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-    os.dup2(2, 1)  # what the planner prints is no message
+    handle = int(sys.argv[2])
+    if sys.platform == "win32":
+        handle = socket.fromshare(sys.stdin.buffer.read()).detach()
+    connection: Any = Connection(handle)
+    os.dup2(2, 1)  # what the planner prints is not the output of the command
     make: Any = None
     classes = planner = road = make
     while True:
         try:
-            verb, value = read(source, classes or {})
+            verb, value = read(connection, classes or {})
         except EOFError:
             return _close(planner)
         try:
@@ -231,12 +222,12 @@ def _main() -> None:
                 planner.reset(value)
             else:
                 answer = (planner.plan(value), str(getattr(planner, "degraded", "")))
-            write(sink, ("done", answer))
+            write(connection, ("done", answer))
         except (Exception, SystemExit) as error:
             hint = getattr(error, "hint", None)
             kind = "" if isinstance(hint, str) else type(error).__name__ + ": "
             text = traceback.format_exc()
-            write(sink, ("failed", (kind + str(error), hint or "", text)))
+            write(connection, ("failed", (kind + str(error), hint or "", text)))
 
 
 if __name__ == "__main__":

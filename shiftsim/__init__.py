@@ -1,33 +1,13 @@
-"""Closed-loop evaluation of driving planners with nuPlan's semantics."""
+"""Closed-loop evaluation of driving planners with nuPlan's semantics.
+
+Type checkers read `__init__.pyi`, so that nothing is imported for them.
+"""
 
 import sys
+from typing import Any
 
-TYPE_CHECKING = False  # type checkers take this name for true; nothing is imported for it
-if TYPE_CHECKING:
-    from typing import Any
+from shiftsim._version import __version__ as __version__
 
-    from shiftsim.api import Run as Run
-    from shiftsim.api import load_planner as load_planner
-    from shiftsim.api import open_run as open_run
-    from shiftsim.api import open_store as open_store
-    from shiftsim.api import run as run
-    from shiftsim.api import simulate as simulate
-    from shiftsim.errors import ShiftsimError as ShiftsimError
-    from shiftsim.metrics import compute_metrics as score  # noqa: F401
-    from shiftsim.planners.contract import check_planner as check_planner
-    from shiftsim.sim.log import SimulationLog as SimulationLog
-    from shiftsim.sim.noise import NoiseModel as NoiseModel
-    from shiftsim.sim.planner import Observation as Observation
-    from shiftsim.sim.planner import Planner as Planner
-    from shiftsim.sim.planner import SceneInfo as SceneInfo
-    from shiftsim.view.page import show as show
-    from shiftsim.world.scenario import Scenario as Scenario
-    from shiftsim.world.state import Command as Command
-    from shiftsim.world.state import EgoState as EgoState
-    from shiftsim.world.state import Tracks as Tracks
-    from shiftsim.world.state import Trajectory as Trajectory
-
-__version__ = "0.1.0"
 # public name -> where it is; imported when it is first used, so that `import shiftsim` is instant
 _PUBLIC = {
     "Command": "shiftsim.world.state:Command",
@@ -54,32 +34,77 @@ _PUBLIC = {
 
 __all__ = list(_PUBLIC)
 
+# Names that earlier documentation printed, for one version more: module path -> where it is now,
+# with all modules in it, and `module:name` -> the same. Remove them with the next version.
+_DEPRECATED = {
+    "shiftsim.api:RunSettings": "shiftsim.runs.config:RunConfig",
+    "shiftsim.data.lanes": "shiftsim.data.maps",
+    "shiftsim.data.lanes.map": "shiftsim.data.maps.build",
+    "shiftsim.data.lanes.pieces": "shiftsim.data.maps.segments",
+    "shiftsim.data.opendrive": "shiftsim.data.maps.opendrive",
+    "shiftsim.data.opendrive.map": "shiftsim.data.maps.opendrive.map",
+    "shiftsim.data.opendrive.reading": "shiftsim.data.maps.opendrive.reading",
+    "shiftsim.data.tracks": "shiftsim.data.readers.tracks",
+    "shiftsim.data.tracks.build": "shiftsim.data.readers.build",
+    "shiftsim.data.tracks.scenarios": "shiftsim.data.readers.scenarios",
+}
 
-def __getattr__(name: str) -> "Any":
+
+def __getattr__(name: str) -> Any:
     if name not in _PUBLIC:
         raise AttributeError(f"module 'shiftsim' has no attribute {name!r}")
-    from importlib import import_module
-
-    module, _, attribute = _PUBLIC[name].partition(":")
-    value = getattr(import_module(module), attribute)
-    globals()[name] = value
+    globals()[name] = value = _load(_PUBLIC[name])
     return value
-
-
-class _Moved:
-    """Asked last, for modules that nobody else knows: import paths of earlier versions."""
-
-    @staticmethod
-    def find_spec(name: str, path: "Any" = None, target: "Any" = None) -> "Any":
-        if not name.startswith("shiftsim."):
-            return None
-        from shiftsim._moved import find_spec
-
-        return find_spec(name)
-
-
-sys.meta_path.append(_Moved)
 
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *_PUBLIC})
+
+
+def _load(target: str) -> Any:
+    from importlib import import_module
+
+    module, _, name = target.partition(":")
+    return getattr(import_module(module), name) if name else import_module(module)
+
+
+class _Deprecated:
+    """Imports modules under their earlier paths; asked last, for what nobody else finds."""
+
+    @staticmethod
+    def find_spec(name: str, path: Any = None, target: Any = None) -> Any:
+        from importlib.machinery import ModuleSpec
+
+        return ModuleSpec(name, _Deprecated) if name in _DEPRECATED else None  # type: ignore[arg-type]
+
+    @staticmethod
+    def create_module(spec: Any) -> None:
+        return None
+
+    @staticmethod
+    def exec_module(module: Any) -> None:
+        """Fill a module with the names of the one that it is now."""
+        new = _DEPRECATED[module.__name__]
+        _warn(module.__name__, new)
+        names = vars(_load(new))
+        vars(module).update({k: v for k, v in names.items() if not k.startswith("__")})
+        module.__path__ = []
+        module.__getattr__ = lambda name: deprecated_name(new, name)
+
+
+def deprecated_name(module: str, name: str) -> Any:
+    """A name that a module has no longer, for its `__getattr__`."""
+    new = _DEPRECATED.get(f"{module}:{name}")
+    if new is None:
+        raise AttributeError(f"module {module!r} has no attribute {name!r}")
+    _warn(f"{module}.{name}", new.replace(":", "."))
+    return _load(new)
+
+
+def _warn(old: str, new: str) -> None:
+    import warnings
+
+    warnings.warn(f"{old} is now {new}", DeprecationWarning, stacklevel=3)
+
+
+sys.meta_path.append(_Deprecated)  # type: ignore[arg-type]

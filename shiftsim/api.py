@@ -7,15 +7,16 @@ notebook shows of scenarios, maps and logs is registered here: these know nothin
 import html
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypedDict, Unpack
+from typing import Any
 
+import shiftsim.edits  # noqa: F401  # attaches Scenario.edited
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.planners import registry
 from shiftsim.runs import results
 from shiftsim.runs.scenarios import open_named_store, open_run_store
 from shiftsim.sim import loop
 from shiftsim.sim.log import SimulationLog
-from shiftsim.sim.noise import NoiseModel
+from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
 from shiftsim.sim.planner import Planner
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario, require_scenario
@@ -112,45 +113,13 @@ class Run(results.Run):
         return _preformatted(self.table(allow_partial=True))
 
 
-class RunSettings(TypedDict, total=False):
-    """The settings of `run` beyond its own arguments; `RunConfig` describes them."""
-
-    store: str
-    split: str
-    limit: int
-    all_scenarios: bool
-    edits: str
-    traffic: str
-    controller: str
-    thresholds: str
-    planner_args: dict[str, dict[str, Any]]
-    metrics: Sequence[str]
-    checkpoints: Sequence[str]
-    device: str
-    batch_size: int
-    isolate: bool
-    planner_python: str
-    strict: bool
-    out: str
-    workers: int
-    timeout: float
-    resume: bool
-    retry_failed: bool
-    shard: str
-    executor: str
-    scheduler: str
-    save_rollouts: str
-    bundle: bool
-    allow_partial: bool
-
-
 def run(
     planner: Any,
     *,
     noise: str | NoiseModel | Sequence[str | NoiseModel] = "none",
     seeds: int | Iterable[int] = 0,
     on_progress: Any = None,
-    **settings: Unpack[RunSettings],
+    **settings: Any,
 ) -> Run:
     """Simulate and score planners on scenarios, as `shiftsim run` does.
 
@@ -160,7 +129,8 @@ def run(
         noise: Name or model, or a list of them.
         seeds: Seeds of the noise.
         on_progress: Called with a `Progress` after every task.
-        settings: The other settings of a run, as in a configuration file.
+        settings: The other settings of a run, as in a configuration file: `store`, `split`,
+            `limit`, `traffic`, `thresholds`, `workers`, `out`, …
 
     Returns:
         The finished run; print `.table()`.
@@ -173,11 +143,24 @@ def run(
         run = shiftsim.run(["idm", "log-future"], noise="ou-high", split="demo-mini", limit=2)
         ```
     """
-    from shiftsim.runs import execute
+    from shiftsim.runs.config import make_config
+    from shiftsim.runs.execute import execute
+    from shiftsim.runs.prepare import prepare
 
-    watch = {"on_progress": on_progress} if on_progress else {}
-    done = execute.run(planner, noise=noise, seeds=seeds, **watch, **settings)
-    return Run(done.path, done.manifest)
+    planners = list(planner) if isinstance(planner, (list, tuple)) else [planner]
+    noises = [noise] if isinstance(noise, (str, NoiseModel)) else list(noise)
+    models = [m if isinstance(m, NoiseModel) else parse_noise(m) for m in noises if m != "all"]
+    if any(isinstance(m, str) and m == "all" for m in noises):
+        models += [parse_noise(name) for name in NOISE_NAMES]
+    values = {
+        "planners": [registry.planner_name(source) for source in planners],
+        "noise": [model.name for model in models],
+        "seeds": [seeds] if isinstance(seeds, int) else list(seeds),
+        **settings,
+    }
+    plan = prepare(make_config(values), planners=planners, noises=models)
+    finished = execute(plan, **{"on_progress": on_progress} if on_progress else {})
+    return Run(finished.path, finished.manifest)
 
 
 def open_run(path: str | Path) -> Run:
@@ -237,7 +220,7 @@ def simulate(
 
     Example:
         ```python
-        scenario = shiftsim.open_store("demo")["03b23c"]
+        scenario = shiftsim.open_store("demo")["01f13e"]
         log = shiftsim.simulate(scenario, "idm", noise="ou-high")
         ```
     """
@@ -255,7 +238,7 @@ def open_store(name: str | Path) -> ScenarioStore:
     Example:
         ```python
         store = shiftsim.open_store("demo")
-        scenario = store["03b23c"]  # a token, or its beginning
+        scenario = store["01f13e"]  # a token, or its beginning
         print(len(store), store.cities, scenario)
         ```
     """
@@ -299,3 +282,9 @@ for _kind, _shown in (
     (SimulationLog, _table_of),
 ):
     setattr(_kind, "_repr_html_", _shown)  # noqa: B010
+
+
+def __getattr__(name: str) -> Any:
+    from shiftsim import deprecated_name
+
+    return deprecated_name(__name__, name)

@@ -26,7 +26,11 @@ class ShiftsimError(Exception):
     """
 
     def __init__(self, message: str, hint: str = "") -> None:
-        self.message, self.hint = _in_one_line(message), hint
+        # one line, also with the text of another library in it; Gymnasium gives an error here
+        message = " ".join(str(message).splitlines())
+        if len(message) > _MAX_MESSAGE:
+            message = f"{message[:700]} … {message[-250:]}"
+        self.message, self.hint = message, hint
         super().__init__(self.message)
 
     def __str__(self) -> str:
@@ -35,14 +39,6 @@ class ShiftsimError(Exception):
     def __reduce__(self) -> tuple[type["ShiftsimError"], tuple[str, str]]:
         """Keep the hint when the error travels between processes."""
         return type(self), (self.message, self.hint)
-
-
-def _in_one_line(message: str) -> str:
-    """The message; texts of other libraries and values of damaged files in it may be long."""
-    if len(message) <= _MAX_MESSAGE and "\n" not in message:
-        return message
-    text = " ".join(message.split())
-    return text if len(text) <= _MAX_MESSAGE else f"{text[:700]} … {text[-250:]}"
 
 
 class ConfigError(ShiftsimError):
@@ -95,14 +91,8 @@ def import_extra(module: str, extra: str) -> ModuleType:
 
 
 def readable(value: object) -> str:
-    """A value as text that every file can hold, whatever its `__str__` does; cut where too long."""
-    try:
-        text = str(value)
-    except (Exception, SystemExit) as error:
-        text = (
-            f"{type(value).__name__}, which has no text: its __str__ raises {type(error).__name__}"
-        )
-    return text[:_MAX_TEXT].encode("utf-8", "backslashreplace").decode()
+    """A value as text that every file can hold; cut where too long."""
+    return str(value)[:_MAX_TEXT].encode("utf-8", "backslashreplace").decode()
 
 
 def one_of(what: str, value: str, choices: Iterable[str]) -> str:

@@ -1,9 +1,8 @@
 """Where users' files are, and how files are read and written: settings in TOML, whole files only.
 
 Nothing else in the project looks at environment variables for folders, and no file is ever seen
-half written: `whole_file` is the one way to replace one. What a file that may be anybody's names is
-looked for inside its folder only, with `below`. `sources` says what a module of ours is made of, so
-that caches and runs notice when it changes.
+half written: `atomic_write` is the one way to replace one. What a file that may be anybody's names
+is looked for inside its folder only, with `safe_join`.
 """
 
 import json
@@ -12,7 +11,7 @@ import re
 import sys
 import tomllib
 import traceback
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import import_module
@@ -23,7 +22,6 @@ from typing import Any, BinaryIO
 from shiftsim.errors import ConfigError, DataError
 
 PACKAGE = Path(__file__).parent
-# a line end is found twice as fast as a line's beginning
 _IMPORT = re.compile(
     r"\n *(?:from shiftsim\.([\w.]+) import (?:\(([^)]*)\)|([^\n(]+))|import shiftsim\.([\w.]+))"
 )
@@ -50,13 +48,12 @@ def checkpoint_folder() -> Path:
 def user_cache(part: str) -> Path:
     """Folder of what is kept to save time, below `SHIFTSIM_CACHE` (`~/.cache/shiftsim`).
 
-    `stores` are files copied from stores behind a URL, `maps` are maps as they are in memory,
-    `kernels` are compiled kernels.
+    `stores` are files copied from stores behind a URL, `kernels` are compiled kernels.
     """
     return Path(os.environ.get("SHIFTSIM_CACHE", "~/.cache/shiftsim")).expanduser() / part
 
 
-def below(folder: Path, name: str) -> Path:
+def safe_join(folder: Path, name: str) -> Path:
     """The place of something in a folder by its relative path.
 
     Raises:
@@ -74,7 +71,7 @@ def below(folder: Path, name: str) -> Path:
     )
 
 
-def draft(path: Path) -> Path:
+def temp_path(path: Path) -> Path:
     """Where a file is written before it takes its place; nothing is there, not even a link."""
     partial = path.with_name(f".{path.name}.tmp")
     partial.unlink(missing_ok=True)
@@ -82,9 +79,9 @@ def draft(path: Path) -> Path:
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path) -> Iterator[Path]:
     """A file to be written, which then takes its place: whole or not at all."""
-    partial = draft(path)
+    partial = temp_path(path)
     try:
         yield partial
         partial.replace(path)
@@ -99,7 +96,7 @@ def write_text(path: Path, text: str) -> None:
 
     Half a surrogate pair, for which UTF-8 has no bytes, is written as JSON would escape it.
     """
-    with whole_file(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text(text, "utf-8", errors="backslashreplace", newline="")
 
 
@@ -122,7 +119,7 @@ def read_json_lines(path: Path) -> Iterator[tuple[str, Any]]:
                 ) from error
 
 
-def locked(path: Path) -> BinaryIO:
+def lock(path: Path) -> BinaryIO:
     """A file, made if needed, that one process at a time has open here; closing it lets others in.
 
     Where the system or the file system has no locks, nobody is kept out.
@@ -163,19 +160,6 @@ def read_toml(path: Path) -> dict[str, Any]:
         ) from error
 
 
-def fresh_python(command: str, *words: str) -> tuple[list[str], dict[str, str]]:
-    """Words and environment that start an interpreter which knows this package.
-
-    What lies in the current folder is no code to it.
-    """
-    search = [str(PACKAGE.parent), os.environ.get("PYTHONPATH", "")]
-    paths = os.pathsep.join(filter(None, search))
-    return [sys.executable, "-P", "-c", command, *words], {**os.environ, "PYTHONPATH": paths}
-
-
-_IMPORTING: list[str] = []  # modules of the user that are being imported
-
-
 def import_named(module: str) -> ModuleType:
     """A module by its name, or by its file, `folder/name.py`.
 
@@ -184,25 +168,19 @@ def import_named(module: str) -> ModuleType:
 
     Raises:
         ImportError: There is none, it fails, or it ends the process.
-        ConfigError: It starts a run.
     """
     name, folder = (module, Path.cwd()) if not module.endswith(".py") else _module_of(Path(module))
     own = not name.startswith("shiftsim.")
     if own and str(folder) not in sys.path:
         sys.path.append(str(folder))
-    _IMPORTING.append(module)
     try:
         found = import_module(name)
-    except (ImportError, ConfigError):
+    except ImportError:
         raise
-    except SystemExit as error:  # else the command would end as if all were well
-        raise ImportError(f"it leaves with SystemExit: {error.code}", name=name) from error
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         where = place_of(error)
         text = f"{type(error).__name__}: {error}{where and f' ({where})'}"
         raise ImportError(text, name=name) from error
-    finally:
-        _IMPORTING.pop()
     if module.endswith(".py") and not Path(module).samefile(found.__file__ or ""):
         raise ImportError(f"{name!r} is the name of {found.__file__}; rename the file", name=name)
     return found
@@ -216,19 +194,6 @@ def _module_of(file: Path) -> tuple[str, Path]:
     while (folder / "__init__.py").is_file():
         folder, name = folder.parent, f"{folder.name}.{name}"
     return name, folder
-
-
-def require_no_import() -> None:
-    """Refuse to start a run from a module that is being imported for one.
-
-    Raises:
-        ConfigError: There is such a module.
-    """
-    if _IMPORTING:
-        raise ConfigError(
-            f"{_IMPORTING[-1]!r} starts a run while it is imported",
-            hint="put what is to run as a script below: if __name__ == '__main__':",
-        )
 
 
 def place_of(error: BaseException) -> str:
@@ -254,18 +219,6 @@ def load_attribute(what: str, name: str, hint: str) -> Any:
         return getattr(import_named(module), attribute)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"{what} {name!r} cannot be imported: {error}", hint) from error
-
-
-def sources(paths: Iterable[Path]) -> dict[str, bytes]:
-    """Modules of ours, below `PACKAGE`, and all that they import: their text by path."""
-    waiting = [path.relative_to(PACKAGE).as_posix() for path in paths]
-    found = dict[str, bytes]()
-    while waiting:
-        name = waiting.pop()
-        if name not in found:
-            found[name], imported = read_module(name)
-            waiting += imported
-    return found
 
 
 @cache

@@ -61,8 +61,12 @@ def _cache_folder() -> str:
             "%s cannot be written: kernels are compiled anew by every process", folder
         )
         return ""
-    if folder is own and shipped.is_dir():
-        shutil.copytree(shipped, own, dirs_exist_ok=True)
+    if folder is own:
+        for path in shipped.rglob("*.nb?"):  # without its permissions
+            copy = own / path.relative_to(shipped)
+            copy.parent.mkdir(exist_ok=True)
+            if not copy.exists():
+                shutil.copyfile(path, copy)
     caches = sorted(folder.parent.iterdir(), key=lambda path: path.stat().st_mtime, reverse=True)
     for old in caches[_CACHES_KEPT:]:
         if old != folder:

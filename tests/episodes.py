@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from shiftsim.env.episode import REWARDS, Episode
-from shiftsim.env.terms import Terms, look_back, make_course, terms_of
-from shiftsim.metrics.comfort import MIN_SAMPLES, filters_of
+from shiftsim.env.terms import Terms, compute_reward_terms, make_state
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import Setting
 from shiftsim.world.map import VectorMap
@@ -71,10 +70,7 @@ def totals(scenario: Scenario) -> tuple[dict[str, float], Account]:
 def expert_account(log: SimulationLog, road: VectorMap) -> tuple[SimulationLog, Account]:
     """What the expert of a rollout would earn, and the rollout as the expert drives it."""
     driven: Any = replace(log, ego=np.ascontiguousarray(log.expert_ego[: len(log.ego)]))
-    course, account = make_course(driven, road), Account()
-    steps = np.diff(log.time_us / 1e6)
+    state, account = make_state(driven, road), Account()
     for row in range(1, len(driven.ego)):
-        step = float(np.add.reduce(steps[:row]) / row)
-        look_back(course, row, filters_of(max(row + 1, MIN_SAMPLES)), step, step**2)
-        account.add(row, terms_of(course))
+        account.add(row, compute_reward_terms(state, driven, row))
     return driven, account

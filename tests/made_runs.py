@@ -7,7 +7,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from shiftsim.metrics import SHORT_NAMES
-from shiftsim.runs.results import FORMAT_VERSION, TABLES, open_run
+from shiftsim.runs.results import FORMAT_VERSION, open_run
+from shiftsim.runs.tables import TABLES
 
 METRICS = [name for name in SHORT_NAMES if name != "score"]
 

@@ -38,12 +38,10 @@ METRIC_TESTS = (
     "metrics/test_comfort.py",
     "metrics/test_examples.py",
     "metrics/test_errors.py",
-    "metrics/test_metric_worlds.py::test_golden_worlds_agree_under_both_profiles",
-    "metrics/test_nuplan_metrics.py::test_recorded_rollouts_score_as_nuplan_scored_them",
+    "parity/test_metric_worlds.py::test_world",
+    "parity/test_nuplan_runs.py",
 )
-DYNAMICS_TESTS = (
-    "sim/dynamics/test_golden_dynamics.py::test_bundled_references_agree_and_are_covered_completely",
-)
+DYNAMICS_TESTS = ("parity/test_dynamics.py",)
 # the tests of each module, fast ones first; a folder's come after the module's own
 TESTS_OF = {
     "shiftsim.metrics": METRIC_TESTS,
@@ -52,7 +50,6 @@ TESTS_OF = {
     "shiftsim.sim.loop": (
         "sim/test_plan_check.py",
         "sim/test_lock_step.py",
-        "sim/test_drive_on.py",
     ),
 }
 Name = tuple[str, str]  # a module and a top-level name of it

@@ -1,6 +1,6 @@
 """Writes a demo town and its traffic as the files of open data sets, for tests.
 
-`demo_content` gives plain values; `data/open_data/write_py123d.py` hands them to py123d's writer.
+`demo_content` gives plain values; `data/readers/write_py123d.py` hands them to py123d.
 """
 
 import json
@@ -14,14 +14,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import shapely
 
-from shiftsim.data.demo.agents import SIZES
-from shiftsim.data.demo.scenes import demo_sites, traffic_of
-from shiftsim.data.demo.traffic import DT
-from shiftsim.data.open_data.av2 import Av2Reader
-from shiftsim.data.open_data.commonroad import CommonRoadReader
-from shiftsim.data.open_data.py123d import Py123dReader
-from shiftsim.data.opendrive.map import build_road_map
-from shiftsim.data.opendrive.reading import parse_opendrive
+from shiftsim.data.maps.opendrive.map import build_road_map
+from shiftsim.data.maps.opendrive.reading import parse_opendrive
+from shiftsim.data.readers.av2 import Av2Reader
+from shiftsim.data.readers.commonroad import CommonRoadReader
+from shiftsim.data.readers.py123d import Py123dReader
+from shiftsim.data.synthetic.agents import SIZES
+from shiftsim.data.synthetic.recordings import DURATION, generate_town
+from shiftsim.data.synthetic.store import DEMO_TOWNS
+from shiftsim.data.synthetic.traffic import DT
 
 AV2_NAME = "00000000-aaaa-bbbb-cccc-000000000001"
 START_US = 1_900_000_000_000_000
@@ -30,18 +31,19 @@ CENTER_TO_IMU = 1.3  # m, of the ego's box
 
 
 @cache
-def demo_map(site="junction"):
+def demo_map(site="avenue"):
     """The map of a town of the demo, as OpenDRIVE gives it."""
-    town = _site(site).town()
-    return build_road_map(parse_opendrive(town.network.xml().encode(), site), name=site)[0]
-
-
-def _site(name):
-    return next(site for site in demo_sites() if site.name == name)
+    xml = _generated(site)[0].network.xml()
+    return build_road_map(parse_opendrive(xml.encode(), site), name=site)[0]
 
 
 @cache
-def demo_content(site="junction", seconds=11.0):
+def _generated(name):
+    return generate_town(next(town for town in DEMO_TOWNS if town.name == name))
+
+
+@cache
+def demo_content(site="avenue", seconds=11.0):
     """Lanes, areas and tracks of a town of the demo, in plain JSON values.
 
     Tracks are (T, 5) t [s], x, y, heading, speed every 0.1 s; `ego` is the car that gets farthest.
@@ -64,7 +66,7 @@ def demo_content(site="junction", seconds=11.0):
         }
         for edge in range(len(road.edges))
     ]
-    tracks = _tracks(_site(site), seconds)
+    tracks = _tracks(_generated(site)[1][0], seconds)
     ego = max((t for t in tracks if t["category"] == "car"), key=lambda t: _way(t, seconds))
     others = [track for track in tracks if track is not ego]
     return {
@@ -92,9 +94,8 @@ def _way(track, seconds):
     return np.hypot(*np.diff(rows[:, 1:3], axis=0).T).sum() if whole else 0.0
 
 
-def _tracks(site, seconds):
-    scene = site.scenes[0]
-    boxes = sorted(traffic_of(scene, site.town()).record(scene.duration), key=lambda box: box[1])
+def _tracks(traffic, seconds):
+    boxes = sorted(traffic.record(DURATION), key=lambda box: box[1])
     out = []
     for number, group in groupby(boxes, key=lambda box: box[1]):
         group = list(group)
@@ -120,7 +121,7 @@ def _tracks(site, seconds):
 # --- Argoverse 2
 
 
-def write_av2(folder, name=AV2_NAME, site="junction"):
+def write_av2(folder, name=AV2_NAME, site="avenue"):
     """One scene of Argoverse 2 motion forecasting; returns the Parquet file."""
     content = demo_content(site)
     folder.mkdir(parents=True, exist_ok=True)
@@ -187,7 +188,7 @@ def _segment(lane):
 # --- CommonRoad
 
 
-def write_commonroad(folder, version="2020a", site="junction"):
+def write_commonroad(folder, version="2020a", site="avenue"):
     """One CommonRoad scenario; returns the file."""
     content = demo_content(site)
     folder.mkdir(parents=True, exist_ok=True)
@@ -256,7 +257,7 @@ def _obstacle(track, is_new):
 # --- py123d
 
 
-def write_py123d(folder, split="demo_val", site="junction", labels="NuPlanBoxDetectionLabel"):
+def write_py123d(folder, split="demo_val", site="avenue", labels="NuPlanBoxDetectionLabel"):
     """One log as py123d writes it, with a map of its own; returns the folder of the log."""
     content = demo_content(site)
     log = folder / "logs" / split / "log-1"

@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-from shiftsim.data.opendrive.reading import parse_opendrive
-from shiftsim.data.opendrive.records import OpenDrive
+from shiftsim.data.maps.opendrive.reading import parse_opendrive
+from shiftsim.data.maps.opendrive.records import OpenDrive
 
 
 def geometry(

@@ -6,8 +6,11 @@ import numpy as np
 import places
 
 from shiftsim.data.recording import EgoTrace, Recording, Window
+from shiftsim.data.store.recordings import ego_table, frames_table, lights_table, tracks_table
+from shiftsim.data.store.tables import require_ranges
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.world.map import VectorMap
+from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Tracks, TrafficLights
 
 GOLDEN = places.GOLDEN / "nuplan_format"
@@ -61,3 +64,15 @@ def write_store(path: Path, road: VectorMap, recording: Recording, *windows: Win
             writer.add_ego(EgoTrace("drive", name, 0, np.full((num_rows, 11), 0.25)))
         for window in windows:
             writer.add_window(window)
+
+
+def require_plausible(scene: Scenario) -> None:
+    """Refuse a scenario with a number outside of the ranges of a store."""
+    rows = slice(0, len(scene.time_us))
+    for table in (
+        frames_table(scene.time_us),
+        lights_table(scene.traffic_lights, rows),
+        tracks_table(scene.tracks, rows),
+        ego_table(scene.ego, 0),
+    ):
+        require_ranges(table, f"scenario {scene.token}")

@@ -3,8 +3,7 @@
 from contextlib import contextmanager
 from threading import Thread
 
-from shiftsim.view.review.server import ReviewServer
-from shiftsim.view.review.service import ReviewService
+from shiftsim.view.review import ReviewServer, ReviewService
 
 
 @contextmanager

@@ -7,12 +7,8 @@ import pytest
 from stores import write_toy_store
 
 import shiftsim
-from shiftsim.api import RunSettings
 from shiftsim.files import PACKAGE
-from shiftsim.runs.config import RunConfig
 from shiftsim.sim.planner import scene_info
-
-ARGUMENTS = {"planners", "noise", "seeds"}  # of `run` itself
 
 
 def is_short(text):
@@ -115,11 +111,6 @@ def test_a_planner_is_made_or_driven_by_its_name(scenario, log):
     assert (again.ego == log.ego).all()
     with pytest.raises(shiftsim.ShiftsimError, match="did you mean 'idm'"):
         shiftsim.simulate(scenario, "idmm")
-
-
-def test_the_settings_of_run_are_those_of_a_configuration():
-    known = {name for name in RunConfig.__dataclass_fields__} - ARGUMENTS
-    assert set(RunSettings.__annotations__) == known
 
 
 def test_a_run_explains_and_plots_a_scenario(run, scenario, tmp_path):

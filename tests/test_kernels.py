@@ -23,11 +23,11 @@ from numba.core.runtime import _nrt_python, rtsys
 from track_files import export_town, write_tracks
 from worlds import cruise_scenario
 
-from shiftsim.data.deepplan.convert import convert_dsc3d
+from shiftsim.data.readers.dsc3d import convert_dsc3d
+from shiftsim.data.readers.tracks.inspection import convert_tracks, inspect_tracks
 from shiftsim.data.recording import visible_columns
 from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import ScenarioStore
-from shiftsim.data.tracks.convert import convert_tracks, look_at
 from shiftsim.files import PACKAGE
 from shiftsim.metrics import compute_metrics
 from shiftsim.planners.registry import load_planner
@@ -35,9 +35,8 @@ from shiftsim.planners.table import PLANNERS
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.planner import Planner
 from shiftsim.sim.traffic import _MODELS
-from shiftsim.train.pictures import blocks_of
-from shiftsim.train.traffic.labels import labels_of
 from shiftsim.train.traffic.realism import compare
+from shiftsim.train.traffic.states import compute_labels
 from shiftsim.world.layers import nearest
 from shiftsim.world.scenario import Scenario
 
@@ -102,7 +101,7 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
 
     def convert_table() -> None:
         shutil.rmtree(folder / "own", ignore_errors=True)
-        convert_tracks(look_at(table, town[1], city="roundabout"), folder / "own")
+        convert_tracks(inspect_tracks(table, town[1], city="roundabout"), folder / "own")
         check_store(folder / "own")
 
     def drive_edited() -> None:
@@ -121,7 +120,6 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
         "edited": drive_edited,
         "conversion": convert,
         "tracks and check": convert_table,
-        "rasters": lambda: blocks_of([np.zeros((9, 256, 256), np.uint8)], [False]),
         "realism": lambda: measure_realism(scenario),
         "metrics": lambda: compute_metrics(
             simulate(scenario, load("constant-velocity")), scenario.map
@@ -141,7 +139,7 @@ def measure_realism(scenario: Scenario) -> None:
     compare([cruise_scenario(speed=4.0, iterations=60, tracks=scenario.tracks)], {})
     poses = np.zeros((scenario.tracks.num_tracks, 3))
     away = np.zeros((len(poses), 2))
-    labels_of(scenario.tracks, 30, poses, np.zeros(len(poses)), away)
+    compute_labels(scenario.tracks, 30, poses, np.zeros(len(poses)), away)
 
 
 def num_kept() -> int:

@@ -14,7 +14,7 @@ from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.review import Review, Reviews, write_reviews
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import DataError
-from shiftsim.files import below, whole_file
+from shiftsim.files import atomic_write, safe_join
 from shiftsim.runs.filter import filter_store
 from shiftsim.runs.journal import Journal
 from shiftsim.view.build import write_site
@@ -51,18 +51,18 @@ def test_a_name_that_leads_out_of_its_folder_is_refused(name, tmp_path, home):
     root.mkdir()
     (root / "link").symlink_to(home)
     with pytest.raises(DataError, match="is outside of this folder"):
-        below(root, name)
+        safe_join(root, name)
 
 
 def test_a_name_inside_a_folder_is_found_also_where_the_folder_is_a_link(tmp_path):
     (tmp_path / "root" / "a").mkdir(parents=True)
     (tmp_path / "link").symlink_to(tmp_path / "root")
-    assert below(tmp_path / "link", "a/b") == tmp_path / "link" / "a" / "b"
+    assert safe_join(tmp_path / "link", "a/b") == tmp_path / "link" / "a" / "b"
 
 
 def test_a_link_at_the_place_of_a_draft_is_not_followed(tmp_path, home):
     (tmp_path / ".page.html.tmp").symlink_to(home / "precious")
-    with whole_file(tmp_path / "page.html") as partial:
+    with atomic_write(tmp_path / "page.html") as partial:
         partial.write_text("theirs")
     assert (tmp_path / "page.html").read_text() == "theirs"
 

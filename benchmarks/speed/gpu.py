@@ -20,10 +20,11 @@ from shiftsim.data.store.reading import open_store
 from shiftsim.metrics import compute_metrics
 from shiftsim.planners.learned.base import LearnedPlanner
 from shiftsim.planners.learned.device import resolve_device
-from shiftsim.planners.learned.owner import Address, Ask, Owner, new_address
+from shiftsim.planners.learned.owner import Address, InferenceClient, InferenceServer, new_address
 from shiftsim.planners.registry import load_planner, planner_factory
+from shiftsim.processes import in_background
 from shiftsim.runs.config import default_workers
-from shiftsim.runs.workers import beside, map_unordered
+from shiftsim.runs.workers import map_unordered
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import Rollout, simulate_together
 from shiftsim.world.scenario import Scenario
@@ -84,7 +85,7 @@ class Worker:
     def __init__(self, store: str, iterations: int, name: str, address: Address) -> None:
         """Open the store, and be ready."""
         self.store, self.iterations = open_store(store), iterations
-        self.planner = planner_factory(name).asking(Ask(address, name))
+        self.planner = planner_factory(name).asking(InferenceClient(address, name))
         warm(self.planner, self.read(self.store.tokens[0]))
 
     def read(self, token: str) -> Scenario:
@@ -122,7 +123,7 @@ def drive_in_workers(
     address = new_address()
     parts = [tuple(tasks[start : start + batch]) for start in range(0, len(tasks), batch)]
     done = {}
-    with beside(partial(Owner, make_planner, address)):
+    with in_background(partial(InferenceServer, make_planner, address)):
         make = partial(make_worker, address)
         for outcome in map_unordered(make, parts, workers=workers):
             if outcome.result is None:

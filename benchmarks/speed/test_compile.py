@@ -14,7 +14,7 @@ from time import perf_counter
 
 import pytest
 
-from shiftsim.data.demo.store import demo_store
+from shiftsim.data.synthetic.store import demo_store
 
 # what every command needs that loads a kernel
 LEAST = """

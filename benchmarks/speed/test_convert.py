@@ -19,7 +19,7 @@ import pyarrow.csv as pc
 import pyarrow.parquet as pq
 import pytest
 
-from shiftsim.data.deepplan.convert import convert_dsc3d
+from shiftsim.data.readers.dsc3d import convert_dsc3d
 
 DURATION, PERIOD = 600, 0.08
 ROADS, LENGTH, SPACING = 20, 500.0, 20.0

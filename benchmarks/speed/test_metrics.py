@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shiftsim.metrics import compute_metrics, judge
+from shiftsim.metrics import compute_metrics, evaluate
 from shiftsim.metrics import measure as measure_rollout
 from shiftsim.sim.log import SimulationLog
 from shiftsim.verify.worlds import read_world
@@ -61,4 +61,4 @@ def test_measuring_with_100_agents(measure) -> None:
 
 def test_judging_one_profile(measure) -> None:
     measured = measure_rollout(*crowded(100))
-    measure(judge, measured, "deepplan", calls=10)
+    measure(evaluate, measured, "deepplan", calls=10)

@@ -9,8 +9,8 @@ from time import perf_counter, process_time
 
 import pytest
 
-from shiftsim.data.open_data.av2 import Av2Reader
-from shiftsim.data.open_data.scenes import convert_scenes
+from shiftsim.data.readers.av2 import Av2Reader
+from shiftsim.data.readers.convert import convert
 
 SAMPLE = Path(__file__).resolve().parents[3] / "shared/reference/open_data/av2"
 
@@ -35,11 +35,11 @@ def scenes(count, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_scenes_per_second_and_core(scenes, count, tmp_path):
-    convert_scenes(Av2Reader(), SAMPLE, tmp_path / "warm")  # kernels
+    convert(Av2Reader(SAMPLE), tmp_path / "warm")  # kernels
     began, work = perf_counter(), process_time()
-    report = convert_scenes(Av2Reader(), scenes, tmp_path / "store")
+    report = convert(Av2Reader(scenes), tmp_path / "store")
     seconds, work = perf_counter() - began, process_time() - work
     print(f"\n{count} scenes of 58 tracks in {seconds:.1f} s", end="")
     print(f": {count / seconds:.1f} scenes/s, {count / work:.1f} by CPU time", end="")
-    assert report.scenarios == count
+    assert report.accepted == count
     assert count / work >= 4

@@ -19,7 +19,7 @@ SCENARIO_TARGETS = {"small": 0.12, "city": 0.25, "city with lights": 0.25}  # s,
 @pytest.fixture(scope="module")
 def scenes():
     """One of the demo, and a generated city with 100 agents, without and with red lights."""
-    from shiftsim.data.demo.store import bench_scene
+    from shiftsim.benchmarks.speed.city import bench_scene
 
     store = shiftsim.open_store("demo")
     return {

@@ -11,7 +11,7 @@ from plans import recorded_inputs
 
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import Rollout, simulate
-from shiftsim.sim.plan_check import validate_plan
+from shiftsim.sim.plan_check import find_fault
 from shiftsim.world.state import LightStatus, TrafficLights
 
 LIGHTS_TARGET = 0.3e-3  # s
@@ -20,7 +20,7 @@ LIGHTS_TARGET = 0.3e-3  # s
 @pytest.fixture(scope="module")
 def scenario():
     """A generated city with 100 agents around the ego."""
-    from shiftsim.data.demo.store import bench_scene
+    from shiftsim.benchmarks.speed.city import bench_scene
 
     return bench_scene(100, 0)
 
@@ -28,7 +28,7 @@ def scenario():
 @pytest.fixture(scope="module")
 def lit_scenario():
     """The same city with lights, and connectors of 150 vertices."""
-    from shiftsim.data.demo.store import bench_scene
+    from shiftsim.benchmarks.speed.city import bench_scene
 
     return bench_scene(100, 0, lights=True)
 
@@ -66,10 +66,10 @@ def test_idm_scenario_with_large_connectors(measure, lit_scenario, traffic):
     measure(lambda: simulate(lit_scenario, planner, traffic=traffic), calls=1)
 
 
-def test_validate_plan(measure, scenario):
+def test_check_plan(measure, scenario):
     scene, observations = recorded_inputs(scenario)
     planner = load_planner("constant-velocity")
     planner.reset(scene)
     plan = planner.plan(observations[0])
     now, after = observations[0].time_us, observations[1].time_us
-    measure(validate_plan, plan, now, after)
+    measure(find_fault, plan, now, after)

@@ -23,10 +23,11 @@ import shiftsim
 from shiftsim.planners.registry import load_planner
 from shiftsim.runs.config import make_config
 from shiftsim.runs.folder import RunWriter
-from shiftsim.runs.results import FORMAT_VERSION, TaskResult
+from shiftsim.runs.results import FORMAT_VERSION
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.rollouts.columns import encode_rows, rollout_rows
 from shiftsim.runs.scenarios import open_named_store
+from shiftsim.runs.tables import TaskResult
 from shiftsim.runs.task import score_rollout
 from shiftsim.runs.workers import map_unordered
 from shiftsim.sim.loop import simulate

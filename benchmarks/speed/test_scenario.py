@@ -9,8 +9,9 @@ from time import process_time
 
 import numpy as np
 import pytest
+from parity_cases import Scenes
 
-from shiftsim.data.demo.store import bench_scene
+from shiftsim.benchmarks.speed.city import bench_scene
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.writing import StoreWriter
@@ -22,8 +23,7 @@ from shiftsim.runs.task import Batch, TaskRunner
 from shiftsim.sim import loop
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.noise import parse_noise
-from shiftsim.sim.planner import HISTORY_SAMPLES, History, Observation, Sight
-from shiftsim.verify.files import Scenes
+from shiftsim.sim.planner import HISTORY_SAMPLES, History, Observation, ObservationBuilder
 
 GOLDEN = Path(__file__).resolve().parents[2] / "tests" / "golden" / "nuplan.tar.xz"
 WHOLE_TARGET, SEALING_TARGET = 25e-3, 1e-6  # s
@@ -57,7 +57,9 @@ def runner(scenes, tmp_path_factory):
             writer.add_window(Window(name, scene.scenario_type, name, "ego", *rows, *place))
     planners = {"constant-velocity": run_planner("constant-velocity", {})}
     noises = {"none": parse_noise("none")}
-    return TaskRunner(make_config({"planners": [*planners]}), str(path), planners, noises)
+    runner = TaskRunner(make_config({"planners": [*planners]}), str(path), planners, noises)
+    runner.path = str(path)
+    return runner
 
 
 NAMES = (
@@ -72,7 +74,7 @@ NAMES = (
 
 @pytest.mark.parametrize("name", NAMES)
 def test_read(measure, runner, name):
-    store = open_store(runner.store)
+    store = open_store(runner.path)
     measure(lambda: store.read(name), calls=1, target=READ_TARGET)
 
 
@@ -94,18 +96,17 @@ def test_step_loop(measure, scenes, runner, name):
     measure(lambda: simulate(scenes[name], planner), calls=1, target=LOOP_TARGET)
 
 
-class PlainSight(Sight):
+class PlainSight(ObservationBuilder):
     """Shows views of the rows of the rollout, writable as they are: what costs least to write."""
 
     def __init__(self, *arrays):
-        super().__init__(*arrays)  # takes its time once per rollout
         self._plain = arrays
 
     def at(self, iteration, row):
         time_us, ego, tracks, lights = self._plain
         past = slice(row + 1 - HISTORY_SAMPLES if row >= HISTORY_SAMPLES else 0, row + 1)
         history = History(time_us[past], ego[past], tracks.rows(past))
-        return Observation(iteration, self._times[row], history, lights.rows(slice(row, row + 1)))
+        return Observation(iteration, int(time_us[row]), history, lights.rows(slice(row, row + 1)))
 
 
 @pytest.mark.parametrize("agents", [10, 100, 300])
@@ -114,16 +115,18 @@ def test_sealed_observations(size, note, monkeypatch, agents):
     scene, planner = bench_scene(agents, 0), run_planner("constant-velocity", {}).make()
 
     def step_seconds(sight):
-        monkeypatch.setattr(loop, "Sight", sight)
+        monkeypatch.setattr(loop, "ObservationBuilder", sight)
         began = process_time()
         for _ in range(size(4)):
             simulate(scene, planner)
         return (process_time() - began) / size(4) / (scene.num_iterations - 1)
 
     def pair(number):  # each goes first as often as the other
-        first, second = (Sight, PlainSight) if number % 2 else (PlainSight, Sight)
+        first, second = (
+            (ObservationBuilder, PlainSight) if number % 2 else (PlainSight, ObservationBuilder)
+        )
         taken = {first: step_seconds(first), second: step_seconds(second)}
-        return taken[Sight], taken[PlainSight]
+        return taken[ObservationBuilder], taken[PlainSight]
 
     pair(0)
     sealed, plain = np.array([pair(number) for number in range(size(60, 2))]).T
@@ -180,7 +183,7 @@ def test_peak_memory_of_a_worker(runner, pytestconfig, tmp_path, monkeypatch):
     monkeypatch.setenv("SHIFTSIM_CACHE", str(tmp_path))
 
     def measured(name):
-        command = [sys.executable, "-c", MEMORY, str(runner.store), name]
+        command = [sys.executable, "-c", MEMORY, str(runner.path), name]
         out = subprocess.run(command, check=True, capture_output=True, text=True)
         return [float(word) for word in out.stdout.split()]
 

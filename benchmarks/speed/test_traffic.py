@@ -8,7 +8,7 @@ from time import process_time
 import numpy as np
 import pytest
 
-from shiftsim.data.demo.city import bench_scene
+from shiftsim.benchmarks.speed.city import bench_scene
 from shiftsim.sim.traffic.idm.model import IdmTraffic
 from shiftsim.sim.traffic.learned.model import LearnedTraffic
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 import shiftsim
-from shiftsim.data.demo.store import bench_scene
+from shiftsim.benchmarks.speed.city import bench_scene
 from shiftsim.data.store.reading import open_store
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import simulate
 from shiftsim.view.build import Gallery, write_site
 from shiftsim.view.page import replay_page
-from shiftsim.view.scene import Shown
+from shiftsim.view.scene import ShownRollout
 
 SCENARIOS, PLANNERS = 60, ("log-future", "idm", "constant-velocity")
 SEEKS = 150
@@ -66,7 +66,7 @@ def test_a_page_with_300_agents(tmp_path, size, browser):
     scene = replace(scene, token="300agents")
     planner = load_planner("constant-velocity")
     shown = [
-        Shown("constant-velocity", noise, 0, simulate(scene, planner, noise=noise))
+        ShownRollout("constant-velocity", noise, 0, simulate(scene, planner, noise=noise))
         for noise in ("none", "awgn-high", "ou-high")
     ]
     file = tmp_path / "page.html"

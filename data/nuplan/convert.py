@@ -9,10 +9,10 @@ from pathlib import Path
 
 from shiftsim.data.nuplan.filter import ScenarioFilter, read_filter
 from shiftsim.data.nuplan.log import Log, open_log
-from shiftsim.data.nuplan.mapping import Mapping
 from shiftsim.data.nuplan.sampling import is_taken, thin_out
 from shiftsim.data.nuplan.scenarios import (
     EGO,
+    Mapping,
     ScenarioEntry,
     cut_window,
     find_maps,

@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 
 from shiftsim.data.nuplan.log import LIDAR_CHANNEL, yaw_of
-from shiftsim.data.nuplan.mapping import Mapping, ends_early
+from shiftsim.data.nuplan.scenarios import Mapping, ends_early
 from shiftsim.data.nuplan.sqlite import Value, write_database
 from shiftsim.errors import ConversionError
 from shiftsim.kernels import FloatArray, IntArray

@@ -10,8 +10,7 @@ import numpy as np
 
 from shiftsim.data.nuplan.filter import ScenarioFilter
 from shiftsim.data.nuplan.log import UNTAGGED, Log, read_ego
-from shiftsim.data.nuplan.mapping import ROW_SECONDS
-from shiftsim.data.nuplan.scenarios import ScenarioEntry
+from shiftsim.data.nuplan.scenarios import ROW_SECONDS, ScenarioEntry
 from shiftsim.data.recording import Window
 from shiftsim.errors import ConfigError
 from shiftsim.kernels import FloatArray

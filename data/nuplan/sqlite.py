@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 from urllib.parse import quote
 
 from shiftsim.errors import DataError
-from shiftsim.files import whole_file
+from shiftsim.files import atomic_write
 
 Value: TypeAlias = int | float | str | bytes | None
 
@@ -113,23 +113,17 @@ def write_database(
 ) -> None:
     """Write an SQLite file in one step: column definitions and rows by table, then statements."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with (
-        whole_file(path) as partial,
-        closing(sqlite3.connect(_absent(partial), isolation_level=None)) as connection,
-    ):
-        connection.execute("PRAGMA journal_mode = OFF")
-        connection.execute("PRAGMA synchronous = OFF")
-        connection.execute("BEGIN")
-        for name, columns in tables.items():
-            connection.execute(f'CREATE TABLE "{name}" ({columns})')
-            if rows.get(name):
-                marks = ", ".join("?" * len(rows[name][0]))
-                connection.executemany(f'INSERT INTO "{name}" VALUES ({marks})', rows[name])
-        for statement in after:
-            connection.execute(statement)
-        connection.execute("COMMIT")
-
-
-def _absent(path: Path) -> Path:
-    path.unlink(missing_ok=True)  # a process that was killed may have left a part
-    return path
+    with atomic_write(path) as partial:
+        partial.unlink(missing_ok=True)  # a process that was killed may have left a part
+        with closing(sqlite3.connect(partial, isolation_level=None)) as connection:
+            connection.execute("PRAGMA journal_mode = OFF")
+            connection.execute("PRAGMA synchronous = OFF")
+            connection.execute("BEGIN")
+            for name, columns in tables.items():
+                connection.execute(f'CREATE TABLE "{name}" ({columns})')
+                if rows.get(name):
+                    marks = ", ".join("?" * len(rows[name][0]))
+                    connection.executemany(f'INSERT INTO "{name}" VALUES ({marks})', rows[name])
+            for statement in after:
+                connection.execute(statement)
+            connection.execute("COMMIT")

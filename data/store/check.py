@@ -8,17 +8,21 @@ from itertools import groupby
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 
-from shiftsim.data.store.check_map import MapCheck
-from shiftsim.data.store.check_motion import Finding, check_boxes, check_ego, read_boxes
+from shiftsim.data.readers.motion import MAX_SHARE, contradiction, fitted_velocities
+from shiftsim.data.store.check_map import MapCheck, Problem
 from shiftsim.data.store.reading import ScenarioStore
-from shiftsim.data.store.tables import MANIFEST, REPORTS, digest, read_manifest
-from shiftsim.data.store.tracks import open_ego, open_recording, whole_ego
+from shiftsim.data.store.recordings import ego_span, ego_states
+from shiftsim.data.store.schema import MOTION
+from shiftsim.data.store.tables import MANIFEST, REPORTS, column, digest, read_manifest
 from shiftsim.errors import DataError
+from shiftsim.geometry.boxes import wrap_angles
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.map import VectorMap
 from shiftsim.world.ranges import CHECK
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import LAST_AGENT_KIND, VX, VY, AgentKind, LightStatus
+from shiftsim.world.state import HEADING, LAST_AGENT_KIND, VX, VY, AgentKind, LightStatus
 
 _MAX_SPEED = 100.0  # m/s; anything faster is in the wrong unit
 _LAST_STEPS_S = 0.5  # by which the last iteration may come before the end
@@ -27,18 +31,11 @@ _MAX_ANGLE = 2.0 * np.pi  # rad; larger headings are in degrees
 _LEAST_S = 3.0  # s, of a scenario
 _MAX_STEP_US = 1_000_000  # us between rows
 _BESIDE = ("filter", "splits")  # folders that hold statements about the scenarios
-
-
-@dataclass(frozen=True)
-class Problem:
-    """One thing that is wrong."""
-
-    where: str  # file, map or scenario
-    what: str  # what is wrong there: value and limit
-    is_error: bool = True  # whether results cannot be trusted; else it is only unusual
-    remedy: str = ""  # what to do
-    kind: str = ""  # short name of what was looked at
-    recording: str = ""  # the recording that it belongs to
+_ROW_S = 0.05
+_FAST = 2.0  # m/s
+_MAX_TURNED = 0.5  # rad, median angle between heading and motion of a vehicle
+_LEAST_ROWS = 20  # of motion that say something of a heading
+_CHECK_UNITS = "check the unit and the axes of velocities and positions where they came from"
 
 
 @dataclass(frozen=True)
@@ -100,24 +97,17 @@ def survey_store(path: str | Path) -> CheckReport:
                 Problem(where, what, remedy=CHECK, kind="map")
                 for what in _check_map(store.map(city))
             ]
-            problems += [_problem(where, f) for f in maps[city].of_map()]
+            problems += maps[city].of_map()
         except DataError as error:
             problems.append(Problem(where, error.message, remedy=error.hint, kind="map"))
     rows = []
     summary = store.summary().select(["token", "recording", "city", "ego"]).to_pylist()
-    for name, group in groupby(sorted(summary, key=_place), lambda row: row["recording"]):
+    summary.sort(key=lambda row: (row["recording"], row["token"]))
+    for name, group in groupby(summary, lambda row: row["recording"]):
         row, found = _check_recording(store, name, list(group), maps)
         rows.append(row)
         problems += found
     return CheckReport(problems, rows)
-
-
-def _place(row: dict[str, str]) -> tuple[str, str]:
-    return row["recording"], row["token"]
-
-
-def _problem(where: str, found: Finding, recording: str = "") -> Problem:
-    return Problem(where, found.what, found.is_error, found.remedy, found.kind, recording)
 
 
 def _check_recording(
@@ -125,44 +115,115 @@ def _check_recording(
 ) -> tuple[RecordingRow, list[Problem]]:
     """One recording with its egos and scenarios."""
     problems: list[Problem] = []
+
+    def add(where: str, what: str, remedy: str, kind: str, is_error: bool = True) -> None:
+        problems.append(Problem(where, what, is_error, remedy, kind, name))
+
     where, city, duration, tracks = f"recording {name}", scenarios[0]["city"], 0.0, 0
     try:
-        folder = store.recording_folder(name)
-        recording = open_recording(folder)
-        time_us = recording.frames.read(columns=["time_us"])["time_us"].to_numpy()
-        duration, tracks = float(time_us[-1] - time_us[0]) / 1e6, len(recording.tokens)
-        found = check_boxes(recording, read_boxes(recording), time_us)
-        problems += [_problem(where, f, name) for f in found]
+        recording = store.recording(name)
+        time_us = column(recording.frames.read(columns=["time_us"], plausible=False), "time_us")
+        duration = float(time_us[-1] - time_us[0]) / 1e6
+        boxes = recording.tracks.read(plausible=False).sort_by(
+            [("track", "ascending"), ("row", "ascending")]
+        )
+        tracks = len(boxes["track"].unique())
+        for kind, what, remedy in _check_boxes(boxes, time_us):
+            add(where, what, remedy, kind)
         for ego in sorted({row["ego"] for row in scenarios}):
-            table = open_ego(folder, ego)
-            first, states = whole_ego(table)
-            found = check_ego(states, time_us[first : first + len(states)])
-            problems += [_problem(f"{where}, ego {ego}", f, name) for f in found]
+            table = store.ego(name, ego)
+            first, last = ego_span(table)
+            states = ego_states(table, first, last, plausible=False)
+            for what in _check_ego(states, time_us[first:last]):
+                remedy = f"{_CHECK_UNITS}: the ego's are along and across the vehicle"
+                add(f"{where}, ego {ego}", what, f"{remedy}, at the rear axle", "velocity")
     except DataError as error:
-        problems.append(Problem(where, error.message, True, error.hint, "file", name))
+        add(where, error.message, error.hint, "file")
     for row in scenarios:
         place = f"scenario {row['token']}"
         try:
             scene = store.read(row["token"], plausible=False)
-            problems += [
-                Problem(place, what, True, hint, "range", name)
-                for what, hint in _check_scenario(scene)
-            ]
+            for what, remedy in _check_scenario(scene):
+                add(place, what, remedy, "range")
             if row["city"] in maps:
-                found = maps[row["city"]].of_scenario(scene)
-                problems += [_problem(place, f, name) for f in found]
-            problems += [
-                Problem(place, what, False, hint, kind, name)
-                for kind, what, hint in _unusual(scene)
-            ]
+                problems += maps[row["city"]].of_scenario(scene, name)
+            for kind, what, remedy in _unusual(scene):
+                add(place, what, remedy, kind, is_error=False)
         except DataError as error:
-            problems.append(Problem(place, error.message, True, error.hint, "file", name))
+            add(place, error.message, error.hint, "file")
     errors = sum(problem.is_error for problem in problems)
-    kinds = Counter(problem.kind for problem in problems)
+    kinds = dict(sorted(Counter(problem.kind for problem in problems).items()))
     counts = len(scenarios), errors, len(problems) - errors
-    return RecordingRow(
-        name, city, duration, tracks, *counts, dict(sorted(kinds.items()))
-    ), problems
+    return RecordingRow(name, city, duration, tracks, *counts, kinds), problems
+
+
+def _check_boxes(boxes: pa.Table, time_us: IntArray) -> Iterator[tuple[str, str, str]]:
+    """Kind, what is wrong with the boxes of a recording, and what to do.
+
+    `boxes` are rows of `schema.TRACKS`, sorted by track, then by row; `time_us` (R,) are the times.
+    """
+    row, track = column(boxes, "row"), column(boxes, "track")
+    twice = np.flatnonzero((np.diff(row) == 0) & (np.diff(track) == 0))
+    if len(twice):
+        name = boxes["token"][int(twice[0])].as_py()
+        yield (
+            "repeated rows",
+            f"track {name!r} has two boxes in row {row[twice[0]]} ({len(twice)} such boxes)",
+            "leave repeated rows out, and give every object an id of its own",
+        )
+        return
+    motion = np.column_stack([column(boxes, name) for name in MOTION])
+    kinds = column(boxes, "kind")
+    good = np.isfinite(motion).all(axis=1) & (kinds <= LAST_AGENT_KIND)
+    good = np.flatnonzero(good & (row >= 0) & (row < len(time_us)))
+    if not len(good) or (np.diff(time_us) <= 0).any():
+        return
+    _, first, owner = np.unique(track[good], return_index=True, return_inverse=True)
+    names = boxes["token"].take(good[first]).to_pylist()
+    time = (time_us[row[good]] - time_us[0]) * 1e-6
+    derived = fitted_velocities(motion[good, :2], time, owner, _ROW_S)
+    is_wrong, share = contradiction(motion[good, 3:], derived, time, owner)
+    if is_wrong.any():
+        worst = int(np.argmax(np.where(is_wrong, share, -1.0)))
+        yield (
+            "velocity",
+            f"the velocity of {is_wrong.sum()} of {len(names)} tracks contradicts their positions,"
+            f" most that of track {names[worst]!r}, by {share[worst]:.0%}, at most {MAX_SHARE:.0%}",
+            _CHECK_UNITS,
+        )
+    # whether most vehicles point somewhere else than they move; some do go backwards
+    moving = np.hypot(derived[:, 0], derived[:, 1]) > _FAST
+    moving &= kinds[good] == AgentKind.VEHICLE
+    course = np.arctan2(derived[moving, 1], derived[moving, 0])
+    turned = np.abs(wrap_angles(motion[good, 2][moving] - course))
+    rows = np.bincount(owner[moving], minlength=len(names))
+    away = np.bincount(owner[moving], turned > _MAX_TURNED, minlength=len(names))
+    known = rows >= _LEAST_ROWS
+    wrong = known & (away > 0.5 * rows)
+    if wrong.sum() > 0.5 * known.sum():
+        yield (
+            "heading",
+            f"{wrong.sum()} of {known.sum()} moving vehicles point more than {_MAX_TURNED:g} rad"
+            f" away from their motion, such as track {names[int(np.flatnonzero(wrong)[0])]!r}",
+            "check the unit (radians), zero (x axis) and sense (counter-clockwise) of headings",
+        )
+
+
+def _check_ego(states: FloatArray, time_us: IntArray) -> Iterator[str]:
+    """What is wrong with the velocities of an ego, states (R, 11) at times (R,)."""
+    if not np.isfinite(states).all() or (np.diff(time_us) <= 0).any():
+        return
+    cos, sin = np.cos(states[:, HEADING]), np.sin(states[:, HEADING])
+    vx, vy = states[:, VX], states[:, VY]
+    stored = np.column_stack([vx * cos - vy * sin, vx * sin + vy * cos])
+    time, track = (time_us - time_us[0]) * 1e-6, np.zeros(len(states), np.int64)
+    derived = fitted_velocities(states[:, :2], time, track, _ROW_S)
+    is_wrong, share = contradiction(stored, derived, time, track)
+    if is_wrong[0]:
+        yield (
+            f"the velocity of the ego contradicts its positions by {share[0]:.0%}, at most"
+            f" {MAX_SHARE:.0%}"
+        )
 
 
 def _check_files(store: Path, files: dict[str, str]) -> Iterator[Problem]:
@@ -206,41 +267,29 @@ def _duration(scene: Scenario) -> float:
 
 
 def _wrong_numbers(scene: Scenario) -> Iterator[str]:
-    steps = np.diff(scene.time_us)
-    if (steps <= 0).any():
-        yield "time stamps do not increase"
-    rows = scene.iteration_rows
-    if len(rows) < 3 or rows[0] < 0 or rows[-1] >= len(scene.time_us) or (np.diff(rows) <= 0).any():
-        yield "the iterations are not at least three increasing rows"
-    if not np.isfinite(scene.ego).all():
-        yield "an ego state is not finite"
-    elif np.hypot(scene.ego[:, VX], scene.ego[:, VY]).max() > _MAX_SPEED:
-        yield f"the ego is faster than {_MAX_SPEED:g} m/s"
-    elif np.abs(scene.ego[:, 2]).max() > _MAX_ANGLE:
-        yield "an ego heading is not in radians"
-    if scene.mission_goal is not None and not np.isfinite(scene.mission_goal).all():
-        yield "the mission goal is not finite"
-    yield from _check_tracks(scene)
-    codes = scene.traffic_lights.status
-    if codes.size and not int(LightStatus.ABSENT) <= codes.min() <= codes.max() <= max(LightStatus):
-        yield "a traffic light has an unknown status"
-
-
-def _check_tracks(scene: Scenario) -> Iterator[str]:
-    tracks, valid = scene.tracks, scene.tracks.valid
-    if len(set(tracks.tokens)) != tracks.num_tracks:
-        yield "two tracks have one token"
-    if not np.isin(tracks.kinds, list(map(int, AgentKind))).all():
-        yield "a track has an unknown kind"
-    if not np.isfinite(tracks.poses[valid]).all():
-        yield "a track's pose is not finite"
-    if not (tracks.sizes[valid] > 0.0).all():
-        yield "a track has no length or width"
-    elif (tracks.sizes[valid] > _MAX_LENGTH).any():
-        yield f"a track is longer than {_MAX_LENGTH:g} m"
+    tracks, valid, codes = scene.tracks, scene.tracks.valid, scene.traffic_lights.status
     moving = tracks.velocities[:, tracks.kinds <= LAST_AGENT_KIND]
-    if (np.abs(moving[~np.isnan(moving)]) > _MAX_SPEED).any():
-        yield f"a track is faster than {_MAX_SPEED:g} m/s"
+    sizes = tracks.sizes[valid]
+    with np.errstate(invalid="ignore"):
+        wrong = {
+            "time stamps do not increase": (np.diff(scene.time_us) <= 0).any(),
+            "there are fewer than three iterations": len(scene.iteration_rows) < 3,
+            "an ego state is not finite": not np.isfinite(scene.ego).all(),
+            f"the ego is faster than {_MAX_SPEED:g} m/s": (
+                np.hypot(scene.ego[:, VX], scene.ego[:, VY]) > _MAX_SPEED
+            ).any(),
+            "an ego heading is not in radians": (np.abs(scene.ego[:, HEADING]) > _MAX_ANGLE).any(),
+            "the mission goal is not finite": scene.mission_goal is not None
+            and not np.isfinite(scene.mission_goal).all(),
+            "two tracks have one token": len(set(tracks.tokens)) != tracks.num_tracks,
+            "a track has an unknown kind": not np.isin(tracks.kinds, list(AgentKind)).all(),
+            "a track's pose is not finite": not np.isfinite(tracks.poses[valid]).all(),
+            "a track has no length or width": not (sizes > 0.0).all(),
+            f"a track is longer than {_MAX_LENGTH:g} m": (sizes > _MAX_LENGTH).any(),
+            f"a track is faster than {_MAX_SPEED:g} m/s": (np.abs(moving) > _MAX_SPEED).any(),
+            "a traffic light has an unknown status": not np.isin(codes, list(LightStatus)).all(),
+        }
+    yield from (what for what, is_wrong in wrong.items() if is_wrong)
 
 
 def _unusual(scene: Scenario) -> Iterator[tuple[str, str, str]]:

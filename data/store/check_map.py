@@ -1,13 +1,13 @@
-"""Lanes that overlap, egos beside the map, routes with holes: what makes tasks fail later."""
+"""Lanes that overlap, egos off the map, routes with holes: what makes tasks fail later."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 import shapely
 
-from shiftsim.data.store.check_motion import Finding
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.world.layers import Polygons, containing, nearest
@@ -19,7 +19,19 @@ _MAX_OFF = 3.0  # m, how far the ego may be beside lanes and drivable area
 _MAX_OFF_SHARE = 0.1  # of the iterations
 _REACH = 1000.0  # m, in which the nearest lane is looked for
 _MIN_OVERLAP = 0.5  # m^2, of two lanes; less is hardly ever met
-_AGAIN = "convert the map again, or repair the polygons of these lanes"
+_REPAIR_LANES = "convert the map again, or repair the polygons of these lanes"
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing that is wrong."""
+
+    where: str  # file, map or scenario
+    what: str  # what is wrong there: value and limit
+    is_error: bool = True  # whether results cannot be trusted; else it is only unusual
+    remedy: str = ""  # what to do
+    kind: str = ""  # short name of what was checked
+    recording: str = ""  # the recording that it belongs to
 
 
 class MapCheck:
@@ -35,11 +47,9 @@ class MapCheck:
         road = self.road
         shapes = np.array([road.edges.shape(lane) for lane in range(road.num_lanes)], object)
         first, second = shapely.STRtree(shapes).query(shapes, predicate="intersects")
-        kept = first < second
-        first, second = first[kept], second[kept]
-        good = shapely.is_valid(shapes)
-        kept = good[first] & good[second]
-        first, second = first[kept], second[kept]
+        is_valid = shapely.is_valid(shapes)
+        chosen = (first < second) & is_valid[first] & is_valid[second]
+        first, second = first[chosen], second[chosen]
         shared = shapely.intersection(shapes[first], shapes[second])
         area = shapely.area(shared)
         return {
@@ -50,27 +60,27 @@ class MapCheck:
             for i in np.flatnonzero(area > _MIN_OVERLAP).tolist()
         }
 
-    def of_map(self) -> Iterator[Finding]:
+    def of_map(self) -> Iterator[Problem]:
         """Lanes that overlap anywhere."""
         if self.overlaps:
             (a, b), (area, point) = max(self.overlaps.items(), key=lambda item: item[1][0])
             ids = self.road.edges.ids
-            yield Finding(
-                "lanes overlap",
+            yield Problem(
+                f"map {self.road.name}",
                 f"{len(self.overlaps)} pairs of lanes overlap by more than {_MIN_OVERLAP:g} m²,"
                 f" most {ids[a]!r} and {ids[b]!r}, by {area:.1f} m² at ({point[0]:.1f},"
                 f" {point[1]:.1f}); a rollout that comes there fails",
-                _AGAIN,
                 is_error=False,
+                remedy=_REPAIR_LANES,
+                kind="lanes overlap",
             )
 
-    def of_scenario(self, scene: Scenario) -> Iterator[Finding]:
+    def of_scenario(self, scene: Scenario, recording: str) -> Iterator[Problem]:
         """What the map says of a scenario."""
-        yield from self._overlap(scene)
-        yield from self._place(scene)
-        yield from self._route(scene)
+        for found in (self._overlap(scene), self._place(scene), self._route(scene)):
+            yield from (replace(problem, recording=recording) for problem in found)
 
-    def _overlap(self, scene: Scenario) -> Iterator[Finding]:
+    def _overlap(self, scene: Scenario) -> Iterator[Problem]:
         road = self.road
         centers = center_poses(scene.expert[:, :3])
         sizes = np.broadcast_to([PACIFICA.length, PACIFICA.width], (len(centers), 2))
@@ -86,26 +96,28 @@ class MapCheck:
             at = several[0] // 5
             when = _seconds(scene)[at]
             fate = "will fail" if at == 0 else "fail if its lane is looked for there"
-            yield Finding(
-                "lanes overlap",
+            yield Problem(
+                f"scenario {scene.token}",
                 f"lanes {pair} overlap at ({x:.2f}, {y:.2f}), where the ego is at {when:.1f} s; it"
                 f" cannot be assigned to one, so its tasks {fate}",
-                _AGAIN,
+                remedy=_REPAIR_LANES,
+                kind="lanes overlap",
             )
             return
         blocks = {road.blocks.index[name] for name in scene.route if name in road.blocks.index}
         for (a, b), (area, point) in self.overlaps.items():
             if road.block_of[a] in blocks or road.block_of[b] in blocks:
-                yield Finding(
-                    "lanes overlap",
+                yield Problem(
+                    f"scenario {scene.token}",
                     f"lanes {ids[a]!r} and {ids[b]!r} on the route overlap by {area:.1f} m² at"
                     f" ({point[0]:.2f}, {point[1]:.2f}), at most {_MIN_OVERLAP:g} m²; tasks that"
                     " come there will fail",
-                    _AGAIN,
+                    remedy=_REPAIR_LANES,
+                    kind="lanes overlap",
                 )
                 return
 
-    def _place(self, scene: Scenario) -> Iterator[Finding]:
+    def _place(self, scene: Scenario) -> Iterator[Problem]:
         road = self.road
         centers = np.ascontiguousarray(center_poses(scene.expert[:, :3])[:, :2])
         if not np.isfinite(centers).all():
@@ -117,25 +129,27 @@ class MapCheck:
             first = int(np.flatnonzero(beside)[0])
             far = off.max()
             shown = f"{far:.1f} m" if np.isfinite(far) else f"more than {_REACH:g} m"
-            yield Finding(
-                "off the map",
+            yield Problem(
+                f"scenario {scene.token}",
                 f"the ego is up to {shown} beside lanes and drivable area, from"
                 f" {_seconds(scene)[first]:.1f} s on, in {beside.mean():.0%} of the iterations,"
                 f" at most {_MAX_OFF:g} m in {_MAX_OFF_SHARE:.0%}",
-                "check that map and recording have one origin, or leave the scenario out",
-                bool(beside.mean() > _MAX_OFF_SHARE),
+                is_error=bool(beside.mean() > _MAX_OFF_SHARE),
+                remedy="check that map and recording have one origin, or leave the scenario out",
+                kind="off the map",
             )
 
-    def _route(self, scene: Scenario) -> Iterator[Finding]:
+    def _route(self, scene: Scenario) -> Iterator[Problem]:
         road = self.road
         blocks = [road.blocks.index.get(name, -1) for name in scene.route]
         for place, (one, other) in enumerate(pairwise(blocks)):
             if min(one, other) >= 0 and other not in road.block_outgoing.at(one):
-                yield Finding(
-                    "route",
+                yield Problem(
+                    f"scenario {scene.token}",
                     f"roadblock {place + 2} of {len(blocks)} of the route,"
                     f" {scene.route[place + 1]!r}, does not follow {scene.route[place]!r}",
-                    "correct the route in shiftsim inspect",
+                    remedy="correct the route in shiftsim inspect",
+                    kind="route",
                 )
                 return
 

@@ -1,57 +1,81 @@
-"""A VectorMap as one row of a Parquet file, one list column per array, and back.
+"""A VectorMap as an Arrow IPC file: one row, one list column per array.
 
-Only what cannot be made of the rest is stored: no arc lengths, bounds and grids, which stores of
-version 1 hold and which are made again for those, too.
+The file is mapped into memory and its arrays are used as they lie there, so that all processes of a
+machine share them. Kernels follow the indices of a map without looking: they are checked here.
 """
 
+import os
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from shiftsim.data.store.plausible import require_sound, require_vertices
-from shiftsim.data.store.tables import REPAIR, Table, write_blocks
+from shiftsim.data.store.schema import list_of
+from shiftsim.data.store.tables import REPAIR
 from shiftsim.errors import DataError
-from shiftsim.kernels import readonly
-from shiftsim.world.layers import Layer, Lists, index_polygons, index_polylines
-from shiftsim.world.map import LAYERS, VectorMap
+from shiftsim.files import atomic_write
+from shiftsim.kernels import FloatArray, IntArray, readonly
+from shiftsim.world.layers import Layer, Lists, Polygons, Polylines
+from shiftsim.world.map import LAYERS, NONE, VectorMap
+from shiftsim.world.ranges import MAP_EXTENT, STORE, require
 
-LINES = ("baselines", "left_boundaries", "right_boundaries")
-LISTS = ("incoming", "outgoing", "stop_lines", "block_edges", "block_incoming", "block_outgoing")
-_ARRAYS = {"speed_limits": "speed_limits_mps"} | {  # field -> column with its unit
-    name: name
-    for name in "lane_index left_lane right_lane block_of has_traffic_lights intersection_of"
-    " turn_type is_bike intersection_kinds stop_kinds".split()
+_F64, _I64, _TEXT = pa.float64(), pa.int64(), pa.string()
+_LINES = ("baselines", "left_boundaries", "right_boundaries")
+# the objects that have a list each, and those that the lists name
+_LISTS = {
+    "incoming": ("edges", "edges"),
+    "outgoing": ("edges", "edges"),
+    "stop_lines": ("edges", "stop_polygons"),
+    "block_edges": ("blocks", "edges"),
+    "block_incoming": ("blocks", "blocks"),
+    "block_outgoing": ("blocks", "blocks"),
 }
-_NOTES = {"name": str, "epsg": int, "num_lanes": int, "num_roadblocks": int, "flaws": dict}
-_POINTERS = {name: ("ring_ptr", "poly_ptr") for name in LAYERS} | dict.fromkeys(LINES, ("ptr",))
+# arrays with a value per object: of which objects, its type, and the objects that it names
+_ARRAYS = {
+    "speed_limits": ("edges", _F64, ""),
+    "lane_index": ("edges", _I64, ""),
+    "left_lane": ("edges", _I64, "edges"),
+    "right_lane": ("edges", _I64, "edges"),
+    "block_of": ("edges", _I64, "blocks"),
+    "has_traffic_lights": ("edges", pa.bool_(), ""),
+    "intersection_of": ("edges", _I64, "intersections"),
+    "turn_type": ("edges", _I64, ""),
+    "is_bike": ("edges", pa.bool_(), ""),
+    "intersection_kinds": ("intersections", _I64, ""),
+    "stop_kinds": ("stop_polygons", _I64, ""),
+}
+_NUMBERS = ("epsg", "num_lanes", "num_roadblocks")
+_UNITS = {"xy": "_m", "bounds": "_m", "grid": "_m", "arc": "_m", "speed_limits": "_mps"}
+_PARTS = {  # columns of arrays of several axes, and of floats
+    "xy": pa.list_(pa.field("item", _F64, nullable=False), 2),
+    "bounds": pa.list_(pa.field("item", _F64, nullable=False), 4),
+    "grid": _F64,
+    "arc": _F64,
+}
 
 
-def _schema(points: tuple[str, ...]) -> pa.Schema:
-    """The columns, where vertices are in columns that end as given."""
+def _columns() -> dict[str, pa.DataType]:
+    """Type of the items of every list column."""
     out: dict[str, pa.DataType] = {}
-    for name, pointers in _POINTERS.items():
-        out |= {f"{name}_{part}": pa.float64() for part in points}
-        out |= {f"{name}_{part}": pa.int64() for part in pointers}
-    for name in LISTS:
-        out |= {f"{name}_{part}": pa.int64() for part in Lists._fields}
-    for name, column in _ARRAYS.items():
-        numbers = pa.float64() if name == "speed_limits" else pa.int64()
-        out[column] = pa.bool_() if name in ("has_traffic_lights", "is_bike") else numbers
-    for name in LAYERS:
-        out[f"{name}_ids"] = pa.string()
-    out["left_boundary_ids"] = out["right_boundary_ids"] = pa.string()
-    return pa.schema(
-        [
-            pa.field(column, pa.list_(pa.field("item", kind, nullable=False)), nullable=False)
-            for column, kind in out.items()
-        ]
-    )
+    kinds: dict[str, Any] = dict.fromkeys(LAYERS, Polygons) | dict.fromkeys(_LINES, Polylines)
+    for name, kind in (kinds | dict.fromkeys(_LISTS, Lists)).items():
+        for part in kind._fields:
+            out[f"{name}_{part}{_UNITS.get(part, '')}"] = _PARTS.get(part, _I64)
+    out |= {f"{name}{_UNITS.get(name, '')}": kind for name, (_, kind, _) in _ARRAYS.items()}
+    out |= dict.fromkeys([f"{name}_ids" for name in LAYERS], _TEXT)
+    out |= {"left_boundary_ids": _TEXT, "right_boundary_ids": _TEXT}
+    return out | {"flaws": _TEXT, "flaw_counts": _I64}
 
 
-SCHEMA = _schema(("x_m", "y_m"))
-_FIRST_SCHEMA = _schema(("xy_m",))  # of version 1, x and y in turn
+SCHEMA = pa.schema(
+    [
+        pa.field("name", _TEXT, nullable=False),
+        *(pa.field(name, _I64, nullable=False) for name in _NUMBERS),
+        *(pa.field(name, list_of(kind), nullable=False) for name, kind in _columns().items()),
+    ]
+)
 
 
 def write_map(path: Path, road: VectorMap) -> None:
@@ -61,78 +85,163 @@ def write_map(path: Path, road: VectorMap) -> None:
         DataError: A number is outside of its range, or an index of something that is not there.
     """
     require_sound(road, str(path))
-    values: dict[str, Any] = {}
-    for name, pointers in _POINTERS.items():
-        group = getattr(road, name)
-        flat = group.polygons if isinstance(group, Layer) else group
-        values[f"{name}_x_m"], values[f"{name}_y_m"] = np.ascontiguousarray(flat.xy.T)
-        values |= {f"{name}_{part}": getattr(flat, part) for part in pointers}
-    for name in LISTS:
-        values |= {f"{name}_{part}": getattr(getattr(road, name), part) for part in Lists._fields}
-    for name, column in _ARRAYS.items():
-        values[column] = getattr(road, name)
-    for name in LAYERS:
-        values[f"{name}_ids"] = list(getattr(road, name).ids)
+    values: dict[str, Any] = {name: getattr(road, name) for name in ("name", *_NUMBERS)}
+    for item in fields(road):
+        value = getattr(road, item.name)
+        if isinstance(value, Layer):
+            values[f"{item.name}_ids"] = list(value.ids)
+            value = value.polygons
+        if isinstance(value, np.ndarray):
+            values[f"{item.name}{_UNITS.get(item.name, '')}"] = value
+        elif isinstance(value, Polygons | Polylines | Lists):
+            for part, array in value._asdict().items():
+                values[f"{item.name}_{part}{_UNITS.get(part, '')}"] = array
     values["left_boundary_ids"] = [left for left, _ in road.boundary_ids]
     values["right_boundary_ids"] = [right for _, right in road.boundary_ids]
+    values["flaws"], values["flaw_counts"] = list(road.flaws), list(road.flaws.values())
     columns = [_one_row(values[field.name], field.type) for field in SCHEMA]
-    footer = {name: getattr(road, name) for name in _NOTES}
-    write_blocks(path, [pa.Table.from_arrays(columns, schema=SCHEMA)], footer)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(path) as partial, pa.ipc.new_file(str(partial), SCHEMA) as writer:
+        writer.write_table(pa.Table.from_arrays(columns, schema=SCHEMA))
 
 
 def _one_row(values: Any, kind: pa.DataType) -> pa.Array:
-    items = pa.array(values, kind.value_type)
-    offsets = pa.array([0, len(items)], pa.int32())
-    return pa.ListArray.from_arrays(offsets, items, type=kind)
+    if not pa.types.is_list(kind):
+        return pa.array([values], kind)
+    if pa.types.is_fixed_size_list(kind.value_type):
+        flat = pa.array(np.ascontiguousarray(values).reshape(-1), _F64)
+        items = pa.FixedSizeListArray.from_arrays(flat, type=kind.value_type)
+    else:
+        items = pa.array(values, kind.value_type)
+    return pa.ListArray.from_arrays(pa.array([0, len(items)], pa.int32()), items, type=kind)
 
 
 def read_map_file(path: Path) -> VectorMap:
-    """Read a map back; its arrays are read-only.
+    """Read a map back; its arrays are read-only, and lie in the file.
 
     Raises:
         DataError: The file is missing or damaged.
     """
-    file = Table(path, SCHEMA, _FIRST_SCHEMA)
-    if file.num_rows != 1:
-        raise DataError(f"{path}: {file.num_rows} rows, not 1", hint=REPAIR)
-    # column by column: decoding a city at once takes three times its size
-    items = {name: _items(file.read(columns=[name])[name]) for name in file.names}
     try:
-        road = _assemble(file.footer, items, str(path))
-    except (KeyError, ValueError, TypeError) as error:
-        raise DataError(f"{path}: the arrays do not fit together: {error}", hint=REPAIR) from error
-    del items
-    pa.default_memory_pool().release_unused()
+        table = pa.ipc.open_file(pa.memory_map(str(path))).read_all()
+        if table.schema != SCHEMA:
+            raise ValueError(_difference(table.schema))
+        table.validate(full=True)
+        if len(table) != 1 or any(column.null_count for column in table.columns):
+            raise ValueError(f"{len(table)} rows, not 1, or values are missing")
+        items = {name: table[name].chunk(0) for name in SCHEMA.names}
+        road = _assemble({name: _value(array) for name, array in items.items()})
+    except (OSError, KeyError, ValueError, TypeError, pa.ArrowException) as error:
+        is_there = os.path.exists(path)
+        what = f"not a readable map: {error}" if is_there else "the file is missing"
+        raise DataError(f"{path}: {what}", hint=REPAIR) from error
     require_sound(road, str(path))
     return road
 
 
-def _items(column: pa.ChunkedArray) -> Any:
-    values = column.chunk(0).flatten()
-    if pa.types.is_string(values.type):
-        return tuple(values.to_pylist())
-    return values.to_numpy(zero_copy_only=False)
+def _difference(found: pa.Schema) -> str:
+    for field in SCHEMA:
+        if found.get_field_index(field.name) < 0:
+            return f"column {field.name!r} is missing"
+        if found.field(field.name) != field:
+            return f"column {field.name!r} is {found.field(field.name).type}, not {field.type}"
+    return "there are other columns"
 
 
-def _assemble(footer: dict[str, Any], items: dict[str, Any], where: str) -> VectorMap:
-    parts: dict[str, Any] = {}
-    for name, pointers in _POINTERS.items():
-        together = items.get(f"{name}_xy_m")
-        if together is None:
-            together = np.column_stack([items[f"{name}_x_m"], items[f"{name}_y_m"]])
-        given = [together.reshape(-1, 2), *(items[f"{name}_{part}"] for part in pointers)]
-        require_vertices(f"{where}: {name}", *given)
-        parts[name] = index_polygons(*given) if name in LAYERS else index_polylines(*given)
-    for name in LISTS:
-        parts[name] = Lists(*(readonly(items[f"{name}_{part}"]) for part in Lists._fields))
+def _value(array: pa.Array) -> Any:
+    """The one value of a column: a scalar, a tuple of texts, or a read-only array."""
+    if not pa.types.is_list(array.type):
+        return array[0].as_py()
+    items, width = array.flatten(), 0
+    if pa.types.is_fixed_size_list(items.type):
+        items, width = items.flatten(), items.type.list_size
+    if items.null_count:
+        raise ValueError("values are missing")
+    if pa.types.is_string(items.type):
+        return tuple(items.to_pylist())
+    numbers = items.to_numpy(zero_copy_only=False)
+    return readonly(numbers.reshape(-1, width) if width else numbers)
+
+
+def _assemble(values: dict[str, Any]) -> VectorMap:
+    parts: dict[str, Any] = {name: values[name] for name in ("name", *_NUMBERS)}
+    kinds: dict[str, Any] = dict.fromkeys(LAYERS, Polygons) | dict.fromkeys(_LINES, Polylines)
+    for name, kind in (kinds | dict.fromkeys(_LISTS, Lists)).items():
+        columns = [f"{name}_{part}{_UNITS.get(part, '')}" for part in kind._fields]
+        parts[name] = kind(*(values[column] for column in columns))
     for name in LAYERS:
-        ids = items[f"{name}_ids"]
-        if len(ids) != len(parts[name].poly_ptr) - 1:
-            raise ValueError(f"{name}: {len(ids)} ids")
-        parts[name] = Layer(ids, parts[name])
-    parts.update({name: items[column] for name, column in _ARRAYS.items()})
-    for name, kind in _NOTES.items():
-        if type(footer[name]) is not kind:
-            raise TypeError(f"{name} in the footer is {footer[name]!r}")
-    pairs = zip(items["left_boundary_ids"], items["right_boundary_ids"], strict=True)
-    return VectorMap(boundary_ids=tuple(pairs), **parts, **footer)
+        parts[name] = Layer(values[f"{name}_ids"], parts[name])
+    parts |= {name: values[f"{name}{_UNITS.get(name, '')}"] for name in _ARRAYS}
+    pairs = zip(values["left_boundary_ids"], values["right_boundary_ids"], strict=True)
+    flaws = dict(zip(values["flaws"], values["flaw_counts"].tolist(), strict=True))
+    return VectorMap(boundary_ids=tuple(pairs), flaws=flaws, **parts)
+
+
+def require_sound(road: VectorMap, where: str) -> None:
+    """Refuse a map with a number outside of its range, or an index of something that is not there.
+
+    Raises:
+        DataError: It has one.
+    """
+    count = {name: len(getattr(road, name)) for name in LAYERS}
+    for name in LAYERS:
+        layer: Layer = getattr(road, name)
+        if len(layer.ids) != len(layer.polygons.bounds) or len(layer.index) != len(layer.ids):
+            raise DataError(f"{where}: {name}: an id is missing or occurs twice", REPAIR)
+        _require_polygons(layer.polygons, f"{where}: {name}:")
+    for name in _LINES:
+        lines: Polylines = getattr(road, name)
+        _require_places(lines.xy, f"{where}: {name}:")
+        require(STORE, "arc", lines.arc, f"{where}: {name}:")
+        least = 2 * (name == "baselines")
+        _require_parts(lines.ptr, len(lines.xy), count["edges"], f"{where}: {name}", least=least)
+        _require(len(lines.arc) == len(lines.xy), f"{where}: {name}")
+    for name, (owner, target) in _LISTS.items():
+        lists: Lists = getattr(road, name)
+        _require_parts(lists.ptr, len(lists.items), count[owner], f"{where}: {name}")
+        _require_index(lists.items, 0, count[target], f"{where}: {name}")
+    for name, (owner, _, target) in _ARRAYS.items():
+        _require(len(getattr(road, name)) == count[owner], f"{where}: {name}")
+        if target:
+            _require_index(getattr(road, name), NONE, count[target], f"{where}: {name}")
+    require(STORE, "speed_limits", road.speed_limits, f"{where}:", may_be_nan=True)
+    _require(len(road.boundary_ids) == count["edges"], f"{where}: boundary_ids")
+    _require(0 <= road.num_lanes <= count["edges"], f"{where}: num_lanes")
+    _require(0 <= road.num_roadblocks <= count["blocks"], f"{where}: num_roadblocks")
+
+
+def _require_places(xy: FloatArray, where: str) -> None:
+    """Refuse vertices out of their range, or too far apart for a grid over them."""
+    require(STORE, "xy", xy, where)
+    if len(xy):
+        require(MAP_EXTENT, "extent", max(np.ptp(xy[:, 0]), np.ptp(xy[:, 1])), where)
+
+
+def _require_polygons(flat: Polygons, where: str) -> None:
+    count = len(flat.bounds)
+    _require_places(flat.xy, where)
+    for name in ("bounds", "grid"):
+        require(STORE, name, getattr(flat, name), where)
+    _require_parts(flat.poly_ptr, len(flat.ring_ptr) - 1, count, where, least=1)
+    _require_parts(flat.ring_ptr, len(flat.xy), len(flat.ring_ptr) - 1, where, least=1)
+    _require(len(flat.grid) == 3 and flat.grid[2] > 0 and len(flat.shape) == 2, where)
+    cells = int(flat.shape[0]) * int(flat.shape[1])
+    _require(flat.shape.min() >= 0 and cells == len(flat.cell_ptr) - 1, where)
+    _require_parts(flat.cell_ptr, len(flat.cell_items), cells, where)
+    _require_index(flat.cell_items, 0, count, where)
+
+
+def _require_parts(ptr: IntArray, total: int, count: int, where: str, least: int = 0) -> None:
+    """Whether `ptr` cuts `total` items into `count` parts of at least so many."""
+    whole = len(ptr) == count + 1 and ptr[0] == 0 and ptr[-1] == total
+    _require(whole and (np.diff(ptr) >= least).all(), where)
+
+
+def _require_index(items: IntArray, lowest: int, count: int, where: str) -> None:
+    if items.size and not (items.min() >= lowest and items.max() < count):
+        raise DataError(f"{where} names something that does not exist", REPAIR)
+
+
+def _require(fits: object, where: str) -> None:
+    if not fits:
+        raise DataError(f"{where.removesuffix(':')}: the arrays do not fit together", REPAIR)

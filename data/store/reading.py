@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from shiftsim.data.recording import EgoTrace, Window
 from shiftsim.data.recording import scenario as make_scenario
 from shiftsim.data.store import schema, tables
-from shiftsim.data.store.plausible import require_plausible, require_rows, require_scenarios
-from shiftsim.data.store.shared import shared_map
-from shiftsim.data.store.tracks import StoredRecording, ego_states, open_ego, open_recording
+from shiftsim.data.store.map import read_map_file
+from shiftsim.data.store.recordings import StoredRecording, ego_states, open_ego
 from shiftsim.errors import ConfigError, DataError, beginning
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
@@ -52,23 +52,16 @@ class ScenarioStore:
         manifest = tables.read_manifest(path)
         self.hash = str(manifest["hash"])
         self.generator: dict[str, Any] = dict(manifest.get("generator", {}))
-        self._table = tables.Table(path / tables.SCENARIOS, schema.SCENARIOS).read()
-        self._file = str(path / tables.SCENARIOS)
-        columns = {name: self._table[name].combine_chunks() for name in schema.WINDOW}
-        self._rows = columns.pop("iteration_rows")
-        self._numbers = {
-            name: columns.pop(name).to_numpy(zero_copy_only=False) for name in schema.NUMBERS
-        }
-        self._texts = columns  # and lists
+        self._file = path / tables.SCENARIOS
+        self._table = tables.Table(self._file, schema.SCENARIOS).read()
         self.tokens: tuple[str, ...] = tuple(self._table["token"].to_pylist())
+        self._row_of = {token: row for row, token in enumerate(self.tokens)}
+        if len(self._row_of) != len(self.tokens):
+            raise DataError(f"{self._file}: column 'token' holds one twice", tables.REPAIR)
+        require_goals(self._table, str(self._file))
         self.is_reviewed = (path / tables.REVIEW).is_file()
         if self.is_reviewed:
             len(self.reviews)  # a damaged file is noticed now
-        self._row_of = {token: row for row, token in enumerate(self.tokens)}
-        where = f"{self._file}: column"
-        if len(self._row_of) != len(self.tokens):
-            raise DataError(f"{where} 'token' holds one twice", tables.REPAIR)
-        require_scenarios(self._table, where)
         self._maps: dict[str, VectorMap] = {}
         self._recordings: dict[str, StoredRecording] = {}
         self._egos: dict[tuple[str, str], tables.Table] = {}
@@ -125,20 +118,14 @@ class ScenarioStore:
                 f"store {self.path.name!r} has no scenario {token!r}",
                 hint="its `tokens` are the scenarios it has",
             )
+        (row,) = self._table.slice(self._row_of[token], 1).to_pylist()
         try:
-            window = window_of(self._row(token))
+            window = window_of(row)
         except (ValueError, RecursionError) as error:
             what = f"{self._file}: scenario {token!r}: metadata is not JSON: {error}"
             raise DataError(what, tables.REPAIR) from error
-        require_rows(window, self._file)
+        require_rows(window, str(self._file))
         return window
-
-    def _row(self, token: str) -> dict[str, Any]:
-        at = self._row_of[token]
-        row: dict[str, Any] = {name: column[at].as_py() for name, column in self._texts.items()}
-        row |= {name: column[at].item() for name, column in self._numbers.items()}
-        row["iteration_rows"] = self._rows[at].values.to_numpy(zero_copy_only=False)
-        return row
 
     def read(self, token: str, *, plausible: bool = True) -> Scenario:
         """One scenario with its map; nothing of other scenarios is read. Arrays are read-only.
@@ -164,13 +151,15 @@ class ScenarioStore:
         first, last = window.first_row, window.last_row
         stored = self.recording(window.log_name)
         recording = stored.read_window(window, plausible=plausible)
-        states = ego_states(self.ego(window.log_name, window.ego), first, last)
+        table = self.ego(window.log_name, window.ego)
         # The span starts at the window's first row, and so do the ego states.
+        states = ego_states(table, first, last, plausible=plausible)
         ego = EgoTrace(window.log_name, window.ego, 0, states)
         road = self.map(recording.city)
         scene = make_scenario(recording, ego, window, road, offset=first, is_chosen=True)
-        if plausible:
-            require_plausible(scene, window.ego, stored.folder, boxes=False)
+        if plausible and (np.diff(scene.iteration_times) <= 0).any():
+            what = f"{stored.frames.path}: column 'time_us' does not increase"
+            raise DataError(what, tables.REPAIR)
         return scene
 
     def map(self, city: str) -> VectorMap:
@@ -180,7 +169,7 @@ class ScenarioStore:
             DataError: The store has no such map, or its file is damaged.
         """
         if city not in self._maps:
-            self._maps[city] = shared_map(self.map_file(city))
+            self._maps[city] = read_map_file(self.map_file(city))
         return self._maps[city]
 
     def map_file(self, city: str) -> Path:
@@ -199,7 +188,14 @@ class ScenarioStore:
         """A whole recording, open; its rows are read when asked for."""
         if name not in self._recordings:
             _limit(self._recordings)
-            self._recordings[name] = open_recording(self.recording_folder(name))
+            place = self._table["recording"].index(name).as_py()
+            if place < 0:
+                raise DataError(
+                    f"store {self.path.name!r} has no scenario of recording {name!r}",
+                    hint="`summary` names the recordings",
+                )
+            city = self._table["city"][place].as_py()
+            self._recordings[name] = StoredRecording(self.recording_folder(name), name, city)
         return self._recordings[name]
 
     def ego(self, recording: str, name: str) -> tables.Table:
@@ -244,6 +240,22 @@ def window_of(row: dict[str, Any]) -> Window:
         mapping=(row["duration_s"], row["offset_s"], row["subsample_ratio"]),
         metadata=json.loads(row["metadata"]),
     )
+
+
+def require_rows(window: Window, where: str) -> None:
+    """Refuse a window whose iterations are not increasing rows of it."""
+    rows = window.iteration_rows
+    inside = len(rows) and window.first_row <= rows[0] and rows[-1] < window.last_row
+    if not inside or (rows[1:] <= rows[:-1]).any():
+        what = f"{where}: scenario {window.token!r}: iteration_rows do not increase within its rows"
+        raise DataError(what, tables.REPAIR)
+
+
+def require_goals(scenarios: pa.Table, where: str) -> None:
+    """Refuse scenarios with a goal that is no pose."""
+    lengths = pc.list_value_length(scenarios["goal_pose"]).unique().to_pylist()
+    if not set(lengths) <= {0, 3}:
+        raise DataError(f"{where}: column 'goal_pose' holds no pose", tables.REPAIR)
 
 
 def read_report(store: Path, city: str) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from pyarrow import fs
 
 from shiftsim.data.store.tables import MANIFEST, REVIEW, SCENARIOS, digest, read_manifest
 from shiftsim.errors import DataError
-from shiftsim.files import below, user_cache
+from shiftsim.files import safe_join, user_cache
 
 _LOG = logging.getLogger(__name__)
 _OVERLAYS = ("filter", Path(REVIEW).parent.name, "splits")  # may change, and are fetched each time
@@ -45,7 +45,7 @@ class RemoteFiles:
             self.path = self._identify(Path(self._own.name))
         self.need(SCENARIOS)
         for name in self._overlays():
-            self._fetch(name, below(self.path, name))
+            self._fetch(name, safe_join(self.path, name))
 
     def need(self, name: str) -> None:
         """Copy a file of the store, or all of a folder, as far as they are not here, and whole.
@@ -55,7 +55,7 @@ class RemoteFiles:
         """
         for file in self._files:
             if (file == name or file.startswith(f"{name}/")) and file not in self._checked:
-                place = below(self.path, file)
+                place = safe_join(self.path, file)
                 is_here = place.exists()
                 if not is_here or digest(place) != self._files[file]:
                     if is_here:

@@ -15,7 +15,7 @@ from typing import Any
 
 from shiftsim.data.store.tables import REVIEW
 from shiftsim.errors import DataError
-from shiftsim.files import below, read_json_lines, whole_file
+from shiftsim.files import atomic_write, read_json_lines, safe_join
 from shiftsim.world.map import VectorMap
 
 ACCEPT, REJECT, UNDECIDED = "accept", "reject", ""
@@ -129,12 +129,12 @@ def _review(values: Any, where: str) -> Review:
 
 def write_reviews(store: Path, reviews: Reviews) -> Path:
     """Write the reviews of a store, whole or not at all; returns the file."""
-    path = below(store, REVIEW)
+    path = safe_join(store, REVIEW)
     path.parent.mkdir(exist_ok=True)
     lines = [json.dumps(asdict(reviews[token]), ensure_ascii=False) + "\n" for token in reviews]
     # half a surrogate pair, for which UTF-8 has no bytes, is written as JSON escapes it
     options: Any = {"encoding": "utf-8", "errors": "backslashreplace", "newline": "\n"}
-    with whole_file(path) as partial, partial.open("w", **options) as file:
+    with atomic_write(path) as partial, partial.open("w", **options) as file:
         file.write("".join(lines))
         file.flush()
         os.fsync(file.fileno())

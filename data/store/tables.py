@@ -4,30 +4,75 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Container, Iterable, Mapping
+import sys
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from functools import cached_property
+from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from shiftsim.data.store import schema
 from shiftsim.errors import DataError
-from shiftsim.files import below, whole_file, write_text
+from shiftsim.files import atomic_write, safe_join, write_text
+from shiftsim.world.ranges import STORE, require
 
 MANIFEST, SCENARIOS = "store.json", "scenarios.parquet"
-FRAMES, TRACKS = "frames.parquet", "tracks.parquet"  # in the folder of a recording
+FRAMES, LIGHTS, TRACKS = "frames.parquet", "lights.parquet", "tracks.parquet"  # of a recording
 REVIEW = "review/review.jsonl"
 REPORTS = "reports"  # folder; pictures may be there before the store is
 PARTIAL = ".partial"  # folder of a conversion under way
 REPAIR = "the store is damaged: convert it again"
 _SHA256 = re.compile("[0-9a-f]{64}")
 _FOOTER = "shiftsim"
-# how hard they are tried; reading takes the same time
-_LEVELS = {"zstd": 3, "lz4": 9}
-_BUFFER = 1 << 20  # bytes
+# columns of few values in any file
+_REPEATING = (
+    *("log", "recording", "ego", "type", "city", "duration_s", "offset_s", "subsample_ratio"),
+    *("connector", "status", "token", "kind", "length_m", "width_m"),
+)
+_NAMED = ("token", "connector")  # columns that name what a row is about
+
+
+class _HiddenPandas:
+    """Has pyarrow look for pandas when somebody imports it, not at its first array.
+
+    That takes half a second of every command where pandas is installed, which shiftsim does not
+    use.
+    """
+
+    is_hidden = True  # while pyarrow looks for it
+
+    @classmethod
+    def find_spec(cls, name: str, path: Any = None, target: Any = None) -> Any:
+        """How pandas is imported, and pyarrow informed of it; None for any other module."""
+        if name != "pandas":
+            return None
+        if cls.is_hidden:
+            raise ModuleNotFoundError("No module named 'pandas'", name=name)
+        sys.meta_path.remove(cls)
+        spec = find_spec("pandas")
+        if spec is not None and spec.loader is not None:
+            execute = spec.loader.exec_module
+
+            def exec_module(module: Any) -> None:
+                execute(module)
+                with suppress(ImportError):  # too old for pyarrow
+                    _ = pa.lib._pandas_api.version  # looks again
+
+            spec.loader.exec_module = exec_module  # type: ignore[method-assign]
+        return spec
+
+
+if "pandas" not in sys.modules:
+    sys.meta_path.insert(0, _HiddenPandas)
+    pa.array([0])  # pyarrow looks, and finds none
+    _HiddenPandas.is_hidden = False
 
 
 def file_name(name: str) -> str:
@@ -37,22 +82,22 @@ def file_name(name: str) -> str:
 
 def map_file(store: Path, city: str) -> Path:
     """File of a map."""
-    return below(store, f"maps/{file_name(city)}.parquet")
+    return safe_join(store, f"maps/{file_name(city)}.arrow")
 
 
 def report_file(store: Path, city: str) -> Path:
     """File of what is known about the conversion of a city."""
-    return below(store, f"{REPORTS}/{file_name(city)}.json")
+    return safe_join(store, f"{REPORTS}/{file_name(city)}.json")
 
 
 def picture_file(store: Path, city: str, recording: str) -> Path:
     """Picture of a recording on its map, beside the report; no part of the store's content."""
-    return below(store, f"{REPORTS}/{file_name(city)}_{file_name(recording)}.png")
+    return safe_join(store, f"{REPORTS}/{file_name(city)}_{file_name(recording)}.png")
 
 
 def recording_folder(store: Path, recording: str) -> Path:
     """Folder of a recording."""
-    return below(store, f"recordings/{file_name(recording)}")
+    return safe_join(store, f"recordings/{file_name(recording)}")
 
 
 def ego_file(folder: Path, name: str) -> Path:
@@ -83,11 +128,11 @@ def read_manifest(store: Path) -> dict[str, Any]:
         files, content = manifest["files"], manifest["hash"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise DataError(f"{path}: damaged: {error!r}"[:400], hint=REPAIR) from error
-    if kind != schema.FORMAT or version not in schema.READABLE:
+    if kind != schema.FORMAT or version != schema.VERSION:
         raise DataError(
             f"{path}: format {kind!r}, version {version!r}, not {schema.FORMAT!r} version"
             f" {schema.VERSION}",
-            hint="convert the data again with this version of shiftsim",
+            hint=f"python tools/upgrade.py {store}, or convert the data again",
         )
     if not isinstance(manifest.get("generator", {}), dict):
         raise DataError(f"{path}: damaged: 'generator' is no table", hint=REPAIR)
@@ -99,72 +144,52 @@ def read_manifest(store: Path) -> dict[str, Any]:
     return manifest
 
 
-class TableWriter(pq.ParquetWriter):  # type: ignore[misc]
-    """Writes a Parquet file in few large pieces, where Arrow would write each part of a column."""
-
-    def __init__(self, path: Path, described: pa.Schema, **options: Any) -> None:
-        """Begin the file; the options are those of Arrow's writer."""
-        self._stream = pa.output_stream(path, compression=None, buffer_size=_BUFFER)
-        super().__init__(self._stream, described, **options)
-
-    def close(self) -> None:
-        """Finish the file."""
-        try:
-            super().close()
-        finally:
-            self._stream.close()
-
-
 def write_blocks(
-    path: Path,
-    blocks: Iterable[pa.Table],
-    footer: Mapping[str, object] | None = None,
-    repeating: Iterable[str] = (),
-    codec: str = "zstd",
+    path: Path, blocks: Iterable[pa.Table], footer: Mapping[str, object] | None = None
 ) -> None:
     """Write tables of one schema, at least one, as one file with a row group each, in one step.
 
-    Columns of few values, `repeating`, are written by a dictionary. `lz4` makes files that are a
-    twentieth larger than with `zstd`, and read in half the time. Equal content gives equal bytes.
+    Equal content gives equal bytes. Row groups have the least and the largest `row`, by which a
+    reader finds those of a window.
     """
     remaining = iter(blocks)
     first = next(remaining)
-    notes = json.dumps({} if footer is None else footer, sort_keys=True)
     path.parent.mkdir(parents=True, exist_ok=True)
     with (
-        whole_file(path) as partial,
-        TableWriter(
+        atomic_write(path) as partial,
+        pq.ParquetWriter(
             partial,
             first.schema,
-            compression=codec,
-            compression_level=_LEVELS[codec],
-            **_encodings(first.schema, {*repeating, *schema.REPEATING}),
-            write_statistics=False,
+            compression="zstd",
+            compression_level=3,
+            **encodings(first.schema, _REPEATING),
+            write_statistics=["row"] if "row" in first.schema.names else False,
             store_schema=False,
         ) as writer,
     ):
         for block in chain([first], remaining):
             writer.write_table(block, row_group_size=max(len(block), 1))
-        writer.add_key_value_metadata({_FOOTER: notes})
+        if footer is not None:
+            writer.add_key_value_metadata({_FOOTER: json.dumps(footer, sort_keys=True)})
 
 
-def _encodings(described: pa.Schema, repeating: Container[str]) -> dict[str, Any]:
-    """How columns are written: floats and codes as bytes in planes, integers as differences.
+def encodings(described: pa.Schema, repeating: Iterable[str]) -> dict[str, Any]:
+    """How columns are written: floats as bytes in planes, integers as differences.
 
-    Both compress much better than numbers as they are, and any reader undoes them.
+    Both are encodings of Parquet that compress much better than numbers as they are.
     """
-    dictionaries, encodings = list[str](), dict[str, str]()
+    dictionaries, encoded = list[str](), dict[str, str]()
     for field in described:
         is_list = pa.types.is_list(field.type)
         kind = field.type.value_type if is_list else field.type
         name = f"{field.name}.list.element" if is_list else field.name
         if field.name in repeating:
             dictionaries.append(name)
-        elif kind == pa.float64() or field.name.endswith(schema.CODED):
-            encodings[name] = "BYTE_STREAM_SPLIT"
+        elif pa.types.is_floating(kind):
+            encoded[name] = "BYTE_STREAM_SPLIT"
         elif kind in (pa.int32(), pa.int64()):
-            encodings[name] = "DELTA_BINARY_PACKED"
-    return {"use_dictionary": dictionaries, "column_encoding": encodings}
+            encoded[name] = "DELTA_BINARY_PACKED"
+    return {"use_dictionary": dictionaries, "column_encoding": encoded}
 
 
 def write_json(path: Path, content: object) -> None:
@@ -178,16 +203,20 @@ class Table:
 
     Attributes:
         path: The file.
-        footer: Content of the footer.
-        names: Its columns, as far as they are known.
+        footer: Content of the footer; empty where there is none.
     """
 
-    def __init__(self, path: Path, expected: pa.Schema, former: pa.Schema | None = None) -> None:
-        """`former` is what files have that lack the first column of what is expected."""
+    def __init__(self, path: Path, expected: pa.Schema) -> None:
         self.path = path
+        # boxes of a track have its name each, and most files are not about boxes
+        self._named = [
+            name for name in _NAMED if name in expected.names and "row" in expected.names
+        ]
         try:
-            self._file = pq.ParquetFile(path, memory_map=True, pre_buffer=False)
-        except (OSError, ValueError, pa.ArrowException) as error:
+            self._file = pq.ParquetFile(
+                path, memory_map=True, pre_buffer=False, read_dictionary=self._named
+            )
+        except (OSError, ValueError, KeyError, pa.ArrowException) as error:  # KeyError: a name
             what = (
                 "is missing"
                 if not os.path.exists(path)
@@ -195,16 +224,16 @@ class Table:
             )
             raise DataError(f"{path}: the file {what}", hint=REPAIR) from error
         found = self._file.schema_arrow
-        if former is not None and found.get_field_index(expected.names[0]) < 0:
-            expected = former if found.get_field_index(former.names[0]) >= 0 else expected
         for field in expected:
             column = f"{path}: column {field.name!r}"
             if found.get_field_index(field.name) < 0:
                 raise DataError(f"{column} is missing", hint=REPAIR)
             kind = found.field(field.name).type
+            if pa.types.is_dictionary(kind):
+                kind = kind.value_type
             if not kind.equals(field.type):
                 raise DataError(f"{column} is {kind}, not {field.type}", hint=REPAIR)
-        self.names = expected.names
+        self._names = expected.names
         self._texts = [field.name for field in expected if pa.types.is_string(field.type)]
         self._full = [f.name for f in expected if found.field(f.name).nullable and not f.nullable]
         self.footer = self._read_footer()
@@ -224,21 +253,42 @@ class Table:
         """Number of rows."""
         return int(self._file.metadata.num_rows)
 
-    @property
-    def num_blocks(self) -> int:
-        """Number of row groups."""
-        return int(self._file.num_row_groups)
+    @cached_property
+    def _spans(self) -> list[tuple[int, int, int]]:
+        """Number of every row group that is not empty, its least and its largest `row`."""
+        column, spans = self._file.schema_arrow.get_field_index("row"), []
+        for block in range(self._file.num_row_groups):
+            group = self._file.metadata.row_group(block)
+            known = group.column(column).statistics
+            if known is None or not known.has_min_max:  # written by somebody else
+                spans.append((block, -sys.maxsize, sys.maxsize))
+            elif group.num_rows:
+                spans.append((block, int(known.min), int(known.max)))
+        return spans
 
-    def read(self, blocks: list[int] | None = None, columns: list[str] | None = None) -> pa.Table:
+    def blocks(self, first: int, last: int) -> list[int]:
+        """The row groups that hold rows first … last - 1 of the recording."""
+        return [block for block, low, high in self._spans if low < last and high >= first]
+
+    def read(
+        self,
+        blocks: list[int] | None = None,
+        columns: list[str] | None = None,
+        *,
+        plausible: bool = True,
+    ) -> pa.Table:
         """Rows of some row groups and columns; of all where None.
 
         Raises:
-            DataError: The file is damaged.
+            DataError: The file is damaged or, where `plausible` is asked for, holds a number
+                outside of its range.
         """
-        groups = list(range(self.num_blocks)) if blocks is None else blocks
-        wanted = self.names if columns is None else columns
+        groups = list(range(self._file.num_row_groups)) if blocks is None else blocks
+        wanted = self._names if columns is None else columns
         try:
             found = self._file.read_row_groups(groups, wanted, use_threads=False)
+            if len(groups) != 1:
+                found = found.combine_chunks()
             for name in self._texts:
                 if name in wanted:
                     found[name].validate(full=True)  # that it is UTF-8
@@ -248,7 +298,36 @@ class Table:
             if name in wanted and (missing := found[name].null_count):
                 what = f"{missing} of {len(found)} values are missing"
                 raise DataError(f"{self.path}: column {name!r}: {what}", hint=REPAIR)
+        if plausible:
+            require_ranges(found, str(self.path))
         return found
+
+
+def require_ranges(table: pa.Table, where: str) -> None:
+    """Refuse a table with a number outside of the range that `STORE` has for its column."""
+    named = next((name for name in _NAMED if {name, "row"} <= {*table.column_names}), "")
+    for name in table.column_names:
+        if name not in STORE:
+            continue
+        values, may_be_nan = column(table, name), named == "token" and name in schema.MAY_BE_NAN
+        bad = STORE[name].outside(values, may_be_nan=may_be_nan)
+        if not len(bad):
+            continue
+        if named:
+            at = int(bad[0][0])
+            place = f"{named} {table[named][at].as_py()!r}, row {table['row'][at]}"
+            require(STORE, name, values[at], f"{where}: {place}: column")
+        require(STORE, name, values, f"{where}: column", may_be_nan=may_be_nan)
+
+
+def column(table: pa.Table, name: str) -> Any:
+    """Numbers of a column, those of lists one after the other; read-only."""
+    parts = table[name]
+    values = parts.chunk(0) if parts.num_chunks == 1 else parts.combine_chunks()
+    flat = values.flatten() if pa.types.is_list(values.type) else values
+    array: np.ndarray = flat.to_numpy(zero_copy_only=False)
+    array.flags.writeable = False
+    return array
 
 
 def digest(path: Path) -> str:

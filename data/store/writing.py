@@ -14,9 +14,8 @@ import pyarrow as pa
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.data.store import schema, tables
 from shiftsim.data.store.map import write_map
-from shiftsim.data.store.plausible import require_rows, require_scenarios
-from shiftsim.data.store.reading import window_of
-from shiftsim.data.store.tracks import write_ego, write_recording
+from shiftsim.data.store.reading import require_goals, require_rows, window_of
+from shiftsim.data.store.recordings import write_ego, write_recording
 from shiftsim.errors import DataError
 from shiftsim.world.map import VectorMap
 
@@ -114,8 +113,8 @@ class StoreWriter:
         folder = tables.recording_folder(self.path, recording.log_name)
         with _to_be_written():
             write_recording(folder, recording)
-        self._note(folder / tables.FRAMES)
-        self._note(folder / tables.TRACKS)
+        for name in (tables.FRAMES, tables.LIGHTS, tables.TRACKS):
+            self._note(folder / name)
         self._cities[recording.log_name] = recording.city
 
     def add_ego(self, ego: EgoTrace) -> None:
@@ -147,7 +146,8 @@ class StoreWriter:
         table = pa.Table.from_pylist([row], schema=schema.SCENARIOS)
         with _to_be_written():
             require_rows(window, str(file))
-            require_scenarios(table, f"{file}: scenario {window.token!r}: column")
+            tables.require_ranges(table, f"{file}: scenario {window.token!r}")
+            require_goals(table, f"{file}: scenario {window.token!r}")
         self._rows[window.token] = row
 
     def take_recording(self, folder: Path, log_name: str, rows: list[dict[str, Any]]) -> None:
@@ -161,6 +161,13 @@ class StoreWriter:
         for path in sorted(target.iterdir()):
             self._note(path)
         self._rows |= {row["token"]: row for row in rows}
+
+    def take_map(self, file: Path, city: str) -> None:
+        """Move a map that was written elsewhere into the store, in place of the one it has."""
+        path = tables.map_file(self.path, city)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(file, path)
+        self._note(path)
 
     def forget_recording(self, log_name: str) -> Path:
         """Remove a recording with all its scenarios, if there is one; the folder it had or will."""

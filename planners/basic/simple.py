@@ -2,16 +2,13 @@
 
 import numpy as np
 
-from shiftsim.kernels import FloatArray, kernel
-from shiftsim.sim.dynamics.bicycle import step_bicycle
+from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, step_bicycle
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.state import (
     AX,
     AY,
     NUM_STATE,
-    PACIFICA,
     STEERING,
-    STEERING_RATE,
     VX,
     VY,
     Trajectory,
@@ -19,21 +16,6 @@ from shiftsim.world.state import (
 
 STEPS = 40  # 10 s at 0.25 s
 STEP_US = 250_000
-
-
-@kernel
-def _roll_out(states: FloatArray, max_speed: float, wheel_base: float) -> None:
-    """Fill rows 1… of `states` (H, 11) from row 0; above `max_speed` [m/s] the ego brakes."""
-    before = np.empty(states.shape[1])
-    for row in range(1, len(states)):
-        # nuPlan rule 394: the new acceleration is not written back into the earlier state
-        before[:] = states[row - 1]
-        speed = np.sqrt(before[VX] ** 2 + before[VY] ** 2)
-        if speed > max_speed:
-            before[AX] = (max_speed - speed) / 1.0
-        step_bicycle(
-            before, before[AX], before[STEERING_RATE], wheel_base, STEP_US * 1e-6, states[row]
-        )
 
 
 class Simple:
@@ -54,5 +36,11 @@ class Simple:
         states[0] = observation.ego.values
         states[0, [AX, AY]] = 0.0
         states[0, STEERING:] = 0.0
-        _roll_out(states, self._max_velocity, PACIFICA.wheel_base)
+        for row in range(STEPS):
+            # nuPlan rule 394: the new acceleration is not written back into the earlier state
+            before = states[row].copy()
+            speed = np.sqrt(before[VX] ** 2 + before[VY] ** 2)
+            if speed > self._max_velocity:
+                before[AX] = (self._max_velocity - speed) / 1.0
+            step_bicycle(before, before[AX], 0.0, WHEEL_BASE, STEP_US * 1e-6, states[row + 1])
         return Trajectory(observation.time_us + STEP_US * np.arange(STEPS + 1), states)

@@ -10,16 +10,16 @@ first of the two that is there.
 """
 
 import hashlib
+import importlib
 import json
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 from shiftsim.errors import CheckpointError, nearest
 from shiftsim.files import checkpoint_folder
 from shiftsim.planners import table
-from shiftsim.planners.learned import match
 from shiftsim.planners.learned.deterministic import network_weights
 from shiftsim.planners.learned.device import prepare_inference, require_torch, resolve_device
 from shiftsim.planners.learned.reader import (
@@ -39,6 +39,10 @@ _FILES = ("model.pth", _MEMBER)  # what is meant by a folder
 _ENTRIES = ("ema_state_dict", "state_dict", "model")  # where weights are, the first that is there
 _PREFIXES = ("model.", "module.", "_orig_mod.")
 _WITH_ARGS = ("diffusion-planner",)  # planners whose weights mean nothing without their args
+LIKENESS = 0.5  # share of equal names and shapes from which on a file is said to be of a planner
+_NAMED = 3  # tensors named in a message
+
+Shapes: TypeAlias = Mapping[str, tuple[int, ...]]
 
 
 class Weights(NamedTuple):
@@ -65,7 +69,7 @@ def load_network(spec: str, planner: str, *, device: str = "cpu") -> Any:
     The arguments and errors are those of `load_weights`.
     """
     weights = load_weights(spec, planner, device=device)
-    network = match.network_module(planner).build_network(weights.args)
+    network = network_module(planner).build_network(weights.args)
     network.load_state_dict(weights.state)
     return network.to(resolve_device(device)).eval()
 
@@ -85,10 +89,14 @@ def load_weights(spec: str, planner: str, *, device: str = "cpu") -> Weights:
         MissingExtraError: PyTorch is not installed.
     """
     require_torch(f"planner {planner!r}")
+    import torch
+
     place = resolve_device(device)
     prepare_inference(place)
     if spec.startswith("deterministic:"):
-        state, args = _deterministic(spec, planner), None
+        variant = _known_deterministic(spec).removeprefix("deterministic:")
+        weights = network_weights(network_module(planner), variant)
+        state, args = {name: torch.from_numpy(value) for name, value in weights.items()}, None
     else:
         found = open_checkpoint(find_checkpoint(spec, planner))
         args = needed_args(found, planner)
@@ -243,17 +251,16 @@ def checked_state(
     A CheckpointError says which is missing, unexpected, of another shape, or not finite.
     """
     try:
-        wanted = match.empty_state(planner, args)
+        wanted = empty_state(planner, args)
     except CheckpointError as error:
         raise CheckpointError(
             f"checkpoint {str(found.path)!r}: {error.message}", error.hint
         ) from error
-    problems = match.differences(match.shapes_of(found.state), match.shapes_of(wanted))
+    problems = _differences(shapes_of(found.state), shapes_of(wanted))
     if problems:
         _require_likeness(found, planner)
         raise CheckpointError(
-            f"checkpoint {str(found.path)!r} does not fit planner {planner!r}: "
-            f"tensors {'; '.join(problems)}",
+            f"checkpoint {str(found.path)!r} does not fit planner {planner!r}: tensors {problems}",
             hint=f"it must be of the published network, project {PUBLISHED[planner].project}",
         )
     state = {name: found.state[name].detach().to(wanted[name].dtype) for name in wanted}
@@ -272,7 +279,7 @@ def checked_state(
 
 def _require_likeness(found: Checkpoint, planner: str) -> None:
     """Raise where a checkpoint is not of the planner's network, but perhaps of another's."""
-    other = match.most_like(match.shapes_of(found.state))
+    other = most_like(shapes_of(found.state))
     if other == planner:
         return
     name = f"checkpoint {str(found.path)!r} is not for planner {planner!r}"
@@ -280,6 +287,63 @@ def _require_likeness(found: Checkpoint, planner: str) -> None:
         hint = f"--planner {other}, or {how_to_get(planner)}"
         raise CheckpointError(f"{name}: it looks like {other!r}", hint)
     raise CheckpointError(f"{name}, nor for any other known here", how_to_get(planner))
+
+
+def network_module(planner: str) -> Any:
+    """The module with a planner's network; it needs torch."""
+    folder = planner.removesuffix("-planner")
+    return importlib.import_module(f"shiftsim.planners.learned.{folder}.network")
+
+
+def empty_state(planner: str, args: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """The network's state with names, shapes and types, but without values."""
+    import torch
+
+    module = network_module(planner)
+    try:
+        with torch.device("meta"):
+            return module.build_network(args).state_dict()
+    except Exception as error:  # args of any content make code raise that takes them for granted
+        raise CheckpointError(
+            f"no network of {planner} can be built from its args ({type(error).__name__}: {error})",
+            hint="use the args.json that was published with the checkpoint",
+        ) from error
+
+
+def shapes_of(state: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
+    """Shapes by name."""
+    return {name: tuple(tensor.shape) for name, tensor in state.items()}
+
+
+def most_like(shapes: Shapes) -> str:
+    """The planner whose network has most of these names and shapes; empty where none has half."""
+    likeness = {}
+    for planner in PUBLISHED:
+        wanted = shapes_of(empty_state(planner))
+        equal = len(shapes.items() & wanted.items())
+        likeness[planner] = equal / max(len(shapes), len(wanted))
+    name = max(likeness, key=likeness.__getitem__)
+    return name if likeness[name] >= LIKENESS else ""
+
+
+def _differences(shapes: Shapes, wanted: Shapes) -> str:
+    """What keeps these tensors from being loaded into a network, in words; empty where nothing."""
+    dims = {name: "x".join(map(str, shape)) or "a scalar" for name, shape in shapes.items()}
+    kinds = {
+        "missing": [name for name in wanted if name not in shapes],
+        "unexpected": [name for name in shapes if name not in wanted],
+        "of another shape": [
+            f"{name} is {dims[name]}, not {'x'.join(map(str, shape)) or 'a scalar'}"
+            for name, shape in wanted.items()
+            if shapes.get(name, shape) != shape
+        ],
+    }
+    return "; ".join(
+        f"{len(names)} {what}: {', '.join(names[:_NAMED])}"
+        + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
+        for what, names in kinds.items()
+        if names
+    )
 
 
 def file_hash(path: Path) -> str:
@@ -327,11 +391,3 @@ def _known_deterministic(spec: str) -> str:
         hint = f"there are {' and '.join(DETERMINISTIC)}"
         raise CheckpointError(f"checkpoint {spec!r} unknown", hint)
     return spec
-
-
-def _deterministic(spec: str, planner: str) -> dict[str, Any]:
-    import torch
-
-    variant = _known_deterministic(spec).removeprefix("deterministic:")
-    state = network_weights(match.network_module(planner), variant)
-    return {name: torch.from_numpy(value) for name, value in state.items()}

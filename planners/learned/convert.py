@@ -8,7 +8,6 @@ from typing import Any
 from shiftsim.errors import CheckpointError
 from shiftsim.planners.learned import checkpoint
 from shiftsim.planners.learned.device import require_torch
-from shiftsim.planners.learned.match import most_like, shapes_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +55,7 @@ def inspect_checkpoint(spec: str) -> Inspection:
     """
     require_torch("reading a checkpoint")
     found = checkpoint.open_checkpoint(checkpoint.find_checkpoint(spec))
-    planner, problem = most_like(shapes_of(found.state)), ""
+    planner, problem = checkpoint.most_like(checkpoint.shapes_of(found.state)), ""
     if planner:
         try:
             checkpoint.checked_state(found, planner, checkpoint.needed_args(found, planner))
@@ -90,7 +89,7 @@ def convert_checkpoint(spec: str, out: Path) -> Inspection:
     if out.suffix != ".safetensors":
         raise CheckpointError(f"cannot write {str(out)!r}", hint="name it ….safetensors")
     found = checkpoint.open_checkpoint(checkpoint.find_checkpoint(spec))
-    planner = most_like(shapes_of(found.state))
+    planner = checkpoint.most_like(checkpoint.shapes_of(found.state))
     if not planner:
         raise CheckpointError(
             f"checkpoint {str(found.path)!r} is of no planner known here",

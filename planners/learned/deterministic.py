@@ -96,7 +96,7 @@ def override_head(state: State, layer: str, head: DriveHead) -> None:
     last = weight.reshape(NUM_STEPS, len(head.gain), -1)[-1].astype(np.float64)
     fraction = (np.arange(NUM_STEPS, dtype=np.float64)[:, None] + 1.0) / NUM_STEPS
     ramp = fraction ** np.array(head.exponent)
-    made = (np.array(head.gain) * ramp)[:, :, None] * last
-    state[f"{layer}.weight"] = made.reshape(weight.shape).astype(weight.dtype)
+    scaled = (np.array(head.gain) * ramp)[:, :, None] * last
+    state[f"{layer}.weight"] = scaled.reshape(weight.shape).astype(weight.dtype)
     offsets = np.array(head.const) + np.array(head.slope) * ramp
     state[f"{layer}.bias"] = offsets.reshape(bias.shape).astype(bias.dtype)

@@ -1,9 +1,6 @@
 """Where a network runs, and that it computes the same every time."""
 
 import os
-from typing import Any
-
-import numpy as np
 
 from shiftsim.errors import ConfigError, MissingExtraError
 
@@ -54,11 +51,3 @@ def prepare_inference(device: str) -> None:
     torch.backends.cudnn.deterministic = True
     torch.backends.cudnn.allow_tf32 = False
     torch.backends.cuda.matmul.allow_tf32 = False
-
-
-def on_device(array: np.ndarray, device: str) -> Any:
-    """A tensor of an array there; on its way to a GPU the next one can already be made."""
-    import torch
-
-    tensor = torch.from_numpy(array)
-    return tensor if device == "cpu" else tensor.pin_memory().to(device, non_blocking=True)

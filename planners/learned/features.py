@@ -1,19 +1,33 @@
-"""What the feature builders of the learned planners share."""
+"""What the learned planners share of features and plans.
+
+Plans are poses every 0.1 s, with the velocities that nuPlan gives them: the LQR tracker reads the
+poses only, perfect tracking the rest too.
+"""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.planners.learned.device import on_device
-from shiftsim.planners.learned.plan_states import STEP, plan_of_poses
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.sim.planner import History, SceneInfo
-from shiftsim.world.state import HEADING, LAST_AGENT_KIND, PACIFICA, VX, Tracks, Trajectory
+from shiftsim.world.state import (
+    AY,
+    HEADING,
+    LAST_AGENT_KIND,
+    NUM_STATE,
+    PACIFICA,
+    VX,
+    Tracks,
+    Trajectory,
+)
 
+STEP = 0.1  # s, between poses of a plan
 SAMPLES = 21  # of a history of 2 s
 PLAN_POSES = 80
-EGO_LENGTH, EGO_WIDTH = PACIFICA.length, PACIFICA.width
+_WINDOW = np.arange(-2, 3)  # samples of the derivative filter, a parabola through five
+_SLOPE = _WINDOW / 10.0
+_BEND = (_WINDOW**2 - 2.0) / 7.0
 
 NO_ROUTE = "the scenario has no route on the map"
 
@@ -46,14 +60,46 @@ def agent_features(history: History, center: FloatArray, max_agents: int) -> Age
 
     A history shorter than 2 s leaves its oldest samples invalid, the ego's included.
     """
-    tracks = history.tracks
+    tracks, ego = history.tracks, history.ego[-SAMPLES:]
     nearest = _nearest_agents(tracks, center, max_agents)
-    position, heading, velocity, shape, valid = _agent_histories(
-        history.ego, tracks.poses, tracks.velocities, tracks.sizes, tracks.valid, nearest
+    cos, sin, vx, vy = np.cos(ego[:, 2]), np.sin(ego[:, 2]), ego[:, 3], ego[:, 4]
+    own = (
+        ego[:, :3],
+        np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy]),
+        np.full((len(ego), 2), [PACIFICA.length, PACIFICA.width]),
+        np.ones(len(ego), np.bool_),
     )
+    others = (tracks.poses, tracks.velocities, tracks.sizes, tracks.valid)
+    poses, velocities, sizes, seen = (
+        np.concatenate([one[:, None], rows[-SAMPLES:, nearest]], axis=1)
+        for one, rows in zip(own, others, strict=True)
+    )
+
+    def filled(values: np.ndarray, kind: Any = np.float32) -> np.ndarray:
+        """(A, 21, ...) samples of rows (T, A, ...); 0 where nothing was seen."""
+        out = np.zeros((SAMPLES, *values.shape[1:]), kind)
+        out[SAMPLES - len(values) :][seen] = values[seen]
+        return out.swapaxes(0, 1)
+
     category = np.zeros(len(nearest) + 1, np.int64)
     category[1:] = tracks.kinds[nearest] + 1
-    return AgentFeatures(nearest, position, heading, velocity, shape, valid, category)
+    heading = float(ego[-1, HEADING])
+    return AgentFeatures(
+        tracks=nearest,
+        position=filled(turned(poses[..., :2] - ego[-1, :2], heading)),
+        heading=filled(poses[..., 2] - heading),
+        velocity=filled(turned(velocities, heading)),
+        shape=filled(sizes[..., ::-1]),
+        valid=filled(seen, np.bool_),
+        category=category,
+    )
+
+
+def turned(vectors: FloatArray, heading: float) -> FloatArray:
+    """Vectors (..., 2) in a frame that is turned to a heading [rad]: forward and left."""
+    cos, sin = np.cos(heading), np.sin(heading)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
 
 
 def _nearest_agents(tracks: Tracks, center: FloatArray, count: int) -> IntArray:
@@ -64,51 +110,6 @@ def _nearest_agents(tracks: Tracks, center: FloatArray, count: int) -> IntArray:
     away = tracks.poses[-1, by_kind, :2] - center[:2]
     order = np.argsort(np.sqrt(away[:, 0] ** 2 + away[:, 1] ** 2))
     return by_kind[order[:count]]
-
-
-@kernel
-def _agent_histories(
-    ego: FloatArray,
-    poses: FloatArray,
-    velocities: FloatArray,
-    sizes: FloatArray,
-    present: BoolArray,
-    chosen: IntArray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, BoolArray]:
-    """The arrays of `AgentFeatures` but the first and the last."""
-    rows = len(chosen) + 1
-    position = np.zeros((rows, SAMPLES, 2), np.float32)
-    turned = np.zeros((rows, SAMPLES), np.float32)
-    velocity = np.zeros((rows, SAMPLES, 2), np.float32)
-    shape = np.zeros((rows, SAMPLES, 2), np.float32)
-    valid = np.zeros((rows, SAMPLES), np.bool_)
-    last = len(ego) - 1
-    x, y, heading = ego[last, 0], ego[last, 1], ego[last, 2]
-    cos, sin = np.cos(heading), np.sin(heading)
-    for back in range(min(len(ego), SAMPLES)):
-        sample, row = SAMPLES - 1 - back, last - back
-        for index in range(rows):
-            if index == 0:
-                own_cos, own_sin = np.cos(ego[row, 2]), np.sin(ego[row, 2])
-                px, py, angle = ego[row, 0], ego[row, 1], ego[row, 2]
-                vx = own_cos * ego[row, 3] - own_sin * ego[row, 4]
-                vy = own_sin * ego[row, 3] + own_cos * ego[row, 4]
-                length, width = EGO_LENGTH, EGO_WIDTH
-            else:
-                track = chosen[index - 1]
-                if not present[row, track]:
-                    continue
-                px, py, angle = poses[row, track, 0], poses[row, track, 1], poses[row, track, 2]
-                vx, vy = velocities[row, track, 0], velocities[row, track, 1]
-                length, width = sizes[row, track, 0], sizes[row, track, 1]
-            position[index, sample, 0] = cos * (px - x) + sin * (py - y)
-            position[index, sample, 1] = cos * (py - y) - sin * (px - x)
-            turned[index, sample] = angle - heading
-            velocity[index, sample, 0] = cos * vx + sin * vy
-            velocity[index, sample, 1] = cos * vy - sin * vx
-            shape[index, sample, 0], shape[index, sample, 1] = width, length
-            valid[index, sample] = True
-    return position, turned, velocity, shape, valid
 
 
 def poses_of(plan: np.ndarray) -> FloatArray:
@@ -138,13 +139,79 @@ def straight_on(history: History) -> Trajectory:
     return plan_of_poses(poses, history)
 
 
+def plan_of_poses(poses: FloatArray, history: History) -> Trajectory:
+    """The present state followed by a plan.
+
+    Velocities and accelerations are derivatives of history and plan together, taken on the uneven
+    past and on the plan resampled at the last interval of the past (nuPlan rule 390).
+
+    Args:
+        poses: (H, 3) rear axle x [m], y [m], heading [rad] in the map frame, 0.1 s apart, from
+            0.1 s after the present on; at least 4.
+        history: The last samples, the present one included.
+
+    Returns:
+        (H + 1) states with log time stamps.
+    """
+    past_s = np.asarray(history.time_us * 1e-6, np.float64)
+    times = np.arange(0.0, len(poses) * STEP - STEP / 2.0, STEP) + STEP + past_s[-1]
+    states = np.zeros((len(poses) + 1, NUM_STATE))
+    states[0] = history.ego[-1]
+    states[1:, :3] = poses
+    states[1:, VX : AY + 1] = _motion(history.ego[:, :3], past_s, states[:, :3], times)
+    time_us = np.empty(len(states), np.int64)
+    time_us[0] = history.time_us[-1]
+    time_us[1:] = times * 1e6  # nuPlan rule 391: truncated, a microsecond may be lost
+    return Trajectory(time_us, states)
+
+
+def _motion(
+    past: FloatArray, past_s: FloatArray, planned: FloatArray, times: FloatArray
+) -> FloatArray:
+    """(H, 4) velocity and acceleration of a plan, each forward and to the right (not left).
+
+    Of poses (N, 3) at times (N,) in the past, and (H + 1, 3) planned, the present one first, at
+    times (H,) behind it [s].
+    """
+    now = past_s[-1]
+    step = now - past_s[-2] if len(past) > 1 else STEP
+    count = int(np.ceil((times[-1] + 1e-6 - now) / step)) - 1
+    if count < len(_WINDOW):  # after a gap in the recording
+        step, count = STEP, len(times)
+    grid = now + step * np.arange(1, count + 1)
+    even = _interpolate(grid, np.concatenate([[now], times]), planned)
+    samples = np.concatenate([past[:, :2], even[:, :2]])
+    spacing = (grid[-1] - past_s[0]) / (len(samples) - 1)
+    index = np.arange(len(past), len(samples))
+    center = np.clip(index, 2, len(samples) - 3)  # the first and last window serve their ends
+    window = samples[center[:, None] + _WINDOW] - samples[center, None]
+    bend = np.einsum("k,nkc->nc", _BEND, window) / spacing**2
+    ahead = (index - center)[:, None] * spacing
+    slope = np.einsum("k,nkc->nc", _SLOPE, window) / spacing + bend * ahead
+    cos, sin = np.cos(even[:, HEADING]), np.sin(even[:, HEADING])
+    parts = []
+    for x, y in (slope.T, bend.T):
+        parts += [x * cos + y * sin, x * sin - y * cos]  # nuPlan rule 392
+    return _interpolate(times, grid, np.stack(parts, axis=1))
+
+
+def _interpolate(at: FloatArray, knots: FloatArray, values: FloatArray) -> FloatArray:
+    """Rows of `values` between the knots; the outer steps go on beyond their ends."""
+    after = np.clip(np.searchsorted(knots, at), 1, len(knots) - 1)
+    before = after - 1
+    along = (at - knots[before]) / (knots[after] - knots[before])
+    return values[before] + along[:, None] * (values[after] - values[before])
+
+
 def stack_scenes(scenes: Sequence[Sequence[np.ndarray]], device: str) -> list[Any]:
     """Tensors (B, …) of the arrays of B scenes; where one has fewer rows, zeros follow."""
+    import torch
+
     out: list[Any] = []
     for arrays in zip(*scenes, strict=True):
         shape = np.max([array.shape for array in arrays], axis=0)
         batch = np.zeros((len(arrays), *shape), arrays[0].dtype)
         for row, array in zip(batch, arrays, strict=True):
             row[tuple(slice(size) for size in array.shape)] = array
-        out.append(on_device(batch, device))
+        out.append(torch.from_numpy(batch).to(device))
     return out

@@ -9,7 +9,9 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
+from shiftsim.geometry.polylines import point_on_polyline
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.planners.learned.features import turned
 from shiftsim.planners.per_map import PerMap
 from shiftsim.world.layers import Polylines, meeting, square_around
 from shiftsim.world.map import NONE, VectorMap
@@ -18,7 +20,6 @@ from shiftsim.world.state import LightStatus, TrafficLights
 POINTS = 20  # per polyline; their vectors lead to the next one
 _MIDDLE = 10  # point that stands for the whole object
 LANE, CONNECTOR, CROSSWALK = 0, 1, 2
-_ZERO_BIN = 1e-6  # divisor of a bin without length
 
 
 class RoadObjects(NamedTuple):
@@ -52,7 +53,7 @@ def _make_road_objects(road: VectorMap) -> RoadObjects:
     lines = np.empty((num_edges + num_crosswalks, 3, POINTS + 1, 2))
     for side, polylines in enumerate((road.baselines, road.left_boundaries, road.right_boundaries)):
         # a map without boundaries gets its centre lines in their place
-        _resample_all(polylines, road.baselines, lines[:num_edges, side])
+        resample(polylines, road.baselines, lines[:num_edges, side])
     along = np.linspace(0.0, 1.0, POINTS + 1)[:, None]
     for index in range(num_crosswalks):
         corners = oriented_rectangle(road.crosswalks.rings(index)[0])
@@ -73,36 +74,27 @@ road_objects = PerMap(_make_road_objects)
 
 
 @kernel
-def _resample_all(lines: Polylines, fallback: Polylines, out: FloatArray) -> None:
-    """Write every polyline, or its fallback where it is missing, at 21 points into `out`."""
+def resample(lines: Polylines, fallback: Polylines, out: FloatArray) -> None:
+    """Write points at equal distances along every polyline into `out` (M, K, 2).
+
+    A polyline of less than two vertices is replaced by its fallback; one without any gives zeros.
+    """
     for line in range(len(out)):
-        start, stop = lines.ptr[line], lines.ptr[line + 1]
-        if stop - start >= 2:
-            _resample(lines.xy[start:stop], lines.arc[start:stop], out[line])
+        if lines.ptr[line + 1] - lines.ptr[line] >= 2:
+            _resample_line(lines, line, out[line])
         else:
-            start, stop = fallback.ptr[line], fallback.ptr[line + 1]
-            _resample(fallback.xy[start:stop], fallback.arc[start:stop], out[line])
+            _resample_line(fallback, line, out[line])
 
 
 @kernel
-def _resample(xy: FloatArray, arc: FloatArray, out: FloatArray) -> None:
-    """Write points equally spaced along a polyline into `out` (21, 2)."""
-    last = len(xy) - 1
-    length = arc[last] if arc[last] > 0.0 else 1.0
-    for point in range(len(out)):
-        fraction = point / (len(out) - 1.0)
-        after = 1
-        while after < last and arc[after] / length <= fraction:
-            after += 1
-        if point == 0:
-            after = 1
-        elif point == len(out) - 1:
-            after = last
-        span = (arc[after] - arc[after - 1]) / length
-        along = (fraction - arc[after - 1] / length) / (span if span > 0.0 else _ZERO_BIN)
-        for axis in range(2):
-            first = xy[after - 1, axis]
-            out[point, axis] = first + along * (xy[after, axis] - first)
+def _resample_line(lines: Polylines, line: int, out: FloatArray) -> None:
+    start, stop = lines.ptr[line], lines.ptr[line + 1]
+    out[:] = 0.0
+    if stop > start:
+        for point in range(len(out)):
+            at = lines.arc[stop - 1] * point / (len(out) - 1)
+            x, y = point_on_polyline(lines.xy, lines.arc, start, stop, at)
+            out[point, 0], out[point, 1] = x, y
 
 
 def oriented_rectangle(ring: FloatArray) -> FloatArray:
@@ -197,63 +189,26 @@ def road_features(
     square = square_around(float(center[0]), float(center[1]), radius)
     edges = meeting(road.edges.polygons, square)
     near = np.concatenate([edges, len(road.edges) + meeting(road.crosswalks.polygons, square)])
-    kept, points, vectors, orientations, valid = _to_ego_frame(
-        known.lines, known.angles, near, ego[0], ego[1], ego[2], radius
-    )
-    limit = known.limit[kept]
+    heading = float(ego[2])
+    offsets = turned(known.lines[near, 0, :-1] - ego[:2], heading)
+    valid: BoolArray = np.all(np.abs(offsets) < radius, axis=-1)
+    seen = valid.any(axis=1)
+    chosen, valid = near[seen], valid[seen]
+    lines = known.lines[chosen]
+    points = turned(lines[:, :, :-1] - ego[:2], heading).astype(np.float32)
+    vectors = turned(np.diff(lines, axis=2), heading).astype(np.float32)
+    orientations = (known.angles[chosen] - heading).astype(np.float32)
+    limit = known.limit[chosen]
     has_limit = ~np.isnan(limit)
-    light = np.full(len(kept), int(LightStatus.UNKNOWN))
-    num_edges = int(np.searchsorted(kept, len(road.edges)))
-    light[:num_edges] = lights[kept[:num_edges]]
-    block = known.block[kept]
-    routed = (block != NONE) & on_route[block] if len(on_route) else np.zeros(len(kept), np.bool_)
+    light = np.full(len(chosen), int(LightStatus.UNKNOWN))
+    num_edges = int(np.searchsorted(chosen, len(road.edges)))
+    light[:num_edges] = lights[chosen[:num_edges]]
+    block = known.block[chosen]
+    routed = (block != NONE) & on_route[block] if len(on_route) else np.zeros(len(chosen), np.bool_)
     centers = np.concatenate(
         [points[:, 0, _MIDDLE], orientations[:, 0, _MIDDLE : _MIDDLE + 1]], axis=1
     )
     return RoadFeatures(
-        *(kept, points, vectors, orientations, centers, valid, known.kind[kept], routed, light),
+        *(chosen, points, vectors, orientations, centers, valid, known.kind[chosen], routed, light),
         *(has_limit, np.where(has_limit, limit, 0.0).astype(np.float32)),
     )
-
-
-@kernel
-def _to_ego_frame(
-    lines: FloatArray,
-    angles: FloatArray,
-    near: IntArray,
-    x: float,
-    y: float,
-    heading: float,
-    radius: float,
-) -> tuple[IntArray, np.ndarray, np.ndarray, np.ndarray, BoolArray]:
-    """Objects with a valid point, moved and turned; invalid points are, too."""
-    cos, sin = np.cos(heading), np.sin(heading)
-    kept = np.empty(len(near), np.int64)
-    valid = np.empty((len(near), POINTS), np.bool_)
-    count = 0
-    for row in near:
-        seen = False
-        for point in range(POINTS):
-            dx, dy = lines[row, 0, point, 0] - x, lines[row, 0, point, 1] - y
-            ahead, left = cos * dx + sin * dy, cos * dy - sin * dx
-            valid[count, point] = abs(ahead) < radius and abs(left) < radius
-            seen = seen or valid[count, point]
-        if seen:
-            kept[count] = row
-            count += 1
-    points = np.empty((count, 3, POINTS, 2), np.float32)
-    vectors = np.empty((count, 3, POINTS, 2), np.float32)
-    orientations = np.empty((count, 3, POINTS), np.float32)
-    for index in range(count):
-        row = kept[index]
-        for side in range(3):
-            line = lines[row, side]
-            for point in range(POINTS):
-                dx, dy = line[point, 0] - x, line[point, 1] - y
-                points[index, side, point, 0] = cos * dx + sin * dy
-                points[index, side, point, 1] = cos * dy - sin * dx
-                dx, dy = line[point + 1, 0] - line[point, 0], line[point + 1, 1] - line[point, 1]
-                vectors[index, side, point, 0] = cos * dx + sin * dy
-                vectors[index, side, point, 1] = cos * dy - sin * dx
-                orientations[index, side, point] = angles[row, side, point] - heading
-    return kept[:count], points, vectors, orientations, valid[:count]

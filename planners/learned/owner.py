@@ -7,7 +7,6 @@ computed, the next request is already read.
 """
 
 import logging
-import pickle
 import secrets
 import sys
 import traceback
@@ -25,11 +24,8 @@ from threading import Lock, Thread
 from time import monotonic, sleep
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from shiftsim.errors import PlannerError, ShiftsimError
 
-LARGE = 1 << 16  # bytes from which an array is sent as it lies in memory, without a copy
 PATIENCE = 60.0  # s, for an owner that has ended to be there again
 _TRIES = 2  # of one request: an owner that has ended by chance, and one that ends of it
 _PAUSE = 0.05  # s
@@ -49,7 +45,7 @@ def new_address() -> Address:
     return Address(place, secrets.token_bytes(32))
 
 
-class Owner:
+class InferenceServer:
     """Answers for planners, on threads, as long as it lives."""
 
     def __init__(self, planners: Mapping[str, Callable[[], Any]], address: Address) -> None:
@@ -74,7 +70,7 @@ class Owner:
             deliver_challenge(connection, self._key)
             answer_challenge(connection, self._key)
             while True:
-                send(connection, self._answer(*receive(connection)))
+                connection.send(self._answer(*connection.recv()))
 
     def _answer(self, name: str, features: Sequence[Any]) -> Any:
         """The outputs, or the error and its traceback."""
@@ -83,11 +79,11 @@ class Owner:
                 return self._planners[name].infer(features), ""
         except Exception as error:  # becomes that of the scenario
             ours = isinstance(error, ShiftsimError)
-            told = error if ours else PlannerError(f"{type(error).__name__}: {error}")
-            return told, traceback.format_exc()
+            reported = error if ours else PlannerError(f"{type(error).__name__}: {error}")
+            return reported, traceback.format_exc()
 
 
-class Ask:
+class InferenceClient:
     """What takes the place of `infer` where an owner has the network.
 
     Copies of a planner share it, and its connection, which is made when it is needed.
@@ -100,7 +96,7 @@ class Ask:
         self._patience = PATIENCE
 
     def __reduce__(self) -> Any:
-        return Ask, (self.address, self.name)
+        return InferenceClient, (self.address, self.name)
 
     def __call__(self, features: Sequence[Any]) -> Sequence[Any]:
         """What the planner's `infer` returns.
@@ -112,8 +108,8 @@ class Ask:
         for left in reversed(range(_TRIES)):
             try:
                 self._connection = self._connection or self._connected()
-                send(self._connection, (self.name, features))
-                answer, trace = receive(self._connection)
+                self._connection.send((self.name, features))
+                answer, trace = self._connection.recv()
                 break
             except (EOFError, OSError) as error:
                 self.close()
@@ -150,33 +146,3 @@ class Ask:
             else:
                 self._patience = PATIENCE
                 return found
-
-
-def send(connection: "Connection[Any, Any]", value: object) -> None:
-    """Send a value; its large arrays follow it, and are not copied into it."""
-    large: list[memoryview] = []
-
-    def stays(buffer: pickle.PickleBuffer) -> bool:
-        raw = buffer.raw()
-        if raw.nbytes >= LARGE:
-            large.append(raw)
-        return raw.nbytes < LARGE
-
-    head = pickle.dumps(value, 5, buffer_callback=stays)
-    connection.send_bytes(np.array([part.nbytes for part in large], np.int64).tobytes())
-    connection.send_bytes(head)
-    for part in large:
-        connection.send_bytes(part)
-
-
-def receive(connection: "Connection[Any, Any]") -> Any:
-    """What `send` sent.
-
-    Raises:
-        EOFError: The other side has gone.
-    """
-    sizes = np.frombuffer(connection.recv_bytes(), np.int64).tolist()
-    head, large = connection.recv_bytes(), [bytearray(size) for size in sizes]
-    for part in large:
-        connection.recv_bytes_into(part)
-    return pickle.loads(head, buffers=large)

@@ -6,25 +6,19 @@ import numpy as np
 import shapely
 from shapely.ops import substring
 
-from shiftsim.geometry.polylines import (
+from shiftsim.geometry.corridor import (
     BAND,
     CLEAR,
-    HIT,
-    OPEN,
-    RUN,
-    Path,
-    Stretch,
+    Corridor,
     corridor_polygon,
     is_run_near,
-    is_run_within,
-    project,
-    side_of,
-    window,
+    occupancy,
     without_repeats,
 )
-from shiftsim.geometry.rings import SLACK, centroid
+from shiftsim.geometry.polylines import RUN, Path, project, window
+from shiftsim.geometry.rings import centroid, ring_bounds
 from shiftsim.kernels import FloatArray, IntArray, kernel
-from shiftsim.planners.pdm.forecast import NUM_FORECASTS, Forecast, ring_of
+from shiftsim.planners.pdm.forecast import Forecast
 
 
 class Paths(NamedTuple):
@@ -45,38 +39,8 @@ class Corridors(NamedTuple):
 
     spans: FloatArray  # (L, 2) progress at its start and at its end [m]
     half_width: float  # radius of the buffer [m]
-    sides: IntArray  # (L, 41, M) CLEAR, HIT or OPEN on every forecast map
+    occupancy: IntArray  # (L, 41, M) CLEAR, HIT or UNDECIDED on every forecast map
     progress: FloatArray  # (L, 41, M) projection of the centroid on the path, where not CLEAR [m]
-
-
-class BoxFrame(NamedTuple):
-    """Axes and size of a box."""
-
-    cos: float  # cosine of its heading
-    sin: float  # sine of its heading
-    half_length: float  # [m]
-    half_width: float  # [m]
-
-
-def make_corridors(num_paths: int, half_width: float, count: int) -> Corridors:
-    """Corridors of no length that nothing is known of yet."""
-    shape = (num_paths, NUM_FORECASTS, count)
-    return Corridors(np.zeros((num_paths, 2)), half_width, np.full(shape, CLEAR), np.zeros(shape))
-
-
-def decide(
-    polygon: shapely.Polygon,
-    corridors: Corridors,
-    forecast: Forecast,
-    index: int,
-    row: int,
-    it: int,
-) -> None:
-    """Decide by the polygon of a path's corridor what is OPEN; what stands still, for all rows."""
-    side = HIT if polygon.intersects(shapely.Polygon(ring_of(forecast, it, row))) else CLEAR
-    stands = it >= len(forecast.moves) or not forecast.moves[it]
-    rows = corridors.sides[index, :, it] if stands else corridors.sides[index, row : row + 1, it]
-    rows[rows == OPEN] = side
 
 
 def corridor_shape(path: Path, low: float, high: float, half_width: float) -> shapely.Polygon:
@@ -98,120 +62,55 @@ def fill_corridor(
 
     Of what stands still, maps beyond the second one repeat the one before.
     """
-    sides, progress, others = corridors.sides[number], corridors.progress[number], forecast.others
-    low, high = corridors.spans[number, 0], corridors.spans[number, 1]
-    begin, end = window(path, low, high)
+    known, progress = corridors.occupancy[number], corridors.progress[number]
+    boxes, centroids = forecast.others.boxes, forecast.others.centroids
+    light_ptr, light_xy, runs = forecast.light_ptr, forecast.light_xy, path.runs
+    begin, end = window(path, corridors.spans[number, 0], corridors.spans[number, 1])
     begin, end = without_repeats(path.xy, begin, end)
-    stretch = Stretch(path.xy, path.runs, begin, end, corridors.half_width)
-    has_length = end - begin > 1
-    reach = 1.5 * (1.0 + BAND) * stretch.half_width  # covers the corners of the square ends
-    num_boxes = len(others.radii)
-    for index in range(sides.shape[1]):
+    corridor = Corridor(path.xy, runs, begin, end, corridors.half_width)
+    reach = 1.5 * (1.0 + BAND) * corridors.half_width  # covers the corners of the square ends
+    num_boxes = len(forecast.moves)
+    for index in range(known.shape[1]):
         light = index - num_boxes
-        stop = last if light < 0 and forecast.moves[index] else first + 1
-        if stop < last and first > 1:
-            stop = first  # all is known
-        ring = (
-            others.boxes[first, index]
-            if light < 0
-            else forecast.light_xy[forecast.light_ptr[light] : forecast.light_ptr[light + 1]]
-        )
-        near, farthest, radius, frame = 0, 0, 0.0, BoxFrame(1.0, 0.0, 0.0, 0.0)
-        is_box = has_length and light < 0 and stop > first
-        if is_box:
+        moves = light < 0 and forecast.moves[index]
+        stop = last if moves else min(first + 1, last) if first == 1 else first
+        first_near, last_near = begin // RUN, (end - 2) // RUN  # runs
+        is_bounded = light < 0 and stop > first and end - begin >= 2
+        if is_bounded:
             # boxes move in straight lines
-            start, there = others.centers[first, index], others.centers[stop - 1, index]
-            swept = (
-                *(min(start[0], there[0]), min(start[1], there[1])),
-                *(max(start[0], there[0]), max(start[1], there[1])),
-            )
-            radius = others.radii[index] + SLACK
-            near, farthest = _runs_near(stretch, swept, reach + radius)
-            if near > farthest:
+            low_x, low_y, high_x, high_y = ring_bounds(boxes[first, index])
+            x0, y0, x1, y1 = ring_bounds(boxes[stop - 1, index])
+            swept = (min(low_x, x0), min(low_y, y0), max(high_x, x1), max(high_y, y1))
+            while first_near <= last_near and not is_run_near(runs, first_near, swept, reach):
+                first_near += 1
+            while first_near <= last_near and not is_run_near(runs, last_near, swept, reach):
+                last_near -= 1
+            if first_near > last_near:
                 continue
-            frame = BoxFrame(
-                np.cos(forecast.headings[index]),
-                np.sin(forecast.headings[index]),
-                0.5 * np.hypot(ring[0, 0] - ring[1, 0], ring[0, 1] - ring[1, 1]),
-                0.5 * np.hypot(ring[1, 0] - ring[2, 0], ring[1, 1] - ring[2, 1]),
-            )
-        guess = near
+        guess = 0
         for row in range(first, stop):
-            side = OPEN
-            if is_box:
-                center = others.centers[row, index]
-                side = _side_of_frame(path, stretch, near, farthest, radius, center, frame)
-            if side == CLEAR:
-                continue
+            if is_bounded and moves:
+                low_x = low_y = np.inf
+                high_x = high_y = -np.inf
+                for corner in range(4):
+                    x, y = boxes[row, index, corner, 0], boxes[row, index, corner, 1]
+                    low_x, high_x = min(low_x, x), max(high_x, x)
+                    low_y, high_y = min(low_y, y), max(high_y, y)
+                run, bounds = first_near, (low_x, low_y, high_x, high_y)
+                while run <= last_near and not is_run_near(runs, run, bounds, reach):
+                    run += 1
+                if run > last_near:
+                    continue
             if light < 0:
-                ring = others.boxes[row, index]
-                x, y = others.centroids[row, index, 0], others.centroids[row, index, 1]
+                ring = boxes[row, index]
+                x, y = centroids[row, index, 0], centroids[row, index, 1]
             else:
+                ring = light_xy[light_ptr[light] : light_ptr[light + 1]]
                 x, y = centroid(ring)
-            along, _, guess = project(path, x, y, guess)
-            if side == OPEN:
-                side = side_of(stretch, ring)
-            sides[row, index], progress[row, index] = side, along
-        known = stop - 1
-        if stop < last and sides[known, index] != CLEAR:
-            for row in range(stop, last):
-                sides[row, index], progress[row, index] = (
-                    sides[known, index],
-                    progress[known, index],
-                )
-
-
-@kernel
-def _side_of_frame(
-    path: Path,
-    stretch: Stretch,
-    first: int,  # run that may be near
-    last: int,  # likewise; those outside are not
-    radius: float,  # of a circle around the box [m]
-    center: FloatArray,  # (2,) of the box [m]
-    frame: BoxFrame,
-) -> int:
-    """As `side_of`, from distances of a box from vertices alone: OPEN where these say nothing."""
-    inner, outer = (1.0 - BAND) * stretch.half_width - SLACK, (1.0 + BAND) * stretch.half_width
-    x, y, begin, end = center[0], center[1], stretch.begin, stretch.end - 1
-    cap = 1.5 * outer  # to the corners of the square ends
-    side = CLEAR
-    if (
-        _square_from(frame, stretch.xy[begin, 0] - x, stretch.xy[begin, 1] - y) <= cap * cap
-        or _square_from(frame, stretch.xy[end, 0] - x, stretch.xy[end, 1] - y) <= cap * cap
-    ):
-        side = OPEN
-    for run in range(first, last + 1):
-        if not is_run_within(stretch.runs, run, x, y, radius + outer):
-            continue
-        for vertex in range(max(begin, run * RUN), min(end, (run + 1) * RUN) + 1):
-            square = _square_from(frame, stretch.xy[vertex, 0] - x, stretch.xy[vertex, 1] - y)
-            if square <= inner * inner:
-                return HIT
-            # no point of the segments beside it is farther from one of their ends
-            step = path.progress[vertex] - path.progress[max(vertex - 1, begin)]
-            step = max(step, path.progress[min(vertex + 1, end)] - path.progress[vertex])
-            limit = outer + 0.5 * step + SLACK
-            if square <= limit * limit:
-                side = OPEN
-    return side
-
-
-@kernel
-def _square_from(frame: BoxFrame, dx: float, dy: float) -> float:
-    """Square of the distance of a box from a point, given from its centre [m^2]."""
-    along = max(abs(frame.cos * dx + frame.sin * dy) - frame.half_length, 0.0)
-    across = max(abs(frame.cos * dy - frame.sin * dx) - frame.half_width, 0.0)
-    return along * along + across * across
-
-
-@kernel
-def _runs_near(
-    stretch: Stretch, bounds: tuple[float, float, float, float], reach: float
-) -> tuple[int, int]:
-    """The first and the last run of a stretch near to bounds; where none is, the last is less."""
-    first, last = len(stretch.runs), -1
-    for run in range(stretch.begin // RUN, (stretch.end - 2) // RUN + 1):
-        if is_run_near(stretch.runs, run, bounds, reach):
-            first, last = min(first, run), run
-    return first, last
+            known[row, index] = occupancy(corridor, ring, True)
+            if known[row, index] != CLEAR:
+                progress[row, index], _, guess = project(path, x, y, guess)
+        for row in range(stop, last):
+            if stop > 0 and not moves:
+                known[row, index] = known[stop - 1, index]
+                progress[row, index] = progress[stop - 1, index]

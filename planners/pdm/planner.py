@@ -136,8 +136,8 @@ class PdmClosed:
         """Lay the centerline (K, 3) and the paths beside it, once per scenario."""
         self.centerline, offsets = line, self.parameters.lateral_offsets
         lines = [line, *(offset_poses(line, by) for by in offsets)]
-        made = [make_path(item) for item in lines]
-        self.paths = Paths(*(np.stack(arrays) for arrays in zip(*made, strict=True)))
+        paths = [make_path(item) for item in lines]
+        self.paths = Paths(*(np.stack(arrays) for arrays in zip(*paths, strict=True)))
         return self.paths
 
     def step_in(
@@ -153,8 +153,8 @@ class PdmClosed:
             seen.forecast.ignored[:] = [token in self.collided for token in seen.tokens]
         limit = params.fallback_velocity if math.isnan(limit) else limit
         targets = limit * np.array(params.speed_fractions)
-        around = Scene(paths, seen.forecast, size, params.following)
-        return plan_step(ego, targets, around, seen.place, vehicle, params)
+        scene = Scene(paths, seen.forecast, size, params.following)
+        return plan_step(ego, targets, scene, seen.place, vehicle, params)
 
     def _forecast(
         self, road: VectorMap, route: Route, observation: Observation, center: FloatArray

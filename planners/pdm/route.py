@@ -6,8 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.errors import PlannerError
-from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.planners.proposals.areas import Areas, Slabs, covering, index_ranks, make_areas
+from shiftsim.geometry.rings import EXTERIOR, locate_in_polygon
+from shiftsim.kernels import FloatArray, IntArray
+from shiftsim.planners.proposals.areas import Areas, index_ranks, make_areas
 from shiftsim.planners.proposals.places import EgoBox
 from shiftsim.planners.routes.correction import Start, correct_route, find_start, known_blocks
 from shiftsim.planners.routes.graph import (
@@ -18,7 +19,7 @@ from shiftsim.planners.routes.graph import (
     lanes_of,
     search_cheapest,
 )
-from shiftsim.world.layers import Polylines, square_around
+from shiftsim.world.layers import square_around
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import HEADING, X, Y
 
@@ -74,37 +75,20 @@ def lanes_at(
     road: VectorMap, route: Route, selected: IntArray, ego: FloatArray
 ) -> tuple[list[int], list[float]]:
     """Areas of the route under the rear axle, and their heading errors [rad]."""
-    areas = route.areas
-    under, errors = np.empty_like(selected), np.empty(len(selected))
-    count = _lanes_at(
-        *(areas.slabs, areas.on_route, areas.lane, selected, road.baselines),
-        *(ego, ego[None, :2], under, errors),
-    )
-    return under[:count].tolist(), errors[:count].tolist()
-
-
-@kernel
-def _lanes_at(
-    slabs: Slabs,
-    on_route: BoolArray,
-    lane: IntArray,
-    selected: IntArray,
-    baselines: Polylines,
-    ego: FloatArray,
-    point: FloatArray,  # (1, 2) its rear axle
-    under: IntArray,  # receives the areas
-    errors: FloatArray,  # receives their heading errors
-) -> int:
-    """Find areas of the route under the rear axle; how many."""
-    count = 0
-    for entry in range(covering(slabs, selected, point, under)):
-        area = under[entry]
-        if on_route[area]:
-            under[count] = area
-            error = deviation(baselines, lane[area], 1, ego[X], ego[Y], ego[HEADING])[1]
-            errors[count] = error
-            count += 1
-    return count
+    x, y, heading = float(ego[X]), float(ego[Y]), float(ego[HEADING])
+    areas, under = route.areas, selected[route.areas.on_route[selected]]
+    shapes, bounds = areas.polygons, areas.polygons.bounds[under]
+    under = under[(bounds[:, :2] <= (x, y)).all(axis=1) & (bounds[:, 2:] >= (x, y)).all(axis=1)]
+    found = [
+        area
+        for area in under.tolist()
+        if locate_in_polygon(
+            shapes.xy, shapes.ring_ptr, *shapes.poly_ptr[area : area + 2].tolist(), x, y
+        )
+        != EXTERIOR
+    ]
+    lanes = areas.lane[found].tolist()
+    return found, [deviation(road.baselines, lane, 1, x, y, heading)[1] for lane in lanes]
 
 
 def in_index_order(route: Route, selected: IntArray, chosen: list[int]) -> list[int]:

@@ -7,34 +7,26 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.geometry.boxes import AHEAD, BEHIND, bearing
+from shiftsim.geometry.boxes import AHEAD, BEHIND, bearing_cosine, boxes_touch
 from shiftsim.geometry.polylines import Path, project
-from shiftsim.geometry.rings import SLACK, convex_intersect
+from shiftsim.geometry.rings import SLACK
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.pdm.parameters import PdmParameters
-from shiftsim.planners.proposals.areas import Areas, Slabs
-from shiftsim.planners.proposals.comfort import (
-    Comfort,
-    ComfortBounds,
-    Filters,
-    empty_comfort,
-    feel,
-    make_filters,
-)
+from shiftsim.planners.proposals.areas import Areas
+from shiftsim.planners.proposals.comfort import comfort
 from shiftsim.planners.proposals.contacts import (
     NEVER,
     TTC_STOPPED,
-    Others,
-    is_at_fault,
-    project_box,
+    Obstacles,
+    first_faults,
+    near_others,
 )
 from shiftsim.planners.proposals.places import (
     OFF_ROAD,
     OFF_ROUTE,
     EgoBox,
-    Places,
-    empty_places,
-    find,
+    ProposalStates,
+    find_places,
 )
 from shiftsim.planners.proposals.tracker import DT
 from shiftsim.world.layers import Polygons, in_any
@@ -61,18 +53,6 @@ class Scores(NamedTuple):
     flags: BoolArray  # (P, T, 3) whether the ego is on several lanes, off the road, off the route
 
 
-class Findings(NamedTuple):
-    """What P proposals hit and where they go, as in `Scores`."""
-
-    no_collision: FloatArray
-    drivable: FloatArray
-    direction: FloatArray
-    ttc: FloatArray
-    raw_progress: FloatArray
-    collision_index: FloatArray
-    ttc_index: FloatArray
-
-
 class Place(NamedTuple):
     """The map as the scorer sees it."""
 
@@ -83,25 +63,38 @@ class Place(NamedTuple):
 
 
 def score(
-    states: FloatArray, place: Place, others: Others, size: EgoBox, params: PdmParameters
+    states: FloatArray, place: Place, others: Obstacles, size: EgoBox, params: PdmParameters
 ) -> Scores:
     """Score P proposals by their driven states (P, T, 11)."""
-    at, felt, near = empty_places(states), empty_comfort(states), np.empty_like(place.selected)
-    found = Findings(*np.empty((len(Findings._fields), len(states))))
-    areas, bounds = place.areas, (params.direction_limits, params.comfort)
-    _judge(
-        *(areas.slabs, areas.on_route, place.selected, near, place.intersections),
-        *(place.centerline, others, size, make_filters(), bounds, at, felt, found),
-    )
-    factor = found.no_collision * found.drivable * found.direction
-    progress = normalise(found.raw_progress, factor)
-    total = factor * weigh(progress, found.ttc, felt.score, params)
+    areas, steps = place.areas, np.arange(states.shape[1])
+    no_limits = np.zeros(len(areas.lane))
+    places = find_places(states, size, areas, place.selected, no_limits, by_center=True)
+    near = near_others(places, others, (steps[-1] + TTC_STEPS[-1]) // 2 + 1, AHEAD_SECONDS)
+    # nuPlan rule 195: what is not at fault when it is first touched is not looked at again
+    no_collision, collision_index = first_faults(places, others, near, steps // 2, True)
+    ttc_index = _first_violations(places, others, near, size, place.intersections)
+    raw_progress, direction = _follow_route(places, place.centerline, params.direction_limits)
+    drivable = np.where(places.flags[..., OFF_ROAD].any(axis=1), 0.0, 1.0)
+    factor = no_collision * drivable * direction
+    progress = normalise(raw_progress, factor)
+    ttc = np.where(ttc_index < NEVER, 0.0, 1.0)
+    comfortable = comfort(states, params.comfort).score
     return Scores(
-        total=total, progress=progress, comfort=felt.score, flags=at.flags, **found._asdict()
+        total=factor * weighted_mean(progress, ttc, comfortable, params),
+        no_collision=no_collision,
+        drivable=drivable,
+        direction=direction,
+        progress=progress,
+        ttc=ttc,
+        comfort=comfortable,
+        raw_progress=raw_progress,
+        collision_index=collision_index,
+        ttc_index=ttc_index,
+        flags=places.flags,
     )
 
 
-def weigh(
+def weighted_mean(
     progress: FloatArray, ttc: FloatArray, comfortable: FloatArray, params: PdmParameters
 ) -> FloatArray:
     """(P,) weighted mean of what is not a factor."""
@@ -121,188 +114,93 @@ def normalise(raw: FloatArray, factor: FloatArray) -> FloatArray:
 
 
 @kernel
-def _judge(
-    slabs: Slabs,
-    on_route: BoolArray,
-    selected: IntArray,
-    near: IntArray,  # scratch for some of them
-    intersections: Polygons,
-    centerline: Path,
-    others: Others,
+def _first_violations(
+    places: ProposalStates,
+    others: Obstacles,
+    near: IntArray,
     size: EgoBox,
-    filters: Filters,
-    bounds: tuple[tuple[float, float], ComfortBounds],  # of the direction, of comfort
-    at: Places,
-    felt: Comfort,
-    found: Findings,
-) -> None:
-    """Fill in the places, the comfort test and the findings."""
-    find(slabs, on_route, selected, np.empty(0), True, size, near, at)
-    states, corners, centers, flags, off_lane, _ = at
-    no_collision, drivable, direction, ttc, raw_progress, collision_index, ttc_index = found
-    _follow_route(centers, flags, centerline, bounds[0], raw_progress, drivable, direction)
-    feel(states, filters, bounds[1], felt)
-    num_steps, (boxes, others_at, centroids, speeds, radii, is_agent, ignored) = (
-        len(states[0]),
-        others,
+    intersections: Polygons,
+) -> FloatArray:
+    """(P,) first time indices at which a proposal comes too near to one of the others, inf if none.
+
+    Each of these counts until its first contact with the ego or its projection.
+    """
+    states, centers, corners, off_lane = (
+        places.states,
+        places.centers,
+        places.corners,
+        places.off_lane,
     )
-    box, motion = np.empty((4, 2)), np.empty((num_steps, 3))  # speed, cosine, sine
-    last, radius = (num_steps - 1 + TTC_STEPS[-1]) // 2, 0.5 * np.hypot(size.length, size.width)
+    others_at, speeds, boxes, centroids = (
+        others.centers,
+        others.speeds,
+        others.boxes,
+        others.centroids,
+    )
+    radii, box = others.radii, np.empty((4, 2))
+    radius = 0.5 * np.hypot(size.length, size.width) + SLACK
+    out = np.full(len(states), NEVER)
+    is_over = np.empty(len(radii), np.bool_)
     for proposal in range(len(states)):
-        worth, fault, violation = 1.0, NEVER, NEVER
-        low_x = low_y = np.inf
-        high_x = high_y = -np.inf
-        for step in range(num_steps):
-            vx, vy = states[proposal, step, VX], states[proposal, step, VY]
-            motion[step, 0] = abs(vx) if vy == 0.0 else np.hypot(vx, vy)
+        is_over[:] = False
+        for step in range(states.shape[1]):
+            speed = np.hypot(states[proposal, step, VX], states[proposal, step, VY])
+            if speed < TTC_STOPPED or out[proposal] < step:
+                continue
             x, y = centers[proposal, step, 0], centers[proposal, step, 1]
-            reach = radius + AHEAD_SECONDS * motion[step, 0]
-            low_x, high_x = min(low_x, x - reach), max(high_x, x + reach)
-            low_y, high_y = min(low_y, y - reach), max(high_y, y + reach)
-        has_courses = False
-        for index in range(len(radii)):
-            # boxes of others move in straight lines
-            x, y, slack = others_at[0, index, 0], others_at[0, index, 1], radii[index] + SLACK
-            to_x, to_y = others_at[last, index, 0], others_at[last, index, 1]
-            if (
-                ignored[index]
-                or max(x, to_x) + slack < low_x
-                or min(x, to_x) - slack > high_x
-                or max(y, to_y) + slack < low_y
-                or min(y, to_y) - slack > high_y
-            ):
-                continue
-            for step in range(0 if has_courses else num_steps):
-                heading = states[proposal, step, HEADING]
-                motion[step, 1], motion[step, 2] = np.cos(heading), np.sin(heading)
-            has_courses = True
-            # each of the others counts until its first contact, of either kind
-            step, ttc_step = _meet(
-                states[proposal],
-                corners[proposal],
-                centers[proposal],
-                off_lane[proposal],
-                motion,
-                size,
-                index,
-                boxes,
-                others_at,
-                centroids,
-                speeds,
-                radii,
-                intersections,
-                violation,
-                box,
-            )
-            violation = min(violation, ttc_step)
-            if step < NEVER:
-                fault, worth = min(fault, step), min(worth, 0.0 if is_agent[index] else 0.5)
-        no_collision[proposal], ttc[proposal] = worth, 1.0 if violation == NEVER else 0.0
-        collision_index[proposal], ttc_index[proposal] = fault, violation
-
-
-@kernel
-def _meet(
-    states: FloatArray,  # (T, 11) of a proposal
-    corners: FloatArray,  # (T, 4, 2)
-    centers: FloatArray,  # (T, 2)
-    off_lane: BoolArray,  # (T,)
-    motion: FloatArray,  # (T, 3) speed [m/s], cosine and sine of the heading
-    size: EgoBox,
-    index: int,  # of one of the others
-    boxes: FloatArray,  # of the others, as in `Others`
-    others_at: FloatArray,
-    centroids: FloatArray,
-    speeds: FloatArray,
-    radii: FloatArray,
-    intersections: Polygons,
-    limit: float,  # time index after which violations do not matter
-    box: FloatArray,  # (4, 2) scratch
-) -> tuple[float, float]:
-    """Time indices of an at-fault collision and of a violation, inf if none."""
-    is_decided, fault, violation = False, NEVER, NEVER
-    is_forgiven = False
-    half_length, half_width = 0.5 * size.length, 0.5 * size.width
-    touching = np.hypot(half_length, half_width) + radii[index] + SLACK
-    for step in range(len(motion)):
-        if is_decided and (is_forgiven or step > limit):
-            break
-        speed, cos, sin = motion[step, 0], motion[step, 1], motion[step, 2]
-        x, y, state = centers[step, 0], centers[step, 1], states[step]
-        reach = touching + AHEAD_SECONDS * speed + (AHEAD_SECONDS + DT) * speeds[0, index]
-        dx, dy = others_at[step // 2, index, 0] - x, others_at[step // 2, index, 1] - y
-        if dx * dx + dy * dy > reach * reach:
-            continue
-        for ahead in TTC_STEPS:
-            row, travel = (step + ahead) // 2, 0.1 * ahead * speed
-            dx = others_at[row, index, 0] - (x + travel * cos)
-            dy = others_at[row, index, 1] - (y + travel * sin)
-            is_now = ahead == 0 and not is_decided
-            is_soon = not is_forgiven and not speed < TTC_STOPPED
-            if dx * dx + dy * dy > touching * touching or not (is_now or is_soon):
-                continue
-            # most boxes that are near clearly lie on one side of the ego
-            other = boxes[row, index]
-            least = left = np.inf
-            most = right = -np.inf
-            for corner in range(4):
-                dx, dy = other[corner, 0] - x, other[corner, 1] - y
-                along, across = cos * dx + sin * dy - travel, cos * dy - sin * dx
-                least, most = min(least, along), max(most, along)
-                left, right = min(left, across), max(right, across)
-            if max(least, -most) > half_length + SLACK or max(left, -right) > half_width + SLACK:
-                continue
-            project_box(corners[step], state, travel, box)
-            if not convex_intersect(box, other):
-                continue
-            middle = centroids[row, index]
-            if is_now:
-                # nuPlan rule 195: what is not at fault when it is first touched is not looked at
-                # again
-                is_decided = True
-                if is_at_fault(state, box, off_lane[step], speeds[row, index], middle, other):
-                    fault = float(step)
-            if is_soon:
-                is_forgiven = True  # or nothing later matters
-                angle = bearing(state, middle[0], middle[1])
-                counts = angle < AHEAD
-                if not counts and not angle > BEHIND:
-                    counts = off_lane[step] or in_any(intersections, state[X], state[Y])
-                if counts:
-                    violation = float(step)
-    return fault, violation
+            heading = states[proposal, step, HEADING]
+            cos, sin = np.cos(heading), np.sin(heading)
+            margin = radius + AHEAD_SECONDS * speed
+            for index in near:
+                reach = margin + radii[index] + (AHEAD_SECONDS + DT) * speeds[0, index]
+                dx, dy = others_at[step // 2, index, 0] - x, others_at[step // 2, index, 1] - y
+                if dx * dx + dy * dy > reach * reach or is_over[index]:
+                    continue
+                touching = radius + radii[index]
+                for ahead in TTC_STEPS:
+                    row, travel = (step + ahead) // 2, 0.1 * ahead * speed
+                    dx = others_at[row, index, 0] - (x + travel * cos)
+                    dy = others_at[row, index, 1] - (y + travel * sin)
+                    if dx * dx + dy * dy > touching * touching or is_over[index]:
+                        continue
+                    for corner in range(4):
+                        box[corner, 0] = corners[proposal, step, corner, 0] + travel * cos
+                        box[corner, 1] = corners[proposal, step, corner, 1] + travel * sin
+                    if not boxes_touch(box, boxes[row, index]):
+                        continue
+                    is_over[index] = True
+                    rear_x, rear_y = states[proposal, step, X], states[proposal, step, Y]
+                    dx = centroids[row, index, 0] - rear_x
+                    dy = centroids[row, index, 1] - rear_y
+                    angle = np.arccos(bearing_cosine(cos, sin, dx, dy))
+                    counts = angle < AHEAD
+                    if not counts and not angle > BEHIND:
+                        counts = off_lane[proposal, step] or in_any(intersections, rear_x, rear_y)
+                    if counts:
+                        out[proposal] = step
+    return out
 
 
 @kernel
 def _follow_route(
-    centers: FloatArray,
-    flags: BoolArray,
-    centerline: Path,
-    limits: tuple[float, float],
-    progress: FloatArray,
-    drivable: FloatArray,
-    direction: FloatArray,
-) -> None:
-    """Fill in where proposals go; `limits` [m] as in `PdmParameters`."""
-    last, guess, start, end = centers.shape[1] - 1, 0, 0.0, 0.0
+    places: ProposalStates, centerline: Path, limits: tuple[float, float]
+) -> tuple[FloatArray, FloatArray]:
+    """(P,) progress [m] and factors of the direction; `limits` [m] as in `PdmParameters`."""
+    centers, flags = places.centers, places.flags
+    progress, direction = np.empty(len(centers)), np.empty(len(centers))
+    last, guess = centers.shape[1] - 1, 0
     for row in range(len(centers)):
-        x, y = centers[row, 0, 0], centers[row, 0, 1]
-        is_same = row > 0 and x == centers[row - 1, 0, 0] and y == centers[row - 1, 0, 1]
-        for step in range(last if is_same else 0, last + 1, last):
-            end, _, guess = project(centerline, centers[row, step, 0], centers[row, step, 1], guess)
-            if step == 0:
-                start = end
+        start, _, guess = project(centerline, centers[row, 0, 0], centers[row, 0, 1], guess)
+        end, _, guess = project(centerline, centers[row, last, 0], centers[row, last, 1], guess)
         progress[row] = max(0.0, end - start)
-        longest = stretch = 0.0
-        is_on_road = True
+        longest = off_route = 0.0
         for step in range(last + 1):
-            is_on_road = is_on_road and not flags[row, step, OFF_ROAD]
             if not flags[row, step, OFF_ROUTE]:
-                stretch = 0.0
+                off_route = 0.0
             elif step > 0:
                 dx = centers[row, step, 0] - centers[row, step - 1, 0]
                 dy = centers[row, step, 1] - centers[row, step - 1, 1]
-                stretch += np.hypot(dx, dy)
-            longest = max(longest, stretch)
-        drivable[row] = 1.0 if is_on_road else 0.0
+                off_route += np.hypot(dx, dy)
+            longest = max(longest, off_route)
         direction[row] = 1.0 if longest < limits[0] else (0.5 if longest < limits[1] else 0.0)
+    return progress, direction

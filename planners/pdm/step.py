@@ -69,7 +69,7 @@ def plan_step(
     driven = drive_proposals(poses, ego, vehicle)
     scores = score(driven.states, place, scene.forecast.others, scene.size, params)
     best, braked = choose(scores, ego, params)
-    plan = brake_poses(ego, vehicle) if braked else extend(proposals, scene, ego, best)
+    plan = brake_poses(ego, vehicle) if braked else extend(proposals, scene, best)
     return Step(plan, best, braked, proposals, driven, scores)
 
 

@@ -7,18 +7,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.geometry.boxes import BEHIND, bearing, circle_around, front_touches
-from shiftsim.geometry.rings import convex_intersect
+from shiftsim.geometry.boxes import (
+    ACTIVE_FRONT,
+    ACTIVE_LATERAL,
+    STOPPED_TRACK,
+    boxes_touch,
+    circle_around,
+    contact_type,
+)
+from shiftsim.geometry.rings import SLACK
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.planners.proposals.places import Places
-from shiftsim.world.state import HEADING, VX, VY
+from shiftsim.planners.proposals.places import ProposalStates
+from shiftsim.world.state import VX, VY
 
-STOPPED = 5e-2  # m/s, of the ego and of others in a collision
 TTC_STOPPED = 5e-3  # m/s, of the ego
 NEVER = np.inf
 
 
-class Others(NamedTuple):
+class Obstacles(NamedTuple):
     """Boxes of all that a proposal can hit."""
 
     boxes: FloatArray  # (R, N, 4, 2) corners [m]
@@ -31,35 +37,16 @@ class Others(NamedTuple):
 
 
 @kernel
-def project_box(corners: FloatArray, state: FloatArray, travel: float, out: FloatArray) -> None:
-    """Write a box (4, 2) of the ego, moved `travel` [m] along the heading of its state (11,)."""
-    cos, sin = np.cos(state[HEADING]), np.sin(state[HEADING])
-    for corner in range(4):
-        out[corner, 0] = corners[corner, 0] + travel * cos
-        out[corner, 1] = corners[corner, 1] + travel * sin
-
-
-@kernel
 def touches_boxes(footprint: FloatArray, boxes: FloatArray) -> BoolArray:
     """(B,) whether a box (4, 2) touches each of others (B, 4, 2)."""
     out = np.empty(len(boxes), np.bool_)
-    circle = circle_around(footprint)
     for index in range(len(boxes)):
-        out[index] = touches_box(footprint, circle, boxes[index])
+        out[index] = boxes_touch(footprint, boxes[index])
     return out
 
 
 @kernel
-def touches_box(footprint: FloatArray, circle: tuple[float, float, float], box: FloatArray) -> bool:
-    """Whether a box (4, 2), with the circle around it, touches another one."""
-    x, y, radius = circle_around(box)
-    if np.hypot(circle[0] - x, circle[1] - y) > circle[2] + radius:
-        return False
-    return convex_intersect(box, footprint)
-
-
-@kernel
-def near_others(places: Places, others: Others, rows: int, horizon: float) -> IntArray:
+def near_others(places: ProposalStates, others: Obstacles, rows: int, horizon: float) -> IntArray:
     """Those that can touch an ego box, or its projection over `horizon` [s], in the first rows."""
     states, corners = places.states, places.corners
     low_x = low_y = np.inf
@@ -89,19 +76,6 @@ def near_others(places: Places, others: Others, rows: int, horizon: float) -> In
 
 
 @kernel
-def hits(
-    others: Others, row: int, index: int, box: FloatArray, circle: tuple[float, float, float]
-) -> bool:
-    """Whether a box (4, 2) and the circle around it touch one of the others at a row of time."""
-    dx = others.centers[row, index, 0] - circle[0]
-    dy = others.centers[row, index, 1] - circle[1]
-    reach = circle[2] + others.radii[index]
-    if dx * dx + dy * dy > reach * reach:
-        return False
-    return convex_intersect(box, others.boxes[row, index])
-
-
-@kernel
 def is_at_fault(
     state: FloatArray,
     box: FloatArray,
@@ -114,45 +88,48 @@ def is_at_fault(
 
     `state` (11,) and `box` (4, 2) are the ego's; `is_off_lane`: on several lanes or off the road.
     """
-    if np.hypot(state[VX], state[VY]) <= STOPPED:
-        return False
-    if speed <= STOPPED:
-        return True
-    if bearing(state, centroid[0], centroid[1]) > BEHIND:
-        return False
-    return is_off_lane or front_touches(box, other)
+    x, y = centroid[0], centroid[1]
+    kind = contact_type(state, np.hypot(state[VX], state[VY]), box, x, y, speed, other)
+    return kind == STOPPED_TRACK or kind == ACTIVE_FRONT or (kind == ACTIVE_LATERAL and is_off_lane)
 
 
 @kernel
 def first_faults(
-    places: Places, others: Others, near: IntArray, rows: IntArray
+    places: ProposalStates, others: Obstacles, near: IntArray, rows: IntArray, first_only: bool
 ) -> tuple[FloatArray, FloatArray]:
     """At-fault collisions with those of the others that are near.
 
-    `rows` (T,) is the row of time of each time index, -1 where it is not looked at.
+    `rows` (T,) is the row of time of each time index, -1 where it is not looked at. With
+    `first_only` a contact without fault is the last one that counts of an obstacle.
 
     Returns:
         (P,) factors 0, 0.5 or 1, and time indices of the first collisions, inf if none.
     """
     scores, first = np.ones(len(places.states)), np.full(len(places.states), NEVER)
-    decided = np.empty(len(near), np.bool_)
+    radius, centers, others_at = (
+        circle_around(places.corners[0, 0])[2],
+        places.centers,
+        others.centers,
+    )
     for proposal in range(len(scores)):
-        for entry in range(len(near)):
-            decided[entry] = False
-        for step in range(len(rows)):
-            box, row = places.corners[proposal, step], rows[step]
-            if row < 0:
-                continue
-            circle = circle_around(box)
-            for entry in range(len(near)):
-                index = near[entry]
-                if decided[entry] or not hits(others, row, index, box, circle):
+        for index in near:
+            reach = radius + others.radii[index] + SLACK
+            for step in range(len(rows)):
+                row = rows[step]
+                dx = others_at[row, index, 0] - centers[proposal, step, 0]
+                dy = others_at[row, index, 1] - centers[proposal, step, 1]
+                if row < 0 or dx * dx + dy * dy > reach * reach:
+                    continue  # most often, and without a slice
+                box, other = places.corners[proposal, step], others.boxes[row, index]
+                if not boxes_touch(box, other):
                     continue
                 state, off_lane = places.states[proposal, step], places.off_lane[proposal, step]
                 speed, center = others.speeds[row, index], others.centroids[row, index]
-                if is_at_fault(state, box, off_lane, speed, center, others.boxes[row, index]):
-                    worth = 0.0 if others.is_agent[index] else 0.5
-                    scores[proposal] = min(scores[proposal], worth)
+                at_fault = is_at_fault(state, box, off_lane, speed, center, other)
+                if at_fault:
+                    factor = 0.0 if others.is_agent[index] else 0.5
+                    scores[proposal] = min(scores[proposal], factor)
                     first[proposal] = min(first[proposal], float(step))
-                    decided[entry] = True
+                if at_fault or first_only:
+                    break
     return scores, first

@@ -8,13 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.geometry.boxes import box_corners
+from shiftsim.geometry.polylines import RUN
+from shiftsim.geometry.rings import ray_crossings, ring_bounds
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.planners.proposals.areas import Areas, Slabs, held_points
+from shiftsim.planners.proposals.areas import Areas
 from shiftsim.world.state import HEADING, VehicleParameters, X, Y
 
 MULTIPLE, OFF_ROAD, OFF_ROUTE = 0, 1, 2  # flags of a pose
-_ALL_CORNERS, _WHOLE = 0b1111, 0b11111  # corners on some area; all of them on one
-_MIDDLE = 0b10000  # the point that decides whether the ego is on the route
+_ALL_CORNERS, _MIDDLE = 0b1111, 0b10000  # bits of the points of a pose
 
 
 class EgoBox(NamedTuple):
@@ -25,7 +26,7 @@ class EgoBox(NamedTuple):
     rear_axle_to_center: float
 
 
-class Places(NamedTuple):
+class ProposalStates(NamedTuple):
     """Driven proposals and where they are."""
 
     states: FloatArray  # (P, T, 11) driven states
@@ -46,20 +47,13 @@ def find_places(
     size: EgoBox,
     areas: Areas,  # all areas of the map
     selected: IntArray,  # those of this step
-    limits: FloatArray,  # (M,) speed limits of all areas, or none of them [m/s]
+    limits: FloatArray,  # (M,) speed limits of all areas [m/s]
     *,
     by_center: bool,  # whether the ego is on the route where its centre is, not its rear axle
-) -> Places:
-    """Places of driven states (P, T, 11)."""
-    at, near = empty_places(states), np.empty_like(selected)
-    find(areas.slabs, areas.on_route, selected, limits, by_center, size, near, at)
-    return at
-
-
-def empty_places(states: FloatArray) -> Places:
-    """Driven states (P, T, 11) and arrays for their places."""
+) -> ProposalStates:
+    """ProposalStates of driven states (P, T, 11)."""
     shape = states.shape[:2]
-    return Places(
+    places = ProposalStates(
         states,
         np.empty((*shape, 4, 2)),
         np.empty((*shape, 2)),
@@ -67,111 +61,139 @@ def empty_places(states: FloatArray) -> Places:
         np.empty(shape, np.bool_),
         np.empty(shape),
     )
+    _locate(areas, selected, limits, by_center, size, places)
+    return places
 
 
 @kernel
-def find(
-    slabs: Slabs,
-    on_route: BoolArray,
+def ego_corners(
+    x: float, y: float, heading: float, size: EgoBox, out: FloatArray
+) -> tuple[float, float]:
+    """Write the corners (4, 2) of the ego at a rear-axle pose; the centre of its box."""
+    center_x = x + size.rear_axle_to_center * np.cos(heading)
+    center_y = y + size.rear_axle_to_center * np.sin(heading)
+    box_corners(center_x, center_y, heading, size.length, size.width, out)
+    return center_x, center_y
+
+
+@kernel
+def _locate(
+    areas: Areas,
     selected: IntArray,
     limits: FloatArray,
     by_center: bool,
     size: EgoBox,
-    near: IntArray,  # (M,) scratch
-    at: Places,  # the states are there
+    places: ProposalStates,  # the states are there
 ) -> None:
-    """Fill in the places."""
-    bounds, flags = slabs.bounds, at.flags
-    num_near, highest = _place_ego(at, size, bounds, selected, near), 0.0
-    has_limits = len(limits) > 0
-    for entry in range(num_near if has_limits else 0):
-        highest = max(highest, limits[near[entry]])
+    """Fill in boxes, flags and speed limits."""
+    polygons, run_ptr, runs, on_route = areas.polygons, areas.run_ptr, areas.runs, areas.on_route
+    xy, ring_ptr, poly_ptr, bounds = (
+        polygons.xy,
+        polygons.ring_ptr,
+        polygons.poly_ptr,
+        polygons.bounds,
+    )
+    states, corners, centers, flags = places.states, places.corners, places.centers, places.flags
+    off_lane, speed_limits = places.off_lane, places.speed_limits
     points = np.empty((5, 2))  # corners of the ego, and what decides whether it is on the route
-    guess = -1  # the area that held the whole ego last is tried first
-    for row in range(len(flags)):
-        for step in range(flags.shape[1]):
-            box = at.corners[row, step]
+    for row in range(states.shape[0]):
+        for step in range(states.shape[1]):
+            x, y, heading = states[row, step, X], states[row, step, Y], states[row, step, HEADING]
+            x, y = ego_corners(x, y, heading, size, points)
+            centers[row, step, 0], centers[row, step, 1] = x, y
             for corner in range(4):
-                points[corner, 0], points[corner, 1] = box[corner, 0], box[corner, 1]
-            if by_center:
-                points[4, 0], points[4, 1] = at.centers[row, step, 0], at.centers[row, step, 1]
-            else:
-                points[4, 0], points[4, 1] = at.states[row, step, X], at.states[row, step, Y]
-            low_x = min(box[0, 0], box[1, 0], box[2, 0], box[3, 0])
-            low_y = min(box[0, 1], box[1, 1], box[2, 1], box[3, 1])
-            high_x = max(box[0, 0], box[1, 0], box[2, 0], box[3, 0])
-            high_y = max(box[0, 1], box[1, 1], box[2, 1], box[3, 1])
-            num_touched, held, is_on_route, limit = 0, 0, False, 0.0
-            for entry in range(-1, num_near):
-                area = guess if entry < 0 else near[entry]
-                if area < 0 or (entry >= 0 and area == guess):
-                    continue
-                is_known = is_on_route and limit >= highest
-                if held == _WHOLE and is_known:
-                    break
-                if not (
-                    low_x <= bounds[area, 2]
-                    and high_x >= bounds[area, 0]
-                    and low_y <= bounds[area, 3]
-                    and high_y >= bounds[area, 1]
-                ):
-                    continue
-                is_settled = held == _WHOLE or (
-                    num_touched > 1
-                    and held == _ALL_CORNERS  # only an area that holds the box changes anything
-                    and not (
-                        bounds[area, 0] <= low_x
-                        and bounds[area, 2] >= high_x
-                        and bounds[area, 1] <= low_y
-                        and bounds[area, 3] >= high_y
-                    )
-                )
-                if is_settled and is_known:
-                    continue
-                first, stop = 4 if is_settled else 0, 4 if is_known else 5
-                within = held_points(slabs, area, points, first, stop)[0]
-                if within & _MIDDLE != 0:
-                    limit = max(limit, limits[area]) if has_limits else limit
-                    is_on_route = is_on_route or on_route[area]
-                within &= _ALL_CORNERS
-                if within == _ALL_CORNERS:
-                    held, guess = _WHOLE, area
-                elif within > 0:
-                    held |= within
-                    num_touched += 1
-            flags[row, step, MULTIPLE] = num_touched > 1 and held != _WHOLE
-            flags[row, step, OFF_ROAD] = held != _WHOLE and held != _ALL_CORNERS
-            flags[row, step, OFF_ROUTE] = not is_on_route
-            at.off_lane[row, step] = flags[row, step, MULTIPLE] or flags[row, step, OFF_ROAD]
-            at.speed_limits[row, step] = limit
-
-
-@kernel
-def _place_ego(
-    at: Places, size: EgoBox, bounds: FloatArray, selected: IntArray, near: IntArray
-) -> int:
-    """Write corners and centres, and which of the selected areas may be met; how many they are."""
-    low_x = low_y = np.inf
-    high_x = high_y = -np.inf
-    for row in range(at.states.shape[0]):
-        for step in range(at.states.shape[1]):
-            heading = at.states[row, step, HEADING]
-            x = at.states[row, step, X] + size.rear_axle_to_center * np.cos(heading)
-            y = at.states[row, step, Y] + size.rear_axle_to_center * np.sin(heading)
-            at.centers[row, step, 0], at.centers[row, step, 1] = x, y
-            corners = at.corners[row, step]
-            box_corners(x, y, heading, size.length, size.width, corners)
-            for corner in range(4):
-                low_x, high_x = min(low_x, corners[corner, 0]), max(high_x, corners[corner, 0])
-                low_y, high_y = min(low_y, corners[corner, 1]), max(high_y, corners[corner, 1])
-    count = 0
+                corners[row, step, corner, 0] = points[corner, 0]
+                corners[row, step, corner, 1] = points[corner, 1]
+    low_x, low_y, high_x, high_y = ring_bounds(corners.reshape(-1, 2))
+    near, num_near, highest, latest = np.empty_like(selected), 0, 0.0, -1
     for area in selected:
         if (
             bounds[area, 0] <= high_x
-            and bounds[area, 2] >= low_x
             and bounds[area, 1] <= high_y
+            and bounds[area, 2] >= low_x
             and bounds[area, 3] >= low_y
         ):
-            near[count] = area
-            count += 1
-    return count
+            near[num_near] = area
+            num_near, highest = num_near + 1, max(highest, limits[area])
+    for row in range(states.shape[0]):
+        for step in range(states.shape[1]):
+            low_x = low_y = np.inf
+            high_x = high_y = -np.inf
+            for corner in range(4):
+                x, y = corners[row, step, corner, 0], corners[row, step, corner, 1]
+                points[corner, 0], points[corner, 1] = x, y
+                low_x, high_x = min(low_x, x), max(high_x, x)
+                low_y, high_y = min(low_y, y), max(high_y, y)
+            points[4, 0], points[4, 1] = states[row, step, X], states[row, step, Y]
+            if by_center:
+                points[4, 0], points[4, 1] = centers[row, step, 0], centers[row, step, 1]
+            num_touched, held, is_whole, is_on_route, limit = 0, 0, False, False, 0.0
+            for entry in range(-1, num_near):
+                # the area that held the whole ego last probably holds it again
+                area = latest if entry < 0 else near[entry]
+                if area < 0 or (entry >= 0 and area == latest):
+                    continue
+                is_known = is_on_route and limit >= highest
+                if is_whole and is_known:
+                    break
+                if (
+                    bounds[area, 0] > high_x
+                    or bounds[area, 1] > high_y
+                    or bounds[area, 2] < low_x
+                    or bounds[area, 3] < low_y
+                ):
+                    continue
+                if num_touched > 1 and held == _ALL_CORNERS and is_known:
+                    # only an area that holds the whole ego changes anything
+                    if low_x < bounds[area, 0] or low_y < bounds[area, 1]:
+                        continue
+                    if high_x > bounds[area, 2] or high_y > bounds[area, 3]:
+                        continue
+                within = on_boundary = 0
+                for ring in range(poly_ptr[area], poly_ptr[area + 1]):
+                    first, end = ring_ptr[ring], ring_ptr[ring + 1]
+                    for run in range(run_ptr[ring], run_ptr[ring + 1]):
+                        if high_y < runs[run, 0] or low_y > runs[run, 1] or low_x > runs[run, 2]:
+                            continue  # most often: no ray from a point to +x meets the run
+                        start = first + RUN * (run - run_ptr[ring])
+                        before = start - 1 if start > first else end - 1
+                        stop = min(start + RUN, end)
+                        for point in range(5):
+                            x, y = points[point, 0], points[point, 1]
+                            if y < runs[run, 0] or y > runs[run, 1] or x > runs[run, 2]:
+                                continue
+                            px, py = xy[before, 0], xy[before, 1]
+                            for vertex in range(start, stop):
+                                qx, qy = xy[vertex, 0], xy[vertex, 1]
+                                if not (min(py, qy) > y or max(py, qy) < y or max(px, qx) < x):
+                                    is_odd, on_edge = (py > y) != (qy > y), False
+                                    if not is_odd or min(px, qx) <= x:
+                                        is_odd, on_edge = ray_crossings(
+                                            xy,
+                                            before if vertex == start else vertex - 1,
+                                            vertex,
+                                            vertex + 1,
+                                            x,
+                                            y,
+                                        )
+                                    if on_edge:
+                                        on_boundary |= 1 << point
+                                    elif is_odd:
+                                        within ^= 1 << point
+                                px, py = qx, qy
+                within &= ~on_boundary
+                if within & _MIDDLE:
+                    limit = max(limit, limits[area])
+                    is_on_route = is_on_route or on_route[area]
+                within &= _ALL_CORNERS
+                if within == _ALL_CORNERS:
+                    is_whole, latest = True, area
+                elif within > 0:
+                    held |= within
+                    num_touched += 1
+            is_on_several = num_touched > 1 and not is_whole
+            is_off_road = held != _ALL_CORNERS and not is_whole
+            flags[row, step, MULTIPLE], flags[row, step, OFF_ROAD] = is_on_several, is_off_road
+            flags[row, step, OFF_ROUTE] = not is_on_route
+            off_lane[row, step] = is_on_several or is_off_road
+            speed_limits[row, step] = limit

@@ -123,7 +123,11 @@ def _find_blocks(
     x, y, heading = rear_axle[0], rear_axle[1], rear_axle[2]
     near = meeting(blocks, area)
     if len(near) == 0:
-        near = _nearest_blocks(blocks, num_roadblocks, x, y)
+        # the nearest roadblock and the nearest roadblock connector, of those that there are
+        roadblock = nearest_of(blocks, 0, num_roadblocks, x, y, np.inf)[0]
+        connector = nearest_of(blocks, num_roadblocks, len(blocks.bounds), x, y, np.inf)[0]
+        near = np.array([roadblock, connector])
+        near = near[near >= 0]
     capacity = 0
     for block in near:
         capacity += block_edges.ptr[block + 1] - block_edges.ptr[block] + 1
@@ -150,21 +154,6 @@ def _find_blocks(
         if distances[kind, index] < distances[kind, best]:
             best = index
     return names[kind, : counts[kind]].copy(), best
-
-
-@kernel
-def _nearest_blocks(blocks: Polygons, num_roadblocks: int, x: float, y: float) -> IntArray:
-    """The nearest roadblock and the nearest roadblock connector."""
-    out = np.empty(2, np.int64)
-    count = 0
-    for kind in range(2):
-        first = 0 if kind == 0 else num_roadblocks
-        stop = num_roadblocks if kind == 0 else len(blocks.bounds)
-        found = nearest_of(blocks, first, stop, x, y, np.inf)[0]
-        if found >= 0:
-            out[count] = found
-            count += 1
-    return out[:count].copy()
 
 
 def _lead_in(road: VectorMap, blocks: list[int], start: Start) -> list[int]:

@@ -10,7 +10,6 @@ from shiftsim.geometry.polylines import (
     Path,
     arc_lengths,
     make_path,
-    nearest_vertex,
     pose_at,
     project_on_polyline,
     vertex_heading,
@@ -119,8 +118,12 @@ def deviation(
     """Distance [m] to the nearest of every `stride`-th vertex of a baseline, and heading error."""
     # nuPlan rule 180: to vertices, not to the line between them
     start, stop = baselines.ptr[lane], baselines.ptr[lane + 1]
-    found, distance = nearest_vertex(baselines.xy, start, stop, stride, x, y)
-    return distance, abs(wrap_angle(vertex_heading(baselines.xy, found, stop) - heading))
+    least, nearest = np.inf, start  # the first one on ties
+    for vertex in range(start, stop, stride):
+        distance = np.hypot(baselines.xy[vertex, 0] - x, baselines.xy[vertex, 1] - y)
+        if distance < least:
+            least, nearest = distance, vertex
+    return least, abs(wrap_angle(vertex_heading(baselines.xy, nearest, stop) - heading))
 
 
 def lane_at(

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.geometry.polylines import RUN
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import LightStatus, TrafficLights
@@ -18,8 +17,6 @@ class RedLights(NamedTuple):
     xy: FloatArray  # (V, 2) vertices of their shells, not closed [m]
     ptr: IntArray  # (L + 1,) first vertex of each
     bounds: FloatArray  # (L, 4) min x, min y, max x, max y of each [m]
-    runs: FloatArray  # (R, 4) likewise of runs of up to 8 edges; edge k ends at vertex k
-    run_ptr: IntArray  # (L + 1,) first run of each
 
 
 class LightWatch:
@@ -51,12 +48,5 @@ def red_lights(lanes: list[int], rings: Sequence[FloatArray]) -> RedLights:
     """Red lights of some lanes and connectors with the shells (V, 2)."""
     xy = np.concatenate([np.zeros((0, 2)), *rings])
     ptr = np.cumsum([0, *map(len, rings)])
-    run_ptr = np.cumsum([0, *(-(-len(ring) // RUN) for ring in rings)])
-    bounds, runs = np.zeros((len(rings), 4)), np.zeros((run_ptr[-1], 4))
-    for number, ring in enumerate(rings):
-        before, starts = np.roll(ring, 1, axis=0), np.arange(0, len(ring), RUN)
-        own = runs[run_ptr[number] : run_ptr[number + 1]]
-        own[:, :2] = np.minimum.reduceat(np.minimum(ring, before), starts)
-        own[:, 2:] = np.maximum.reduceat(np.maximum(ring, before), starts)
-        bounds[number] = *ring.min(axis=0), *ring.max(axis=0)
-    return RedLights(lanes, xy, ptr, bounds, runs, run_ptr)
+    bounds = [[*ring.min(axis=0), *ring.max(axis=0)] for ring in rings]
+    return RedLights(lanes, xy, ptr, np.array(bounds).reshape(-1, 4))

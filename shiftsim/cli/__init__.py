@@ -8,31 +8,27 @@ traceback. Exit codes: 0 all well, 1 usage or settings, 2 data, 3 finished with 
 tasks, 130 interrupted; `verify` has its own.
 """
 
-import gc
 import inspect
 import json
 import os
 import shlex
 import shutil
-import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stdout
+from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout
 from dataclasses import fields
 from functools import cache, wraps
 from importlib import import_module
-from typing import Annotated, Any, TypeAlias, get_args, get_origin
+from typing import Annotated, Any, TextIO, TypeAlias, get_args, get_origin
 
 import typer
 
-from shiftsim.cli import values
 from shiftsim.errors import DataError, ShiftsimError
 from shiftsim.runs.config import RunConfig, parse_argument
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress.")]
-Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
 
 
 def new_app(help: str = "", **settings: Any) -> typer.Typer:
@@ -57,23 +53,12 @@ def say_json(value: Any) -> None:
     typer.echo(json.dumps(value, indent=2, ensure_ascii=False, default=str))
 
 
-@contextmanager
-def output_kept() -> Iterator[None]:
+def stdout_to_stderr() -> redirect_stdout[TextIO]:
     """What planners print within goes to the standard error: the output is the command's own.
 
-    That holds for worker processes that begin within, and for what is no Python, as well.
+    What workers print goes there anyway.
     """
-    sys.stdout.flush()
-    before = os.dup(1)
-    os.dup2(2, 1)
-    try:
-        with redirect_stdout(sys.stderr):
-            yield
-    finally:
-        if sys.__stdout__ is not None:
-            sys.__stdout__.flush()  # while it leads to the standard error still
-        os.dup2(before, 1)
-        os.close(before)
+    return redirect_stdout(sys.stderr)
 
 
 def show(values: Any, lines: Iterable[str], *, as_json: bool) -> None:
@@ -104,49 +89,15 @@ def show_in_browser(address: str) -> None:
         webbrowser.open(address)
 
 
-Advance = Callable[[int, int, str], None]
+Advance = Callable[..., None]  # done, total and, where there is one, a note
+
+
+def progress_bar(*, quiet: bool) -> AbstractContextManager[Advance]:
+    """Yields what shows done, total and a note: as a bar with the remaining time, or in lines."""
+    return _bar() if sys.stderr.isatty() and not quiet else nullcontext(_lines(quiet))
 
 
 @contextmanager
-def progress_bar(*, quiet: bool) -> Iterator[Advance]:
-    """Yields what shows done, total and a note: as a bar with the remaining time, or in lines.
-
-    It ends the command where an interrupt came and got lost.
-    """
-    with _shown(quiet) as advance:
-
-        def checked(done: int, total: int, note: str) -> None:
-            if _has_come():
-                raise KeyboardInterrupt
-            advance(done, total, note)
-
-        yield checked
-
-
-@contextmanager
-def _shown(quiet: bool) -> Iterator[Advance]:
-    if quiet:
-        yield lambda done, total, note: None
-    elif sys.stderr.isatty():
-        yield from _bar()
-    else:
-        yield _lines()
-
-
-class _Interrupt:
-    """What an interrupt from the terminal does; remembers it, as libraries catch what is raised."""
-
-    came = False
-
-    def __call__(self, number: int, frame: object) -> None:
-        self.came = True
-        raise KeyboardInterrupt
-
-
-def _has_come() -> bool:
-    return getattr(signal.getsignal(signal.SIGINT), "came", False)
-
-
 def _bar() -> Iterator[Advance]:
     from rich import progress
     from rich.console import Console
@@ -161,31 +112,29 @@ def _bar() -> Iterator[Advance]:
     )
     with progress.Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task("", total=None)
-
-        def advance(done: int, total: int, note: str) -> None:
-            bar.update(task, completed=done, total=total or None, description=note)
-
-        yield advance
+        yield lambda done, total, note="": bar.update(
+            task, completed=done, total=total or None, description=note
+        )
 
 
-def _lines() -> Advance:
-    began = time.monotonic()
-    last = [-1]
+def _lines(quiet: bool) -> Advance:
+    """A line for each tenth, and one for what happens before."""
+    began, last = time.monotonic(), -1
 
-    def advance(done: int, total: int, note: str) -> None:
-        if not total:  # not known yet: what happens before
-            if last[0] < 0:
-                typer.echo(f" {note}", err=True)
-                last[0] = 0
+    def advance(done: int, total: int, note: str = "") -> None:
+        nonlocal last
+        tenth = 10 * done // total if total else 0
+        if quiet or tenth <= last or (total and not tenth):
             return
-        tenth = 10 * done // total
-        if tenth > max(last[0], 0):
-            last[0] = tenth
-            elapsed = time.monotonic() - began
-            left = elapsed / done * (total - done) if done else 0.0
-            tail = f"  {note}" if note else ""
-            text = f" {10 * tenth:3d} %  {done}/{total}  {elapsed:.0f} s, {left:.0f} s left{tail}"
-            typer.echo(text, err=True)
+        last = tenth
+        if not total:
+            typer.echo(f" {note}", err=True)
+            return
+        elapsed = time.monotonic() - began
+        left = elapsed / done * (total - done)
+        tail = f"  {note}" if note else ""
+        text = f" {10 * tenth:3d} %  {done}/{total}  {elapsed:.0f} s, {left:.0f} s left{tail}"
+        typer.echo(text, err=True)
 
     return advance
 
@@ -233,8 +182,7 @@ def _option(name: str, text: str | None) -> inspect.Parameter:
     elif option.parse:
         kind = str
     flags = option.flags or ((f"--{name.replace('_', '-')}",) if kind is bool else ())
-    offered = values.BY_SETTING.get(name) or values.among(*option.choices)
-    words = typer.Option(*flags, help=text or option.help, autocompletion=offered)
+    words = typer.Option(*flags, help=text or option.help)
     return inspect.Parameter(name, _KIND, default=None, annotation=Annotated[kind | None, words])
 
 
@@ -255,38 +203,32 @@ def planner_arguments(
 
 
 _USAGE, _DATA, _INTERRUPTED = 1, 2, 130
-_FEW_LOOKS = 50_000  # new objects between two looks for garbage
-# commands that go on with what is finished, and the words that ask for it
-_GOES_ON = {
-    **dict.fromkeys(("filter", "dsc3d", "av2", "py123d", "commonroad"), ()),
-    "train": ("--resume",),
-}
 # of whichever click typer was built on
 _ClickError: Any = typer.BadParameter.__mro__[2]
 # command -> where it is: a function, or further commands; imported when it is used
 _COMMANDS = {
-    "demo": "demo:demo",
-    "run": "running:run",
-    "score": "deriving:score",
-    "merge": "deriving:merge",
+    "demo": "run:demo",
+    "run": "run:run",
+    "score": "run:score",
+    "merge": "run:merge",
     "bench": "bench:bench",
-    "report": "reading:report",
-    "explain": "reading:explain",
-    "diff": "reading:diff",
-    "check": "stores:check",
+    "report": "report:report",
+    "explain": "report:explain",
+    "diff": "report:diff",
+    "check": "store:check",
     "verify": "doctor:verify",
     "doctor": "doctor:doctor",
-    "data": "data:data",
-    "view": "viewing:view",
-    "plot": "viewing:plot",
-    "inspect": "viewing:inspect",
-    "filter": "stores:filter_scenarios",
-    "stats": "stores:show_stats",
-    "split": "stores:make_split",
+    "data": "bench:data",
+    "view": "view:view",
+    "plot": "view:plot",
+    "inspect": "view:inspect",
+    "filter": "store:filter_scenarios",
+    "stats": "store:show_stats",
+    "split": "store:make_split",
     "edits": "edits:app",
     "planners": "planners:app",
-    "convert": "open_data:app",
-    "export": "stores:export",
+    "convert": "convert:app",
+    "export": "store:export",
     "checkpoint": "planners:checkpoint",
     "train": "training:app",
     "realism": "training:realism",
@@ -320,7 +262,7 @@ def _command(name: str) -> Any:
         alone.command()(found)
         command = typer.main.get_command(alone)
     command.name = name
-    return values.with_plain_values(command)
+    return command
 
 
 app = new_app(
@@ -336,10 +278,11 @@ app = new_app(
 @app.callback(invoke_without_command=True)
 def _options(
     version: bool = typer.Option(False, "--version", help="Print the version and leave."),
+    debug: bool = typer.Option(False, "--debug", help="With any command: show tracebacks."),
 ) -> None:
     """Closed-loop evaluation of driving planners with nuPlan's semantics."""
     if version:
-        from shiftsim import __version__
+        from shiftsim._version import __version__
 
         typer.echo(__version__)
         raise typer.Exit
@@ -349,34 +292,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and leave with its exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
-    # imports make a hundred thousand objects that stay: looking for garbage among them while they
-    # are made takes a sixth of the time of a short command
-    looks, before = gc.get_threshold(), signal.getsignal(signal.SIGINT)
-    gc.set_threshold(_FEW_LOOKS)
-    if callable(before):  # else it is ignored, as in the background of a shell
-        signal.signal(signal.SIGINT, _Interrupt())
-    sys.unraisablehook = _raised_nowhere
     try:
         code = _run([word for word in words if word != "--debug"], debug)
     except BrokenPipeError:  # the reader of our output has left, as `| head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = _USAGE
-    finally:
-        signal.signal(signal.SIGINT, before)
-        sys.unraisablehook = sys.__unraisablehook__
-        gc.set_threshold(*looks)
     sys.exit(code)
-
-
-def _raised_nowhere(found: Any) -> None:
-    """No words on an interrupt where nothing can be raised: `progress_bar` knows that it came."""
-    if found.exc_type is not KeyboardInterrupt:
-        sys.__unraisablehook__(found)
 
 
 def _run(words: list[str], debug: bool) -> int:
     try:
-        command = values.with_plain_values(typer.main.get_command(app))
+        command: Any = typer.main.get_command(app)
         code = command.main(words, prog_name="shiftsim", standalone_mode=False)
     except (KeyboardInterrupt, typer.Abort):
         code = _INTERRUPTED
@@ -397,22 +323,11 @@ def _run(words: list[str], debug: bool) -> int:
         context = getattr(error, "ctx", None)
         path = context.command_path if context is not None else "shiftsim"
         return _complain(error.format_message(), f"{path} --help", _USAGE)
-    except Exception:
-        if not _has_come():
-            raise
-        code = _INTERRUPTED  # a library has made something else of it
     if code == _INTERRUPTED:  # typer has taken the interrupt for itself
-        return _complain("interrupted", _after_interrupt(words), _INTERRUPTED)
+        again = [*words, *(["--resume"] if words[:2] == ["train", "carl"] else [])]
+        hint = f"go on, or start again, with: {shlex.join(['shiftsim', *again])}"
+        return _complain("interrupted", hint, _INTERRUPTED)
     return code if isinstance(code, int) else 0
-
-
-def _after_interrupt(words: list[str]) -> str:
-    """What becomes of the work of a command that was interrupted, and how to go on."""
-    for name in words[:2]:
-        if name in _GOES_ON:
-            again = [*words, *(word for word in _GOES_ON[name] if word not in words)]
-            return f"what is finished is kept; go on with: {shlex.join(['shiftsim', *again])}"
-    return f"start again with: {shlex.join(['shiftsim', *words])}" if words else ""
 
 
 def _complain(fact: str, hint: str, code: int) -> int:

@@ -1,16 +1,16 @@
-"""The command that runs a whole benchmark track and reports it."""
+"""Commands about benchmark tracks: `bench` runs and reports one, `data` says what is missing."""
 
 import sys
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from shiftsim import cli
-from shiftsim.cli import Debug, Json, Quiet, output_kept, plural, say, say_json, values
-from shiftsim.cli.running import DryRun, Live, announce_data, interruptible, say_dry_run, watched
+from shiftsim.cli import Json, Quiet, plural, say, say_json, show, stdout_to_stderr
+from shiftsim.cli.run import DryRun, Live, progress_of, say_dry_run, say_provenance
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from shiftsim.benchmarks.bench import Plan
     from shiftsim.report.figures import Figure
@@ -45,7 +45,6 @@ def bench(
         str,
         typer.Argument(
             help="semantic-shift, state-drift or edits.",
-            autocompletion=values.among(*_MAIN_TABLE),
         ),
     ],
     settings: cli.Settings,
@@ -65,7 +64,6 @@ def bench(
     live: Live = False,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Run a benchmark track with all its traffic modes, noises and seeds, and report it.
 
@@ -81,21 +79,20 @@ def bench(
         settings["planner_args"] = cli.planner_arguments(texts, {}, planners)
     if published:  # beside the paper's figures nothing stands in for the paper's planners
         settings["checkpoints"] = (*settings.get("checkpoints", ()), *_official(settings))
-    with output_kept():
+    with stdout_to_stderr():
         plan = plan_bench(chosen, settings, reference=val14 or "", out=out)
     if estimate:
         _estimate(plan, shards, as_json=as_json)
         return
-    announce_data(list(plan.runs.values()), as_json=as_json)
+    plans = list(plan.runs.values())
+    say_provenance(plans, as_json=as_json)
     if not as_json:
-        _announce(plan)
+        _say_plan(plan)
     if dry_run:
-        say_dry_run(list(plan.runs.values()), as_json=as_json)
+        say_dry_run(plans, as_json=as_json)
         return
-    kept = interruptible(plan.folder, sys.argv[1:], quiet=quiet or as_json)
-    prepared = list(plan.runs.values())
-    with output_kept(), kept as show, watched(prepared, plan.folder, live, show) as tell:
-        runs = run_bench(plan, on_progress=tell, argv=sys.argv)
+    with progress_of(plans, plan.folder, sys.argv[1:], live, quiet or as_json) as shown:
+        runs = run_bench(plan, on_progress=shown, argv=sys.argv)
     allow_partial = settings.get("allow_partial", False)
     _report(plan, published=published, allow_partial=allow_partial, as_json=as_json)
     if not all(run.is_complete for run in runs):
@@ -106,10 +103,10 @@ def _estimate(plan: "Plan", shards: int, *, as_json: bool) -> None:
     """Do a few tasks, and say what all of them cost."""
     from shiftsim.benchmarks import estimate
 
-    with cli.output_kept():
+    with cli.stdout_to_stderr():
         costs = estimate.estimate(plan, shards=shards)
-    shown = estimate.lines(plan, costs, shards=shards)
-    cli.show(estimate.as_json(plan, costs, shards=shards), shown, as_json=as_json)
+    lines = estimate.lines(plan, costs, shards=shards)
+    show(estimate.as_json(plan, costs, shards=shards), lines, as_json=as_json)
 
 
 def _official(settings: cli.Settings) -> list[str]:
@@ -126,17 +123,17 @@ def _official(settings: cli.Settings) -> list[str]:
     return [f"{name}={OFFICIAL}" for name in names if name not in named]
 
 
-def _announce(plan: "Plan") -> None:
+def _say_plan(plan: "Plan") -> None:
     """What will be run."""
     track = plan.track
     first = next(iter(plan.runs.values()))
     config = first.config
     say(f"track       {track.name}   planners {' '.join(config.planners)}")
-    for name, prepared in plan.runs.items():
-        found = len({task.token for task in prepared.tasks})
+    for name, run in plan.runs.items():
+        found = len({task.token for task in run.tasks})
         say(
-            f"run         {name}: split {prepared.split}, {plural(found, 'scenario')}, "
-            f"traffic {prepared.config.traffic}, thresholds {prepared.config.thresholds}"
+            f"run         {name}: split {run.selection.split}, {plural(found, 'scenario')}, "
+            f"traffic {run.config.traffic}, thresholds {run.config.thresholds}"
         )
     say(f"noise       {' '.join(config.noise)}   seeds {' '.join(map(str, config.seeds))}")
     if config.limit:
@@ -154,7 +151,7 @@ def _report(plan: "Plan", *, published: bool, allow_partial: bool, as_json: bool
     from shiftsim.report.build import TABLES, Options, make_tables, write_report
     from shiftsim.report.groups import read_groups
     from shiftsim.report.scores import summary
-    from shiftsim.report.writers import FORMATS, render
+    from shiftsim.report.tables import FORMATS, render
 
     runs, own, extra = open_runs([plan.folder])
     groups = read_groups(runs, (*known_sets(), *own))
@@ -184,3 +181,41 @@ def _pictures(groups: "Sequence[Group]", allow_partial: bool) -> "list[Figure]":
     except MissingExtraError as error:
         typer.echo(f" no pictures: {error.message}; {error.hint}", err=True)
         return []
+
+
+def data(as_json: Json = False) -> None:
+    """Stores, maps, splits and checkpoints that are there, and what each benchmark row lacks."""
+    from shiftsim.benchmarks.inventory import list_available_data
+
+    found = list_available_data()
+    show(found, _inventory_lines(found), as_json=as_json)
+
+
+def _inventory_lines(found: dict[str, Any]) -> "Iterator[str]":
+    yield f"stores in {found['store_folder']} (SHIFTSIM_DATA)"
+    for store in found["stores"]:
+        if store["problem"]:
+            yield f" {store['name']:18} {store['problem']}"
+        for one in store["sets"]:
+            label = f"   is {one['known']}" if one["known"] else ""
+            yield f" {one['name']:18} {plural(one['scenarios'], 'scenario')}{label}"
+        if store["maps"]:
+            yield f" {'':18} maps: {', '.join(store['maps'])}"
+    if not found["stores"]:
+        yield " none; shiftsim demo makes one"
+    yield f"checkpoints in {found['checkpoint_folder']} (SHIFTSIM_CHECKPOINTS)"
+    for planner, lack in found["checkpoints"].items():
+        yield f" {planner:18} {'missing' if lack else 'ready'}"
+    missing: dict[str, dict[str, str]] = {}
+    yield "benchmark"
+    yield f" {'track':15} {'planner':18} {'Val14':16} {'own scenarios':16} planner"
+    for row in found["rows"]:
+        lacks = [lack["what"] for lack in row["missing"]]
+        missing |= {lack["what"]: lack for lack in row["missing"]}
+        ready = "missing" if f"planner {row['planner']}" in lacks else "ready"
+        own = ", ".join(row["own"]) or "missing"
+        reference = row["reference"] or "missing"
+        yield f" {row['track']:15} {row['planner']:18} {reference:16} {own:16} {ready}"
+    yield "missing" if missing else "nothing is missing"
+    for what, gap in missing.items():
+        yield f" {what}: {gap['get']} ({gap['page']})"

@@ -1,30 +1,21 @@
-"""Commands that make scenario stores: convert nuplan, convert dsc3d, convert tracks."""
+"""Commands that make scenario stores: convert nuplan, dsc3d, tracks, av2, py123d, commonroad."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections import Counter
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from shiftsim import cli
-from shiftsim.cli import (
-    Debug,
-    Json,
-    Quiet,
-    new_app,
-    plural,
-    progress_bar,
-    say,
-    say_json,
-    values,
-)
+from shiftsim.cli import Json, Quiet, new_app, plural, progress_bar, say, say_json
 
 if TYPE_CHECKING:
-    from shiftsim.data.deepplan.convert import ConversionReport
-    from shiftsim.data.deepplan.recording import Converted, RecordingSummary
-    from shiftsim.data.deepplan.windows import ConversionConfig
-    from shiftsim.data.tracks.convert import Looked
+    from shiftsim.data.readers.convert import ConversionReport
+    from shiftsim.data.readers.reader import Reader
+    from shiftsim.data.readers.scenarios import RecordingSummary
+    from shiftsim.data.readers.tracks.inspection import Inspection
+    from shiftsim.data.readers.windows import ConversionConfig
 
 app = new_app("Make a scenario store from recordings.", no_args_is_help=True)
 _DATA, PARTIAL = 2, 3
@@ -32,9 +23,7 @@ _DATA, PARTIAL = 2, 3
 
 Store = Annotated[
     str,
-    typer.Option(
-        "--store", "-s", help="Name or folder of the store.", autocompletion=values.stores
-    ),
+    typer.Option("--store", "-s", help="Name or folder of the store."),
 ]
 _Window = Annotated[
     float | None, typer.Option(help="Length of a scenario with its history [s]. [18]")
@@ -64,11 +53,10 @@ def nuplan(
     ] = None,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Convert scenarios of nuPlan logs (.db) and maps (map.gpkg)."""
     from shiftsim.data.nuplan.convert import convert_nuplan
-    from shiftsim.data.nuplan.mapping import parse_mapping
+    from shiftsim.data.nuplan.scenarios import parse_mapping
     from shiftsim.files import store_path
 
     folder = store_path(store)
@@ -84,8 +72,6 @@ def nuplan(
             progress=advance,
         )
     if as_json:
-        from dataclasses import asdict
-
         say_json(asdict(report))
     else:
         for flaw, count in report.flaws.items():
@@ -142,7 +128,6 @@ def dsc3d(
     settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Convert recordings in the layout of DSC3D.
 
@@ -152,8 +137,7 @@ def dsc3d(
     Planners need 2 s of history. A recording too short for that is converted with a made-up one,
     of constant velocity: --window-s 4.9 --overlap-s 0 --history-s 0 --padding-s 2.2
     """
-    from shiftsim.data.deepplan.convert import convert_dsc3d
-    from shiftsim.files import store_path
+    from shiftsim.data.readers.dsc3d import Dsc3dReader
 
     flags = {
         "country": country,
@@ -165,23 +149,12 @@ def dsc3d(
         "category_map": _category_map(category or []),
     }
     options = _options(config, {name: value for name, value in flags.items() if value is not None})
-    folder = store_path(store)
-    with in_parts(settings, quiet=quiet or as_json) as (advance, spread):
-        report = convert_dsc3d(
-            source,
-            folder,
-            site=site,
-            map_path=map_path,
-            options=options,
-            progress=advance,
-            spread=spread,
-        )
+    reader = Dsc3dReader(source, site=site, map_path=map_path, config=options)
+    report, folder = _convert(reader, store, settings, quiet=quiet or as_json)
     if as_json:
-        from dataclasses import asdict
-
-        say_json(asdict(report))
+        say_json({"site": report.name, **_contents(report)})
     else:
-        _show_dsc3d(report)
+        _show_site(report)
         if options.is_short:
             say(" note: scenarios are shorter than the benchmark's; their scores do not compare")
         say(f" {plural(report.accepted, 'scenario')} → {folder}")
@@ -213,7 +186,6 @@ def tracks(
     history_s: _History = None,
     quiet: Quiet = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Convert tracks of any source: a table with one row per object and time, and its map.
 
@@ -221,78 +193,190 @@ def tracks(
     the picture beside the report shows tracks and map. Recordings shorter than a window become one
     scenario each, with 2 s of history.
     """
+    from shiftsim.data.readers.tracks.inspection import (
+        convert_tracks,
+        inspect_tracks,
+        tracks_config,
+    )
     from shiftsim.data.store.tables import picture_file
-    from shiftsim.data.tracks.convert import convert_tracks, look_at, tracks_config
     from shiftsim.errors import ConfigError, ConversionError
     from shiftsim.files import read_toml, store_path
 
     flags = {"window_s": window_s, "overlap_s": overlap_s, "history_s": history_s}
     config = tracks_config(**{name: value for name, value in flags.items() if value is not None})
-    said = read_toml(columns) if columns else {}
+    overrides = read_toml(columns) if columns else {}
     egos = None if ego is None or "all" in ego else ego
     folder = store_path(store)
     try:
-        looked = look_at(source, map_path, city=city, said=said, hz=hz, config=config)
+        inspection = inspect_tracks(
+            source, map_path, city=city, overrides=overrides, hz=hz, config=config
+        )
     except ConfigError as error:
         raise ConfigError(f"{columns or source}: {error.message}", error.hint) from error
-    picture = picture_file(folder, looked.road.name, looked.table.name)
+    picture = picture_file(folder, inspection.road.name, inspection.table.name)
+    errors = inspection.diagnostics.errors
     try:
-        report, made = convert_tracks(looked, folder, egos=egos, config=config)
+        report = convert_tracks(inspection, folder, egos=egos, config=config)
     except ConversionError:
-        for doubt in looked.doubts.found:
-            say(f" wrong: {doubt.what}")
-            say(f"   remedy: {doubt.remedy}")
-        _draw_tracks(picture, looked, None)
-        if not looked.doubts.found:
+        for wrong in errors:
+            say(f" wrong: {wrong.what}")
+            say(f"   remedy: {wrong.remedy}")
+        _draw_tracks(picture, inspection, None)
+        if not errors:
             raise
-        typer.echo(
-            f"error: {source}: {plural(len(looked.doubts.found), 'thing')} cannot be right",
-            err=True,
-        )
+        typer.echo(f"error: {source}: {plural(len(errors), 'thing')} cannot be right", err=True)
         raise typer.Exit(_DATA) from None
+    names = {role: column.name for role, column in inspection.table.columns.found.items()}
     if as_json:
-        from dataclasses import asdict
-
-        say_json(asdict(report))
+        content = _contents(report) | {"city": report.name, "summary": asdict(report.recordings[0])}
+        say_json(content | {"figures": inspection.diagnostics.figures, "columns": names})
     else:
-        say(f"map {report.city}: {report.lanes} lanes and connectors")
+        say(f"map {report.name}: {report.lanes} lanes and connectors")
         for name, count in report.map_warnings.items():
             say(f" map: {name} ({count})")
-        say(f" columns: {', '.join(f'{ours} = {name}' for ours, name in report.columns.items())}")
-        _show_recording(report.summary)
-        for note in looked.doubts.notes:
-            say(f" unusual: {note.what}")
-            say(f"   remedy: {note.remedy}")
-    _draw_tracks(picture, looked, made)
+        say(f" columns: {', '.join(f'{ours} = {name}' for ours, name in names.items())}")
+        _show_recording(report.recordings[0])
+        for warning in inspection.diagnostics.warnings:
+            say(f" unusual: {warning.what}")
+            say(f"   remedy: {warning.remedy}")
+    _draw_tracks(picture, inspection, folder)
     if not as_json:
-        say(f" {plural(report.summary.accepted, 'scenario')} → {folder}")
+        say(f" {plural(report.accepted, 'scenario')} → {folder}")
         say(f" next: shiftsim check {store}, then shiftsim run --planner idm --store {store}")
 
 
-def _draw_tracks(path: Path, looked: "Looked", made: "Converted | None") -> None:
-    """The picture of map and tracks; without matplotlib a line that says how to get it."""
+def _draw_tracks(path: Path, inspection: "Inspection", store: Path | None) -> None:
+    """The picture of map, tracks and scenarios; without matplotlib a line how to get it."""
     from shiftsim.errors import MissingExtraError
     from shiftsim.view.tracks import save_tracks_picture
 
     try:
-        save_tracks_picture(path, looked, made)
+        save_tracks_picture(path, inspection, store)
     except MissingExtraError as error:
         typer.echo(f" no picture: {error.message} ({error.hint})", err=True)
     else:
         typer.echo(f" picture: {path}", err=True)
 
 
-@contextmanager
-def in_parts(settings: cli.Settings, *, quiet: bool) -> Iterator[tuple[Any, Any]]:
-    """A progress bar, and what spreads work over processes."""
+_Source = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the data set.")]
+_Egos = Annotated[
+    str, typer.Option(help="recorded: the recording car; vehicles: each vehicle that drives.")
+]
+
+
+@app.command()
+@cli.with_settings("workers")
+def av2(
+    folder: _Source,
+    store: Store,
+    egos: _Egos = "recorded",
+    *,
+    settings: cli.Settings,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Convert scenes of Argoverse 2 motion forecasting, train or val.
+
+    A broken scene is skipped and named, and the exit code is 3. A conversion that was stopped goes
+    on when it is started again. That holds for py123d and commonroad as well.
+    """
+    from shiftsim.data.readers.av2 import Av2Reader
+
+    reader = Av2Reader(folder, vehicles=_are_vehicles(egos))
+    _convert_scenes(reader, store, settings, quiet=quiet, as_json=as_json)
+
+
+@app.command()
+@cli.with_settings("workers")
+def py123d(
+    folder: _Source,
+    store: Store,
+    egos: _Egos = "recorded",
+    *,
+    settings: cli.Settings,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Convert logs that py123d wrote: Waymo, nuScenes, Argoverse 2 Sensor, nuPlan.
+
+    FOLDER holds logs/ and, for data sets with one map per city, maps/.
+    """
+    from shiftsim.data.readers.py123d import Py123dReader
+
+    reader = Py123dReader(folder, vehicles=_are_vehicles(egos))
+    _convert_scenes(reader, store, settings, quiet=quiet, as_json=as_json)
+
+
+@app.command()
+@cli.with_settings("workers")
+def commonroad(
+    folder: _Source,
+    store: Store,
+    *,
+    settings: cli.Settings,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Convert CommonRoad scenarios in XML: NGSIM, INTERACTION, inD, highD and others.
+
+    The files have no recording car: each vehicle that drives is an ego.
+    """
+    from shiftsim.data.readers.commonroad import CommonRoadReader
+
+    _convert_scenes(CommonRoadReader(folder), store, settings, quiet=quiet, as_json=as_json)
+
+
+def _are_vehicles(egos: str) -> bool:
+    from shiftsim.errors import one_of
+
+    return one_of("egos", egos, ("recorded", "vehicles")) == "vehicles"
+
+
+def _convert_scenes(
+    reader: "Reader", store: str, settings: cli.Settings, *, quiet: bool, as_json: bool
+) -> None:
+    report, folder = _convert(reader, store, settings, quiet=quiet or as_json)
+    if as_json:
+        say_json({"dataset": report.name, **_contents(report)})
+    else:
+        warnings = Counter(report.map_warnings) + report.count("warnings")
+        for title, counts in ("not an ego by rule", report.count("rejected")), ("note", warnings):
+            for name, number in sorted(counts.items()):
+                say(f" {title}: {name} ({number})")
+        for name, reason in list(report.skipped.items())[:MAX_NAMED]:
+            say(f" failed: {name}: {reason}")
+        without = sum(not summary.accepted for summary in report.recordings)
+        say(
+            f" {plural(report.converted, 'scene')} converted, {without} of them without a "
+            f"scenario, {report.kept} kept from before, {len(report.skipped)} failed"
+        )
+        say(f" {plural(report.accepted, 'new scenario')} → {folder}")
+        say(f" next: shiftsim filter {store}, then shiftsim run --planner idm --store {store}")
+    if report.skipped:
+        raise typer.Exit(PARTIAL)
+
+
+def _convert(
+    reader: "Reader", store: str, settings: cli.Settings, *, quiet: bool
+) -> tuple["ConversionReport", Path]:
+    """Convert a source over processes, with a progress bar; the report, and the store's folder."""
     from functools import partial
 
+    from shiftsim.data.readers.convert import convert
+    from shiftsim.files import store_path
     from shiftsim.runs.config import default_workers
     from shiftsim.runs.workers import map_unordered
 
-    count = settings.get("workers") or default_workers()
+    folder = store_path(store)
+    executor = partial(map_unordered, workers=settings.get("workers") or default_workers())
     with progress_bar(quiet=quiet) as advance:
-        yield advance, partial(map_unordered, workers=count)
+        return convert(reader, folder, progress=advance, executor=executor), folder
+
+
+def _contents(report: "ConversionReport") -> dict[str, Any]:
+    """The report as plain values, for JSON."""
+    found = asdict(report)
+    return {**found.pop("details"), **{k: v for k, v in found.items() if k != "name"}}
 
 
 def _category_map(words: list[str]) -> dict[str, str] | None:
@@ -306,7 +390,7 @@ def _category_map(words: list[str]) -> dict[str, str] | None:
 
 
 def _options(path: Path | None, flags: dict[str, Any]) -> "ConversionConfig":
-    from shiftsim.data.deepplan.windows import make_config
+    from shiftsim.data.readers.windows import make_config
     from shiftsim.errors import ConfigError
     from shiftsim.files import read_toml
 
@@ -317,10 +401,10 @@ def _options(path: Path | None, flags: dict[str, Any]) -> "ConversionConfig":
         raise ConfigError(f"{path or 'convert dsc3d'}: {error.message}", error.hint) from error
 
 
-def _show_dsc3d(report: "ConversionReport") -> None:
+def _show_site(report: "ConversionReport") -> None:
     say(
-        f"site {report.site}: {report.lanes} lanes and connectors, "
-        f"{100.0 * report.drivable_share:.1f} % of moving vehicles on drivable area"
+        f"site {report.name}: {report.lanes} lanes and connectors, "
+        f"{100.0 * report.details['drivable_share']:.1f} % of moving vehicles on drivable area"
     )
     for name, count in report.map_warnings.items():
         say(f" map: {name} ({count})")

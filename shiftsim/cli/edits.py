@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from shiftsim.cli import Debug, Json, new_app, plural, say, say_json
+from shiftsim.cli import Json, new_app, plural, say, say_json
 
 app = new_app("Edits of recorded scenarios: check them, look at them, import interPlan's.")
 
@@ -25,12 +25,11 @@ def check(
         typer.Option("--avoidable", help="Also whether braking or PDM-Closed avoids it."),
     ] = False,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Apply every edit to its scenarios, and say which cannot be applied and why."""
     from shiftsim.errors import ConfigError, ShiftsimError
-    from shiftsim.runs.edits.avoidable import is_avoidable
-    from shiftsim.runs.edits.edited import EditedStore
+    from shiftsim.runs.avoidable import is_avoidable
+    from shiftsim.runs.edited import EditedStore
     from shiftsim.runs.scenarios import open_edits, open_named_store
     from shiftsim.sim.traffic import traffic_name
 
@@ -72,14 +71,13 @@ def show(
     out: Annotated[
         Path, typer.Option("--out", "-o", help="A .pdf, .png or .svg: before and after.")
     ] = Path("edit.png"),
-    debug: Debug = False,
 ) -> None:
     """What an edit makes of a scenario: words, and a picture of before and after."""
     from shiftsim.errors import beginning
     from shiftsim.report.palette import save_picture
-    from shiftsim.runs.edits.edited import EditedStore
+    from shiftsim.runs.edited import EditedStore
     from shiftsim.runs.scenarios import open_edits, open_named_store
-    from shiftsim.view.edited import before_and_after
+    from shiftsim.view.still import before_and_after
 
     opened = open_named_store(store)
     edited = EditedStore(opened, open_edits(file, opened))
@@ -108,14 +106,14 @@ def import_edits(
     window: Annotated[
         float, typer.Option(help="Duration of the scenarios [s]; 0 keeps the recorded one.")
     ] = 30.0,
-    debug: Debug = False,
 ) -> None:
     """Edits that make interPlan's scenarios, from interPlan's own two files."""
+    from shiftsim.data.nuplan.filter import read_yaml
+    from shiftsim.edits.interplan.codes import import_names
     from shiftsim.files import write_text
-    from shiftsim.runs.edits.edited import edits_text, make_edits
-    from shiftsim.runs.edits.interplan.codes import import_names
+    from shiftsim.runs.edited import edits_text, make_edits
 
-    table = import_names(names, modifications, window)
+    table = import_names(read_yaml(names), read_yaml(modifications), window)
     made = make_edits(table, out.stem)
     write_text(out, edits_text(table))
     tokens = {token for edit in made.edits for token in edit.tokens}
@@ -134,18 +132,17 @@ def sample(
         bool, typer.Option("--even", help="As many easy, medium and hard ones.")
     ] = False,
     out: Annotated[Path, typer.Option("--out", "-o", help="The .toml file. [KIND.toml]")] = Path(),
-    debug: Debug = False,
 ) -> None:
     """Draw edits over a store: in the way, and avoided by braking at 4 m/s^2 or by PDM-Closed."""
     from collections import Counter
     from functools import lru_cache
 
+    from shiftsim.edits.sampling import KINDS, sample_edits
     from shiftsim.errors import one_of
     from shiftsim.files import write_text
-    from shiftsim.runs.edits.avoidable import grade
-    from shiftsim.runs.edits.edited import edits_text
+    from shiftsim.runs.avoidable import grade
+    from shiftsim.runs.edited import edits_text
     from shiftsim.runs.scenarios import find_split, open_named_store
-    from shiftsim.world.edits.sampling import KINDS, sample_edits
 
     one_of("kind", kind, KINDS)
     opened = open_named_store(store)

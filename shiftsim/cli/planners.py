@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from shiftsim.cli import Debug, Json, new_app, output_kept, plural, say, say_json, show, values
+from shiftsim.cli import Json, new_app, plural, say, say_json, show, stdout_to_stderr
 
 _USAGE = 1
 app = new_app("Planners: what there is, and does mine obey the contract.")
@@ -24,14 +24,14 @@ Source = Annotated[
 
 
 @app.callback(invoke_without_command=True)
-def planners(context: typer.Context, as_json: Json = False, debug: Debug = False) -> None:
+def planners(context: typer.Context, as_json: Json = False) -> None:
     """The planners that come with shiftsim, and whether they are ready to run."""
     if context.invoked_subcommand is None:
         list_planners(as_json)
 
 
 @app.command("list")
-def list_planners(as_json: Json = False, debug: Debug = False) -> None:
+def list_planners(as_json: Json = False) -> None:
     """The planners that come with shiftsim, and whether they are ready to run."""
     from shiftsim.planners.table import PLANNERS, SHIPPED_NOTE, readiness, shipped_file
 
@@ -61,7 +61,6 @@ def check_one_planner(
         str,
         typer.Argument(
             help="Name, ./file.py:Class or package.module:Class.",
-            autocompletion=values.planners,
         ),
     ],
     planner_arg: Annotated[
@@ -69,11 +68,10 @@ def check_one_planner(
     ] = None,
     store: Annotated[
         str,
-        typer.Option(help="Store with scenarios to try it on.", autocompletion=values.stores),
+        typer.Option(help="Store with scenarios to try it on."),
     ] = "demo",
     token: Annotated[str | None, typer.Option(help="Scenario. [the first]")] = None,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Does a planner obey the contract? Says what is wrong, and what to do."""
     from shiftsim.planners.contract import HANGS, check_planner
@@ -91,14 +89,14 @@ def check_one_planner(
     others = [row for row in rows if row["token"] != scenario.token]
     # of another map where there is one: a planner that keeps the map of the first shows there
     others.sort(key=lambda row: row["city"] == scenario.city)
-    with output_kept():
+    with stdout_to_stderr():
         load_planner(planner, arguments)
         make = partial(load_planner, planner, arguments)
         findings = check_planner(
             make, scenario, scenes.read(others[0]["token"]) if others else None
         )
     errors = [finding for finding in findings if finding.severity == "error"]
-    doubts = [finding for finding in findings if finding.severity == "warning"]
+    warnings = [finding for finding in findings if finding.severity == "warning"]
     if as_json:
         say_json([asdict(finding) for finding in findings])
     else:
@@ -107,7 +105,7 @@ def check_one_planner(
             if finding.hint:
                 say(f"   hint: {finding.hint}")
         verdict = plural(len(errors), "error") if errors else "obeys the contract"
-        verdict += f", {plural(len(doubts), 'warning')}" if doubts else ""
+        verdict += f", {plural(len(warnings), 'warning')}" if warnings else ""
         say(f"{planner} on scenario {scenario.token}: {verdict}")
     if any(finding.check == HANGS for finding in errors):
         raise KeyboardInterrupt
@@ -116,7 +114,7 @@ def check_one_planner(
 
 
 @checkpoint.command()
-def inspect(path: Source, as_json: Json = False, debug: Debug = False) -> None:
+def inspect(path: Source, as_json: Json = False) -> None:
     """Which planner a checkpoint is for, whether it loads, its hash, and what was left out."""
     from shiftsim.planners.learned.convert import inspect_checkpoint
 
@@ -129,10 +127,9 @@ def convert(
     path: Source,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write: ….safetensors")],
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Write the weights that the planner loads, and nothing else, to a safetensors file."""
     from shiftsim.planners.learned.convert import convert_checkpoint
 
-    made = convert_checkpoint(path, out)
-    show(made.to_dict(), made.lines(), as_json=as_json)
+    converted = convert_checkpoint(path, out)
+    show(converted.to_dict(), converted.lines(), as_json=as_json)

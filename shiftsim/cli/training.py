@@ -1,13 +1,13 @@
 """`shiftsim train`: making weights."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from shiftsim.cli import Debug, Json, Quiet, new_app, say, show, values
+from shiftsim.cli import Json, Quiet, new_app, say, show
 
 app = new_app("Train networks.")
 
@@ -15,14 +15,11 @@ app = new_app("Train networks.")
 @app.command()
 def carl(
     out: Annotated[Path, typer.Option(help="Folder for networks, curves and what was collected.")],
-    store: Annotated[
-        str, typer.Option(help="Store by name, path or URL.", autocompletion=values.stores)
-    ] = "demo",
+    store: Annotated[str, typer.Option(help="Store by name, path or URL.")] = "demo",
     split: Annotated[
         str,
         typer.Option(
             help="Split of the store; all its scenarios if empty.",
-            autocompletion=values.splits,
         ),
     ] = "",
     checkpoint: Annotated[
@@ -41,14 +38,13 @@ def carl(
     ppo_samples: Annotated[int, typer.Option(help="Steps of PPO afterwards.")] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on where it was ended.")] = False,
     quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Train CaRL's network to drive as PDM-Closed does."""
     from shiftsim.planners.learned.device import require_torch
 
     require_torch("training")
+    from shiftsim.train.folder import Settings
     from shiftsim.train.recipe import Training
-    from shiftsim.train.settings import Settings
 
     settings = Settings(
         store=store,
@@ -65,9 +61,7 @@ def carl(
         device=device,
         workers=workers,
     )
-    shown = (lambda text: None) if quiet else (lambda text: typer.echo(text, err=True))
-    training = Training(settings, shown, resume=resume)
-    training.run()
+    Training(settings, _on_message(quiet), resume=resume).run()
     say(f"best network: {settings.best}")
     say(f"drive with it: shiftsim run -p carl --checkpoint carl={settings.best}")
 
@@ -85,7 +79,6 @@ def traffic(
     epochs: Annotated[int, typer.Option(help="Of each round.")] = 8,
     tests: Annotated[int, typer.Option(help="Scenarios that the result is measured on.")] = 100,
     quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Train traffic to move as recorded agents do."""
     from shiftsim.planners.learned.device import require_torch
@@ -94,9 +87,12 @@ def traffic(
     from shiftsim.train.traffic.recipe import TrafficSettings, train_traffic
 
     settings = TrafficSettings(store, out, split, seed, rounds, scenarios, epochs, tests)
-    shown = (lambda text: None) if quiet else (lambda text: typer.echo(text, err=True))
-    say(f"weights: {train_traffic(settings, shown)}")
+    say(f"weights: {train_traffic(settings, _on_message(quiet))}")
     say(f"how real it is: shiftsim realism {store} --weights {out}/weights.npz")
+
+
+def _on_message(quiet: bool) -> Callable[[str], None]:
+    return (lambda text: None) if quiet else partial(typer.echo, err=True)
 
 
 def realism(
@@ -110,7 +106,6 @@ def realism(
     seconds: Annotated[float, typer.Option(min=0.5, help="That agents are driven for.")] = 5.0,
     limit: Annotated[int, typer.Option(help="Only so many scenarios of each store.")] = 0,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """How like the recorded ones agents of each kind of traffic are, some seconds on."""
     from shiftsim.runs.scenarios import open_named_store

@@ -18,5 +18,5 @@ if ID not in registry:
     register(
         ID,
         entry_point="shiftsim.env.driving:DrivingEnv",
-        vector_entry_point="shiftsim.env.parallel:DrivingVectorEnv",
+        vector_entry_point="shiftsim.env.driving:DrivingVectorEnv",
     )

@@ -4,22 +4,24 @@ An episode is one scenario. It is truncated when the scenario is at its end, and
 infraction: a corner of the ego off the road, or a collision of the moving ego.
 """
 
+import signal
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from functools import cache
+from functools import cache, partial
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 
-from shiftsim.env.episode import Episode, Reward, reward_of
-from shiftsim.env.observations import Nothing, Observer
+from shiftsim.env.episode import REWARDS, Episode, NoObservation, Observer, Reward
 from shiftsim.env.raster import RasterObserver, picture_of
 from shiftsim.env.vector import VectorObserver
-from shiftsim.errors import ConfigError, DataError, one_of
+from shiftsim.errors import ConfigError, DataError, ShiftsimError, one_of
 from shiftsim.geometry.boxes import from_frame
 from shiftsim.kernels import FloatArray
 from shiftsim.planners.learned.carl.planner import command_of
@@ -33,7 +35,7 @@ from shiftsim.world.state import Trajectory
 POSES, SPACING = 10, 0.1  # of a trajectory action; s between them
 REACH = 50.0  # m from the ego that a pose of it may be
 OBSERVATIONS: dict[str, Callable[[], Observer]] = {
-    "none": Nothing,
+    "none": NoObservation,
     "raster": RasterObserver,
     "vector": VectorObserver,
 }
@@ -111,7 +113,9 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         if isinstance(observation, str):
             observation = OBSERVATIONS[one_of("observation", observation, OBSERVATIONS)]()
         self.observer = deepcopy(observation)
-        self._reward = reward_of(reward)
+        if isinstance(reward, str):
+            reward = REWARDS[one_of("reward", reward, REWARDS)]
+        self._reward = reward
         self._is_command = one_of("action", action, ACTIONS) == "command"
         self._terminate, self._penalty = terminate, penalty
         if render_mode not in (None, *self.metadata["render_modes"]):
@@ -143,11 +147,6 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
             ConfigError: There is another option.
             DataError: The store has no scenario of that token.
         """
-        info = self.begin(seed, options)
-        return self.observer.look(self.episode), info
-
-    def begin(self, seed: int | None, options: dict[str, Any] | None) -> dict[str, Any]:
-        """As `reset`, without an observation."""
         super().reset(seed=seed)
         drawn = {
             "token": self._tokens[int(self.np_random.integers(len(self._tokens)))],
@@ -161,7 +160,7 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         self._episode = episode = Episode(scenario, setting, np.zeros_like(self._high))
         self.observer.start(episode)
         info = {"scenario_type": scenario.scenario_type, "log_name": scenario.log_name}
-        return chosen | info
+        return self.observer.look(episode), chosen | info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Drive one step of 0.1 s.
@@ -169,11 +168,6 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         Raises:
             ConfigError: The episode has ended.
         """
-        driven = self.drive(action)
-        return self.observer.look(self.episode), *driven
-
-    def drive(self, action: Any) -> tuple[float, bool, bool, dict[str, Any]]:
-        """As `step`, without an observation."""
         episode = self.episode
         if episode.is_over:
             raise ConfigError("the episode has ended", hint="call reset()")
@@ -190,7 +184,7 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
             info["error"] = episode.error
         reward = float(self._reward(episode)) + (self._penalty if infraction else 0.0)
         terminated = self._terminate and infraction != ""
-        return reward, terminated, is_over, info
+        return self.observer.look(episode), reward, terminated, is_over, info
 
     def render(self) -> np.ndarray | None:
         """(256, 256, 3) uint8: 128 m around the ego, which drives to the right."""
@@ -201,3 +195,83 @@ def _trajectory(action: NDArray[np.float32], ego: FloatArray) -> Trajectory:
     """The plan that (10, 3) poses in the frame of the rear axle stand for."""
     poses = np.concatenate([ego[None, :3], from_frame(action.astype(np.float64), ego[:3])])
     return Trajectory.from_poses(SPACING * np.arange(POSES + 1), poses)
+
+
+def DrivingVectorEnv(
+    num_envs: int = 1,
+    *,
+    num_workers: int = 1,
+    autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+    **settings: Any,
+) -> "VectorEnv[Any, Any, Any]":
+    """Environments side by side: Gymnasium's `SyncVectorEnv`, or its `AsyncVectorEnv`.
+
+    Args:
+        num_envs: Number of environments.
+        num_workers: 1 to step all of them in this process; with more, each of them has a process
+            of its own.
+        autoreset_mode: When an ended episode is followed by a new one, as in Gymnasium.
+        settings: Those of `DrivingEnv`.
+
+    Raises:
+        ConfigError: A setting is wrong.
+        DataError: The store is not there, or has no scenario.
+    """
+    if not 1 <= num_workers <= num_envs:
+        raise ConfigError(
+            f"{num_workers} workers for {num_envs} environments",
+            hint="num_workers must be at least 1, and at most num_envs",
+        )
+    makers = [partial(DrivingEnv, **settings)] * num_envs
+    if num_workers == 1:
+        return SyncVectorEnv(makers, autoreset_mode=autoreset_mode)
+    return ProcessVectorEnv(makers, autoreset_mode=autoreset_mode)
+
+
+class ProcessVectorEnv(AsyncVectorEnv):
+    """Environments in a process each; an error in one of them, or its death, closes all."""
+
+    def __init__(
+        self,
+        makers: Sequence[Callable[[], gymnasium.Env[Any, Any]]],
+        *,
+        autoreset_mode: str | AutoresetMode,
+    ) -> None:
+        """Start the processes; forking is unsafe beside the threads of torch."""
+        start = partial(super().__init__, context="spawn", autoreset_mode=autoreset_mode)
+        self._close_on_error(start, makers)
+
+    def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
+        """As Gymnasium's."""
+        return self._close_on_error(partial(super().reset, **arguments))
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """As Gymnasium's."""
+        return self._close_on_error(super().step, actions)
+
+    def close_extras(self, timeout: float | None = None, terminate: bool = True) -> None:
+        """End the processes; there is nothing that they would have to write."""
+        processes = getattr(self, "processes", ())  # none where a setting was refused
+        for process in processes:
+            process.terminate()
+        for process in processes:
+            process.join()
+
+    def _close_on_error(self, call: Callable[..., Any], *arguments: Any) -> Any:
+        try:
+            return call(*arguments)
+        except (EOFError, ConnectionError) as error:
+            ended = wait([process.sentinel for process in self.processes], timeout=5.0)
+            number = next(n for n, one in enumerate(self.processes) if one.sentinel in ended)
+            self.processes[number].join()
+            code = self.processes[number].exitcode or 0
+            self.close()
+            how = f"exit code {code}" if code >= 0 else signal.Signals(-code).name
+            raise ShiftsimError(
+                f"the process of environment {number} ended with {how}",
+                hint="what it printed is above; a script that makes processes needs the guard "
+                "if __name__ == '__main__'",
+            ) from error
+        except BaseException:
+            self.close()
+            raise

@@ -1,14 +1,15 @@
-"""One episode: a scenario on its way, what was driven of it, and how the last step was."""
+"""One episode: a scenario under way, its rollout, rewards, and what an observation is."""
 
 from collections.abc import Callable
 from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
+from gymnasium import Space, spaces
 
-from shiftsim.env.terms import Terms, look_back, make_course, terms_of
-from shiftsim.errors import PlannerError, ShiftsimError, one_of
+from shiftsim.env.terms import Terms, compute_reward_terms, make_state
+from shiftsim.errors import PlannerError, ShiftsimError
 from shiftsim.metrics import SHORT_NAMES, compute_metrics
-from shiftsim.metrics.comfort import MIN_SAMPLES, filters_of
 from shiftsim.sim.loop import Rollout, Setting
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.scenario import Scenario
@@ -39,7 +40,7 @@ class Episode:
         scene: What a planner would be told of it.
         log: The rollout; its arrays have a row per iteration, filled up to the present one.
         terms: How the last step was.
-        course: The same as the kernels see it.
+        state: What the kernels read of it.
         action: (…) the last action within its bounds, zeros at the beginning.
         error: Why there are no scores; empty otherwise.
     """
@@ -52,9 +53,8 @@ class Episode:
         self.scenario, self.scene = scenario, driver.scene
         self.log = self._rollout.log()
         self.action = action
-        self._steps = np.diff(self.log.time_us / 1e6)
-        self.course = make_course(self.log, scenario.map)
-        self.terms: Terms = terms_of(self.course)
+        self.state = make_state(self.log, scenario.map)
+        self.terms: Terms = compute_reward_terms(self.state, self.log, 0)
 
     @property
     def iteration(self) -> int:
@@ -78,11 +78,7 @@ class Episode:
     def advance(self, plan: Trajectory | Command) -> None:
         """Drive one step."""
         self._rollout.advance(plan)
-        row = self._rollout.iteration
-        # as the comfort metrics do it on the whole rollout
-        step = float(np.add.reduce(self._steps[:row]) / row)
-        look_back(self.course, row, filters_of(max(row + 1, MIN_SAMPLES)), step, step**2)
-        self.terms = terms_of(self.course)
+        self.terms = compute_reward_terms(self.state, self.log, self._rollout.iteration)
 
     @cached_property
     def scores(self) -> dict[str, float]:
@@ -141,10 +137,26 @@ def _factor(t: Terms) -> float:
 REWARDS: dict[str, Reward] = {f.__name__: f for f in (regular, nuplan, survival, score)}
 
 
-def reward_of(reward: str | Reward) -> Reward:
-    """The reward of a name, or the function itself.
+class Observer(Protocol):
+    """Makes observations; one's own is given to the environment as an object with these three."""
 
-    Raises:
-        ConfigError: There is none of that name.
-    """
-    return REWARDS[one_of("reward", reward, REWARDS)] if isinstance(reward, str) else reward
+    space: Space[Any]  # of what `look` returns
+
+    def start(self, episode: Episode) -> None:
+        """Prepare for a new episode."""
+
+    def look(self, episode: Episode) -> Any:
+        """The present observation, in arrays that nobody writes to later."""
+
+
+class NoObservation:
+    """No observation, for policies that need none."""
+
+    space: Space[Any] = spaces.Discrete(1)
+
+    def start(self, episode: Episode) -> None:
+        """Nothing to prepare."""
+
+    def look(self, episode: Episode) -> int:
+        """Always the same."""
+        return 0

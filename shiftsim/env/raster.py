@@ -28,7 +28,6 @@ _COLOURS = {  # red, green, blue by channel; what is drawn first lies below
     view.EGO: (180, 40, 120),
 }
 
-
 _roads = PerMap(make_roads)  # of all environments of a process
 
 
@@ -38,18 +37,17 @@ class Canvas:
     def __init__(self, episode: Episode) -> None:
         scene = episode.scene
         self._roads = _roads(scene.map)
-        self._scratch = view.make_scratch(self._roads)
         self._on_route: BoolArray = np.zeros(len(scene.map.blocks), np.bool_)
         self._on_route[route_blocks(scene)] = True
         self._lights = LightLookup(scene.map, LightStatus.ABSENT)
 
-    def draw(self, episode: Episode, raster: Raster) -> None:
-        """Draw over a raster (9, 256, 256)."""
-        log, row = episode.log, episode.iteration
-        raster.fill(0)
+    def draw(self, episode: Episode) -> Raster:
+        """The present raster (9, 256, 256)."""
+        log, row, raster = episode.log, episode.iteration, np.zeros(SHAPE, np.uint8)
         status = self._lights.at(log.traffic_lights.rows(slice(row, row + 1)))
-        roads, scratch = self._roads, self._scratch
-        draw(raster, roads, scratch, log.ego[row], log.tracks, row, self._on_route, status)
+        roads = self._roads
+        draw(raster, roads, log.ego[row], log.tracks, row, self._on_route, status)
+        return raster
 
 
 class RasterObserver:
@@ -70,28 +68,20 @@ class RasterObserver:
 
     def look(self, episode: Episode) -> dict[str, Any]:
         """The present raster and measurements."""
-        seen = {
-            "raster": np.empty(SHAPE, np.uint8),
-            "measurements": np.empty(10, np.float32),
-            "value_measurements": np.empty(4, np.float32),
-        }
-        self.fill(episode, seen)
-        return seen
-
-    def fill(self, episode: Episode, seen: dict[str, Any]) -> None:
-        """Write the same to arrays that are there."""
         row, terms = episode.iteration, episode.terms
         action = episode.action if episode.action.shape == (2,) else np.zeros(2, np.float32)
-        left = 1.0 - row / episode.scenario.num_iterations
-        self._canvas.draw(episode, seen["raster"])
-        seen["measurements"][:] = measure(episode.log.ego[row], action)
-        seen["value_measurements"][:] = left, 1.0 - terms.completion, terms.comfort, terms.ttc
+        time_left = 1.0 - row / episode.scenario.num_iterations
+        critic = np.array([time_left, 1.0 - terms.completion, terms.comfort, terms.ttc], np.float32)
+        return {
+            "raster": self._canvas.draw(episode),
+            "measurements": measure(episode.log.ego[row], action).astype(np.float32),
+            "value_measurements": critic,
+        }
 
 
 def picture_of(episode: Episode) -> np.ndarray:
     """(256, 256, 3) uint8, driving to the right, left is up."""
-    raster = np.empty(SHAPE, np.uint8)
-    Canvas(episode).draw(episode, raster)
+    raster = Canvas(episode).draw(episode)
     picture = np.full((view.SIZE, view.SIZE, 3), 245, np.uint8)
     for channel, colour in _COLOURS.items():
         picture[raster[channel, ::-1] > 0] = colour

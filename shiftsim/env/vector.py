@@ -1,7 +1,7 @@
 """A compact observation: the ego, its route, and the tracks and lanes nearest to it.
 
-Everything is in the frame of the ego's box centre, scaled to about one and cut at `LARGEST`: metres
-by 50, m/s by 20, m/s^2 by 5.
+Everything is in the frame of the ego's box centre, scaled to about one and clipped at `LARGEST`:
+metres by 50, m/s by 20, m/s^2 by 5.
 """
 
 from math import prod
@@ -12,7 +12,7 @@ from gymnasium import Space, spaces
 from numpy.typing import NDArray
 
 from shiftsim.env.episode import Episode
-from shiftsim.env.terms import Course
+from shiftsim.env.terms import EpisodeState
 from shiftsim.geometry.polylines import arc_lengths, point_on_polyline, project_on_polyline
 from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.planners.learned.features import route_blocks
@@ -93,7 +93,7 @@ class VectorObserver:
         status = self._lights.at(episode.log.traffic_lights.rows(slice(row, row + 1)))
         values = np.zeros(SIZE, np.float32)
         seen = parts_of(values)
-        _look(episode.course, self._route, row, status, seen)
+        _write_observation(episode.state, self._route, row, status, seen)
         if episode.action.shape == (2,):
             seen.ego[7:] = episode.action
         return values
@@ -118,88 +118,70 @@ def route_line(scene: SceneInfo, blocks: list[int], center: FloatArray) -> Float
 
 
 @kernel
-def _look(course: Course, route: Route, row: int, status: IntArray, seen: Seen) -> None:
+def _write_observation(
+    episode: EpisodeState, route: Route, row: int, status: IntArray, seen: Seen
+) -> None:
     """Write one observation into zeros."""
-    ego = course.ego[row]
+    ego = episode.ego[row]
     cos, sin = np.cos(ego[2]), np.sin(ego[2])
     x, y = ego[0] + _TO_CENTER * cos, ego[1] + _TO_CENTER * sin
-    seen.ego[0] = _cut(ego[3] / SPEED)
-    seen.ego[1], seen.ego[2] = _cut(ego[5] / ACCEL), _cut(ego[6] / ACCEL)
+    seen.ego[0] = _clip(ego[3] / SPEED)
+    seen.ego[1], seen.ego[2] = _clip(ego[5] / ACCEL), _clip(ego[6] / ACCEL)
     for index in range(4):
-        seen.ego[3 + index] = _cut(ego[7 + index])
+        seen.ego[3 + index] = _clip(ego[7 + index])
     last = len(route.arc)
     start = project_on_polyline(route.xy, route.arc, 0, last, x, y)
     for point in range(ROUTE_POINTS):
         px, py = point_on_polyline(route.xy, route.arc, 0, last, start + point * ROUTE_STEP)
-        _place(px - x, py - y, cos, sin, METRES, seen.route[point])
-    _look_at_tracks(course, route, row, x, y, cos, sin, seen.tracks)
-    _look_at_lanes(course, route, status, x, y, cos, sin, seen.lanes)
-
-
-@kernel
-def _look_at_tracks(
-    course: Course, route: Route, row: int, x: float, y: float, cos: float, sin: float, out: Values
-) -> None:
+        _write_vector(px - x, py - y, cos, sin, METRES, seen.route[point])
     count = 0
-    for track in range(len(course.kinds)):
-        if course.valid[row, track]:
-            dx, dy = course.poses[row, track, 0] - x, course.poses[row, track, 1] - y
-            count = _keep(route, count, len(out), np.hypot(dx, dy), track)
+    for track in range(len(episode.kinds)):
+        if episode.valid[row, track]:
+            dx, dy = episode.poses[row, track, 0] - x, episode.poses[row, track, 1] - y
+            count = _insert_nearest(route, count, TRACKS, np.hypot(dx, dy), track)
     for place in range(count):
-        track, line = route.indices[place], out[place]
-        pose, size = course.poses[row, track], course.sizes[row, track]
+        track, line = route.indices[place], seen.tracks[place]
+        pose, size = episode.poses[row, track], episode.sizes[row, track]
         line[0] = 1.0
-        _place(pose[0] - x, pose[1] - y, cos, sin, METRES, line[1:3])
-        _place(np.cos(pose[2]), np.sin(pose[2]), cos, sin, 1.0, line[3:5])
-        if course.kinds[track] <= _LAST_AGENT:
-            velocity = course.velocities[row, track]
-            _place(velocity[0], velocity[1], cos, sin, SPEED, line[5:7])
-            line[9] = 0.0 if course.kinds[track] == _VEHICLE else 1.0
+        _write_vector(pose[0] - x, pose[1] - y, cos, sin, METRES, line[1:3])
+        _write_vector(np.cos(pose[2]), np.sin(pose[2]), cos, sin, 1.0, line[3:5])
+        if episode.kinds[track] <= _LAST_AGENT:
+            velocity = episode.velocities[row, track]
+            _write_vector(velocity[0], velocity[1], cos, sin, SPEED, line[5:7])
+            line[9] = 0.0 if episode.kinds[track] == _VEHICLE else 1.0
         else:
             line[10] = 1.0
-        line[7], line[8] = _cut(size[0] / METRES), _cut(size[1] / METRES)
-
-
-@kernel
-def _look_at_lanes(
-    course: Course,
-    route: Route,
-    status: IntArray,
-    x: float,
-    y: float,
-    cos: float,
-    sin: float,
-    out: Values,
-) -> None:
-    bounds, lines, count = course.edges.bounds, course.baselines, 0
+        line[7], line[8] = _clip(size[0] / METRES), _clip(size[1] / METRES)
+    bounds, lines, count = episode.edges.bounds, episode.baselines, 0
     for edge in range(len(bounds)):
         dx = max(bounds[edge, 0] - x, 0.0, x - bounds[edge, 2])
         dy = max(bounds[edge, 1] - y, 0.0, y - bounds[edge, 3])
-        limit = REACH if count < len(out) else route.nearest[count - 1]
+        limit = REACH if count < LANES else route.nearest[count - 1]
         if dx * dx + dy * dy < limit * limit:
             first, stop = lines.ptr[edge], lines.ptr[edge + 1]
             along = project_on_polyline(lines.xy, lines.arc, first, stop, x, y)
             px, py = point_on_polyline(lines.xy, lines.arc, first, stop, along)
             distance = np.hypot(px - x, py - y)
             if distance < REACH:
-                count = _keep(route, count, len(out), distance, edge)
+                count = _insert_nearest(route, count, LANES, distance, edge)
     for place in range(count):
-        edge, line = route.indices[place], out[place]
-        limit = course.limits[edge]
+        edge, line = route.indices[place], seen.lanes[place]
+        limit = episode.limits[edge]
         line[0] = 1.0
-        line[1] = 1.0 if course.edge_on_route[edge] else 0.0
-        line[2] = 0.0 if np.isnan(limit) else _cut(limit / SPEED)
+        line[1] = 1.0 if episode.edge_on_route[edge] else 0.0
+        line[2] = 0.0 if np.isnan(limit) else _clip(limit / SPEED)
         line[3] = 1.0 if status[edge] == _RED else 0.0
         first, stop = lines.ptr[edge], lines.ptr[edge + 1]
         along = project_on_polyline(lines.xy, lines.arc, first, stop, x, y)
         for point in range(LANE_POINTS):
             ahead = along + point * LANE_STEP
             px, py = point_on_polyline(lines.xy, lines.arc, first, stop, ahead)
-            _place(px - x, py - y, cos, sin, METRES, line[4 + 2 * point : 6 + 2 * point])
+            vector = line[4 + 2 * point : 6 + 2 * point]
+            _write_vector(px - x, py - y, cos, sin, METRES, vector)
 
 
 @kernel
-def _keep(route: Route, count: int, most: int, distance: float, index: int) -> int:
+def _insert_nearest(route: Route, count: int, most: int, distance: float, index: int) -> int:
     """Sort something into the nearest ones; how many there are then."""
     nearest, indices = route.nearest, route.indices
     if count == most:
@@ -215,12 +197,12 @@ def _keep(route: Route, count: int, most: int, distance: float, index: int) -> i
 
 
 @kernel
-def _place(dx: float, dy: float, cos: float, sin: float, unit: float, out: Values) -> None:
+def _write_vector(dx: float, dy: float, cos: float, sin: float, unit: float, out: Values) -> None:
     """Write a vector of the map frame in that of the ego, in a unit."""
-    out[0] = _cut((cos * dx + sin * dy) / unit)
-    out[1] = _cut((cos * dy - sin * dx) / unit)
+    out[0] = _clip((cos * dx + sin * dy) / unit)
+    out[1] = _clip((cos * dy - sin * dx) / unit)
 
 
 @kernel
-def _cut(value: float) -> float:
+def _clip(value: float) -> float:
     return min(max(value, -LARGEST), LARGEST)

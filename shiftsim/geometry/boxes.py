@@ -7,11 +7,20 @@ rear-right, front-right.
 
 import numpy as np
 
-from shiftsim.geometry.rings import EXTERIOR, locate_in_ring, segments_intersect
+from shiftsim.geometry.rings import (
+    EXTERIOR,
+    SLACK,
+    convex_intersect,
+    locate_in_ring,
+    segments_intersect,
+)
 from shiftsim.kernels import FloatArray, kernel
 
 # rad, bearings from the rear axle that at-fault tests compare with
 BEHIND, AHEAD = np.deg2rad(150.0), np.deg2rad(30.0)
+STOPPED_SPEED = 5e-2  # m/s, of the ego and of others in a collision
+# how the ego and another box come into contact
+STOPPED_EGO, STOPPED_TRACK, ACTIVE_REAR, ACTIVE_FRONT, ACTIVE_LATERAL = range(5)
 
 
 @kernel
@@ -35,9 +44,20 @@ def circle_around(box: FloatArray) -> tuple[float, float, float]:
 
 
 @kernel
-def bearing(pose: FloatArray, x: float, y: float) -> float:
-    """Angle between the heading of a pose (3,) and the direction to a point, in [0, pi] [rad]."""
-    return np.arccos(bearing_cosine(np.cos(pose[2]), np.sin(pose[2]), x - pose[0], y - pose[1]))
+def boxes_touch(a: FloatArray, b: FloatArray) -> bool:
+    """Whether two boxes (4, 2) share a point; touching counts."""
+    # most that are near one another are clearly apart along an axis of the first
+    x, y = 0.5 * (a[0, 0] + a[2, 0]), 0.5 * (a[0, 1] + a[2, 1])
+    for axis in range(1, 4, 2):
+        axis_x, axis_y = a[0, 0] - a[axis, 0], a[0, 1] - a[axis, 1]
+        size = np.sqrt(axis_x * axis_x + axis_y * axis_y)
+        least, most = np.inf, -np.inf
+        for corner in range(4):
+            along = axis_x * (b[corner, 0] - x) + axis_y * (b[corner, 1] - y)
+            least, most = min(least, along), max(most, along)
+        if max(least, -most) > size * (0.5 * size + SLACK):
+            return False
+    return convex_intersect(a, b)
 
 
 @kernel
@@ -49,14 +69,33 @@ def bearing_cosine(cos: float, sin: float, dx: float, dy: float) -> float:
 
 
 @kernel
-def front_touches(box: FloatArray, ring: FloatArray) -> bool:
-    """Whether the front edge of a box (4, 2) touches the area of a convex ring (V, 2)."""
-    if locate_in_ring(ring, box[0, 0], box[0, 1]) != EXTERIOR:
-        return True
-    for index in range(len(ring)):
-        if segments_intersect(box[0], box[3], ring[index - 1], ring[index]):
-            return True
-    return False
+def contact_type(
+    pose: FloatArray,
+    speed: float,
+    box: FloatArray,
+    x: float,
+    y: float,
+    other_speed: float,
+    other: FloatArray,
+) -> int:
+    """STOPPED_EGO … ACTIVE_LATERAL: the kind of a contact of the ego with another box.
+
+    The ego has the rear-axle pose (3,), a speed [m/s] and the box (4, 2), the other one the middle
+    (x, y) that the bearing is taken to, a speed and the box (4, 2).
+    """
+    if speed <= STOPPED_SPEED:
+        return STOPPED_EGO
+    if other_speed <= STOPPED_SPEED:
+        return STOPPED_TRACK
+    cosine = bearing_cosine(np.cos(pose[2]), np.sin(pose[2]), x - pose[0], y - pose[1])
+    if np.arccos(cosine) > BEHIND:
+        return ACTIVE_REAR
+    if locate_in_ring(other, box[0, 0], box[0, 1]) != EXTERIOR:
+        return ACTIVE_FRONT
+    for index in range(len(other)):
+        if segments_intersect(box[0], box[3], other[index - 1], other[index]):
+            return ACTIVE_FRONT  # the front edge touches the other box
+    return ACTIVE_LATERAL
 
 
 @kernel

@@ -1,34 +1,18 @@
-"""Polylines: arc length, headings, nearest vertices, projection; paths, and their corridors.
+"""Polylines: arc length, headings, projection; paths with headings.
 
 The vertices of a path are grouped in short runs with bounding boxes, so that a search along it
 looks at a few segments instead of all of them.
-
-A corridor is the path buffered by a half width, with square ends. nuPlan builds that polygon and
-asks which objects intersect it. Distances to the path decide the same thing at a fraction of the
-cost, except in a thin band: the polygon's round joins are segmented, and GEOS leaves out shallow
-vertices first. What lies in the band is left OPEN, for the polygon itself to decide.
 """
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-import shapely
 
-from shiftsim.geometry.rings import (
-    SLACK,
-    point_segment_distance,
-    ring_bounds,
-    ring_segment_distance,
-    rings_touch,
-)
+from shiftsim.geometry.rings import SLACK, point_segment_distance
 from shiftsim.kernels import FloatArray, IntArray, kernel
 
 RUN = 8  # segments per bounding box
-CLEAR, HIT, OPEN = 0, 1, 2
-# GEOS drops vertices of the line within 1 % of the radius, and its arcs (16 segments per quarter)
-# lie 0.1 % inside the circle; twice that is safe
-BAND = 0.02
-_QUARTER_SEGMENTS = 16  # of the round joins
 _STRIDE = 4  # vertices between those that are looked at for a first bound
 
 
@@ -108,42 +92,15 @@ def vertex_headings(xy: FloatArray) -> FloatArray:
     return np.append(heading, heading[-1])
 
 
-@kernel
-def nearest_vertex(
-    xy: FloatArray, start: int, stop: int, stride: int, x: float, y: float
-) -> tuple[int, float]:
-    """The vertex of a polyline nearest to a point and its distance [m]; the first one on ties.
-
-    Of the vertices `start` … `stop` - 1 of `xy` (V, 2) every `stride`-th is looked at.
-    """
-    best, found = np.inf, start
-    for index in range(start, stop, stride):
-        distance = np.hypot(xy[index, 0] - x, xy[index, 1] - y)
-        if distance < best:
-            best, found = distance, index
-    return found, best
-
-
 def arc_lengths(xy: FloatArray, ptr: IntArray) -> FloatArray:
     """(V,) arc length at each vertex from the start of its own polyline, as in `Polylines` [m]."""
     steps = np.diff(xy, axis=0)
     out = np.zeros(len(xy))
     np.hypot(steps[:, 0], steps[:, 1], out=out[1:])
-    if len(ptr) == 2:  # most often; no kernel needs to be compiled for it
-        np.cumsum(out, out=out)
-    else:
-        _sum_up(out, ptr)
+    for start, stop in pairwise(ptr.tolist()):
+        out[start:stop][:1] = 0.0
+        np.cumsum(out[start:stop], out=out[start:stop])
     return out
-
-
-@kernel
-def _sum_up(steps: FloatArray, ptr: IntArray) -> None:
-    """Make lengths (V,) of the segments that end at the vertices of lines arc lengths of these."""
-    for line in range(len(ptr) - 1):
-        total = 0.0
-        for vertex in range(ptr[line], ptr[line + 1]):
-            total = 0.0 if vertex == ptr[line] else total + steps[vertex]
-            steps[vertex] = total
 
 
 class Path(NamedTuple):
@@ -160,15 +117,9 @@ def make_path(poses: FloatArray, progress: FloatArray | None = None) -> Path:
     xy = np.ascontiguousarray(poses[:, :2])
     if progress is None:
         progress = arc_lengths(xy, np.array([0, len(xy)]))
-    runs = np.empty((runs_of(len(xy)), 4))
+    runs = np.empty(((len(xy) - 2) // RUN + 1, 4))
     bound_runs(xy, runs)
     return Path(xy, np.unwrap(poses[:, 2]), progress, runs)
-
-
-@kernel
-def runs_of(num_points: int) -> int:
-    """How many runs a polyline of so many vertices has."""
-    return (num_points - 2) // RUN + 1
 
 
 @kernel
@@ -184,27 +135,13 @@ def bound_runs(xy: FloatArray, runs: FloatArray) -> None:
 
 
 @kernel
-def is_run_within(runs: FloatArray, run: int, x: float, y: float, limit: float) -> bool:
-    """Whether the bounds of a run come within `limit` [m] of a point."""
-    dx = max(runs[run, 0] - x, 0.0, x - runs[run, 2])
-    dy = max(runs[run, 1] - y, 0.0, y - runs[run, 3])
-    return not dx * dx + dy * dy > limit * limit
-
-
-@kernel
 def pose_at(path: Path, progress: float) -> tuple[float, float, float]:
     """Pose x [m], y [m], heading [rad] at a progress, clamped to the path; heading not wrapped."""
     last = len(path.progress) - 1
     s = min(max(progress, path.progress[0]), path.progress[last])
-    return pose_before(path, min(max(int(np.searchsorted(path.progress, s)), 1), last), s)
-
-
-@kernel
-def pose_before(path: Path, upper: int, progress: float) -> tuple[float, float, float]:
-    """As `pose_at`, between a vertex and the one before, which have the progress between them."""
+    upper = min(max(int(np.searchsorted(path.progress, s)), 1), last)
     lower = upper - 1
-    ahead = progress - path.progress[lower]
-    span = path.progress[upper] - path.progress[lower]
+    ahead, span = s - path.progress[lower], path.progress[upper] - path.progress[lower]
     return (
         interpolate(path.xy[lower, 0], path.xy[upper, 0], span, ahead),
         interpolate(path.xy[lower, 1], path.xy[upper, 1], span, ahead),
@@ -224,12 +161,14 @@ def project(path: Path, x: float, y: float, guess: int) -> tuple[float, float, i
     bound = least + SLACK
     best, found, run_found = np.inf, 0.0, guess
     for run in range(num_runs):
-        if run == guess:
-            distance, progress = least, along
-        elif is_run_within(path.runs, run, x, y, min(bound, best + SLACK)):
+        distance, progress = least, along
+        if run != guess:
+            dx = max(path.runs[run, 0] - x, 0.0, x - path.runs[run, 2])
+            dy = max(path.runs[run, 1] - y, 0.0, y - path.runs[run, 3])
+            reach = min(bound, best + SLACK)
+            if dx * dx + dy * dy > reach * reach:
+                continue
             distance, progress = _project_on_run(path, run, x, y)
-        else:
-            continue
         if distance < best:
             best, found, run_found = distance, progress, run
     return found, best, run_found
@@ -259,107 +198,3 @@ def window(path: Path, low: float, high: float) -> tuple[int, int]:
     first = int(np.searchsorted(path.progress, min(max(low, 0.0), end)))
     last = int(np.searchsorted(path.progress, min(max(high, 0.0), end), side="right"))
     return first, max(first, last)
-
-
-class Stretch(NamedTuple):
-    """A stretch of a polyline and the half width of its corridor."""
-
-    xy: FloatArray  # (K, 2) vertices of the whole polyline [m]
-    runs: FloatArray  # bounds of its runs, as in `Path`
-    begin: int  # first vertex of the stretch
-    end: int  # one past its last vertex
-    half_width: float  # radius of the buffer around it [m]
-
-
-@kernel
-def without_repeats(xy: FloatArray, begin: int, end: int) -> tuple[int, int]:
-    """Vertices `begin` … `end` - 1 without repeats at their ends; one if all are the same."""
-    while end - begin > 1 and xy[begin, 0] == xy[begin + 1, 0] and xy[begin, 1] == xy[begin + 1, 1]:
-        begin += 1
-    while end - begin > 1 and xy[end - 1, 0] == xy[end - 2, 0] and xy[end - 1, 1] == xy[end - 2, 1]:
-        end -= 1
-    return begin, end
-
-
-@kernel
-def side_of(stretch: Stretch, ring: FloatArray) -> int:
-    """CLEAR, HIT or OPEN: whether a ring (V, 2) touches the corridor of a stretch.
-
-    The stretch ends `without_repeats`; OPEN where it has a single vertex.
-    """
-    xy, begin, end = stretch.xy, stretch.begin, stretch.end
-    if end - begin < 2:
-        return OPEN
-    inner, outer = (1.0 - BAND) * stretch.half_width, (1.0 + BAND) * stretch.half_width
-    bounds = ring_bounds(ring)
-    nearest, starts_outside = np.inf, False
-    for run in range(begin // RUN, (end - 2) // RUN + 1):
-        if not is_run_near(stretch.runs, run, bounds, outer):
-            starts_outside = False
-            continue
-        for index in range(max(begin, run * RUN), min(end - 1, (run + 1) * RUN)):
-            distance = ring_segment_distance(ring, xy[index], xy[index + 1], outer, starts_outside)
-            nearest, starts_outside = min(nearest, distance), True
-            if nearest <= inner:
-                return HIT
-    first = side_of_cap(xy[begin + 1], xy[begin], stretch.half_width, ring, bounds)
-    last = side_of_cap(xy[end - 2], xy[end - 1], stretch.half_width, ring, bounds)
-    if first == HIT or last == HIT:
-        return HIT
-    return CLEAR if first == last == CLEAR and nearest > outer else OPEN
-
-
-@kernel
-def is_run_near(
-    runs: FloatArray, run: int, bounds: tuple[float, float, float, float], reach: float
-) -> bool:
-    """Whether a run and what lies in `bounds` may come within `reach` [m] of one another."""
-    return (
-        runs[run, 0] <= bounds[2] + reach
-        and runs[run, 1] <= bounds[3] + reach
-        and runs[run, 2] >= bounds[0] - reach
-        and runs[run, 3] >= bounds[1] - reach
-    )
-
-
-@kernel
-def side_of_cap(
-    a: FloatArray,
-    b: FloatArray,
-    half_width: float,
-    ring: FloatArray,
-    bounds: tuple[float, float, float, float],
-) -> int:
-    """As `side_of`, for the end of the corridor: beyond b it goes on straight by half a width.
-
-    Before b (2,) comes a (2,); `bounds` are those of the ring.
-    """
-    inner, outer = (1.0 - BAND) * half_width, (1.0 + BAND) * half_width
-    reach = 2.0 * outer  # more than to the corners
-    if not (
-        bounds[0] - reach <= b[0] <= bounds[2] + reach
-        and bounds[1] - reach <= b[1] <= bounds[3] + reach
-    ):
-        return CLEAR
-    if _touches_cap(a, b, inner, ring):
-        return HIT
-    return OPEN if _touches_cap(a, b, outer, ring) else CLEAR
-
-
-@kernel
-def _touches_cap(a: FloatArray, b: FloatArray, reach: float, ring: FloatArray) -> bool:
-    """Whether a ring touches the end of the corridor beyond the segment a-b, `reach` long [m]."""
-    length = np.hypot(b[0] - a[0], b[1] - a[1])
-    along_x, along_y = reach * (b[0] - a[0]) / length, reach * (b[1] - a[1]) / length
-    cap = np.empty((4, 2))
-    for corner in range(4):
-        ahead = 1.0 if corner == 0 or corner == 3 else 0.0
-        left = 1.0 if corner < 2 else -1.0
-        cap[corner, 0] = b[0] + ahead * along_x - left * along_y
-        cap[corner, 1] = b[1] + ahead * along_y + left * along_x
-    return rings_touch(cap, ring)
-
-
-def corridor_polygon(line: shapely.LineString, half_width: float) -> shapely.Polygon:
-    """The corridor of a line as nuPlan makes it."""
-    return line.buffer(half_width, quad_segs=_QUARTER_SEGMENTS, cap_style="square")

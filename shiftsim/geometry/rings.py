@@ -36,14 +36,21 @@ def orientation(ax: float, ay: float, bx: float, by: float, cx: float, cy: float
 @kernel
 def _exact_orientation(ax: float, ay: float, bx: float, by: float, cx: float, cy: float) -> int:
     # det = (ax by - ay bx) + (bx cy - by cx) + (cx ay - cy ax), each product exact
-    expansion = np.zeros(12)
-    size = 0
-    size = _add_product(expansion, size, ax, by)
-    size = _add_product(expansion, size, -ay, bx)
-    size = _add_product(expansion, size, bx, cy)
-    size = _add_product(expansion, size, -by, cx)
-    size = _add_product(expansion, size, cx, ay)
-    size = _add_product(expansion, size, -cy, ax)
+    expansion, size = np.zeros(12), 0
+    for p, q in ((ax, by), (-ay, bx), (bx, cy), (-by, cx), (cx, ay), (-cy, ax)):
+        high, p_big, q_big = p * q, _SPLITTER * p, _SPLITTER * q
+        p_high, q_high = p_big - (p_big - p), q_big - (q_big - q)
+        p_low, q_low = p - p_high, q - q_high
+        low = p_low * q_low - (((high - p_high * q_high) - p_low * q_high) - p_high * q_low)
+        for carry in (low, high):
+            for index in range(size):
+                other = expansion[index]
+                total = carry + other
+                virtual = total - carry
+                expansion[index] = (carry - (total - virtual)) + (other - virtual)
+                carry = total
+            expansion[size] = carry
+            size += 1
     # components do not overlap and grow in magnitude: the last non-zero one has the sign
     for index in range(size - 1, -1, -1):
         if expansion[index] > 0.0:
@@ -54,35 +61,8 @@ def _exact_orientation(ax: float, ay: float, bx: float, by: float, cx: float, cy
 
 
 @kernel
-def _add_product(expansion: FloatArray, size: int, a: float, b: float) -> int:
-    high = a * b
-    a_big = _SPLITTER * a
-    a_high = a_big - (a_big - a)
-    a_low = a - a_high
-    b_big = _SPLITTER * b
-    b_high = b_big - (b_big - b)
-    b_low = b - b_high
-    low = a_low * b_low - (((high - a_high * b_high) - a_low * b_high) - a_high * b_low)
-    size = _grow(expansion, size, low)
-    return _grow(expansion, size, high)
-
-
-@kernel
-def _grow(expansion: FloatArray, size: int, value: float) -> int:
-    carry = value
-    for index in range(size):
-        other = expansion[index]
-        total = carry + other
-        virtual = total - carry
-        expansion[index] = (carry - (total - virtual)) + (other - virtual)
-        carry = total
-    expansion[size] = carry
-    return size + 1
-
-
-@kernel
 def _separated_by_edges(a: FloatArray, b: FloatArray) -> bool:
-    count = len(a)
+    count, outside = len(a), False
     for index in range(count):
         ax, ay = a[index, 0], a[index, 1]
         after = index + 1 if index + 1 < count else 0
@@ -95,8 +75,8 @@ def _separated_by_edges(a: FloatArray, b: FloatArray) -> bool:
                 outside = False
                 break
         if outside:
-            return True
-    return False
+            break
+    return outside
 
 
 @kernel
@@ -149,26 +129,26 @@ def ray_crossings(
 
     The chain goes from the vertex `before` (of a whole ring the last one) to `start` … `stop` - 1.
     """
-    parity = False
+    parity = on_edge = False
     px, py = xy[before, 0], xy[before, 1]
     for index in range(start, stop):
         qx, qy = xy[index, 0], xy[index, 1]
         if qx == x and qy == y:
-            return False, True
-        if py == y and qy == y:
-            if min(px, qx) <= x <= max(px, qx):
-                return False, True
+            on_edge = True
+        elif py == y and qy == y:
+            on_edge = min(px, qx) <= x <= max(px, qx)
         elif (py > y) != (qy > y) and (px >= x or qx >= x):
             if px > x and qx > x:
                 parity = not parity
             else:
                 side = orientation(px, py, qx, qy, x, y)
-                if side == 0:
-                    return False, True
+                on_edge = side == 0
                 if (side > 0) == (qy > py):
                     parity = not parity
+        if on_edge:
+            break  # a single return: numba then needs no count of references
         px, py = qx, qy
-    return parity, False
+    return parity and not on_edge, on_edge
 
 
 @kernel
@@ -228,19 +208,6 @@ def polygon_distance(
 
 
 @kernel
-def _geos_distance(x: float, y: float, ax: float, ay: float, bx: float, by: float) -> float:
-    """As `point_segment_distance`, rounded as the library under shapely does it."""
-    dx, dy = bx - ax, by - ay
-    square = dx * dx + dy * dy
-    along = ((x - ax) * dx + (y - ay) * dy) / square  # NaN where a is b
-    if along >= 1.0:
-        return np.sqrt((x - bx) * (x - bx) + (y - by) * (y - by))
-    if along > 0.0:
-        return abs(((ay - y) * dx - (ax - x) * dy) / square) * np.sqrt(square)
-    return np.sqrt((x - ax) * (x - ax) + (y - ay) * (y - ay))
-
-
-@kernel
 def boundary_distance_below(
     xy: FloatArray, start: int, stop: int, x: float, y: float, limit: float
 ) -> float:
@@ -261,9 +228,17 @@ def boundary_distance_below(
             and max(ay, by) > -reach
         ):
             before = index - 1 if index > start else stop - 1
-            best = min(
-                best, _geos_distance(x, y, xy[before, 0], xy[before, 1], xy[index, 0], xy[index, 1])
-            )
+            px, py, qx, qy = xy[before, 0], xy[before, 1], xy[index, 0], xy[index, 1]
+            dx, dy = qx - px, qy - py
+            square = dx * dx + dy * dy
+            along = ((x - px) * dx + (y - py) * dy) / square  # NaN where both are one point
+            if along >= 1.0:
+                distance = np.sqrt((x - qx) * (x - qx) + (y - qy) * (y - qy))
+            elif along > 0.0:
+                distance = abs(((py - y) * dx - (px - x) * dy) / square) * np.sqrt(square)
+            else:
+                distance = np.sqrt((x - px) * (x - px) + (y - py) * (y - py))
+            best = min(best, distance)
         ax, ay = bx, by
     return best
 
@@ -289,8 +264,9 @@ def rings_touch(a: FloatArray, b: FloatArray) -> bool:
             or max(b[before, 1], b[j, 1]) < low_y
             or min(b[before, 1], b[j, 1]) > high_y
         ):
+            px, py, qx, qy = b[before, 0], b[before, 1], b[j, 0], b[j, 1]
             for i in range(len(a)):
-                if segments_intersect(a[i - 1], a[i], b[before], b[j]):
+                if segments_meet(a[i - 1, 0], a[i - 1, 1], a[i, 0], a[i, 1], px, py, qx, qy):
                     return True
         before = j
     return False
@@ -317,17 +293,17 @@ def ring_distance(a: FloatArray, b: FloatArray) -> float:
     best = np.inf
     before = len(b) - 1
     for j in range(len(b)):
-        c, d = b[before], b[j]
+        cx, cy, dx, dy = b[before, 0], b[before, 1], b[j, 0], b[j, 1]
         if not (
-            max(c[0], d[0]) < low_x - reach
-            or min(c[0], d[0]) > high_x + reach
-            or max(c[1], d[1]) < low_y - reach
-            or min(c[1], d[1]) > high_y + reach
+            max(cx, dx) < low_x - reach
+            or min(cx, dx) > high_x + reach
+            or max(cy, dy) < low_y - reach
+            or min(cy, dy) > high_y + reach
         ):
             for i in range(len(a)):
-                p, q = a[i - 1], a[i]
-                best = min(best, point_segment_distance(q[0], q[1], c[0], c[1], d[0], d[1]))
-                best = min(best, point_segment_distance(d[0], d[1], p[0], p[1], q[0], q[1]))
+                px, py, qx, qy = a[i - 1, 0], a[i - 1, 1], a[i, 0], a[i, 1]
+                best = min(best, point_segment_distance(qx, qy, cx, cy, dx, dy))
+                best = min(best, point_segment_distance(dx, dy, px, py, qx, qy))
             reach = min(reach, best + SLACK)
         before = j
     return best
@@ -341,38 +317,6 @@ def distance_bound(a: FloatArray, b: FloatArray) -> float:
         dx, dy = b[j, 0] - a[0, 0], b[j, 1] - a[0, 1]
         square = min(square, dx * dx + dy * dy)
     return np.sqrt(square) + SLACK
-
-
-@kernel
-def ring_segment_distance(
-    ring: FloatArray, a: FloatArray, b: FloatArray, limit: float, starts_outside: bool
-) -> float:
-    """Distance between the area of a simple ring (V, 2) and the segment a-b, points (2,) [m].
-
-    Infinite where it is more than `limit`. `starts_outside` where a is known to be outside.
-    """
-    if not starts_outside and locate_in_ring(ring, a[0], a[1]) != EXTERIOR:
-        return 0.0
-    low_x, high_x = min(a[0], b[0]) - limit, max(a[0], b[0]) + limit
-    low_y, high_y = min(a[1], b[1]) - limit, max(a[1], b[1]) + limit
-    best = np.inf
-    before = len(ring) - 1
-    for index in range(len(ring)):
-        c, d = ring[before], ring[index]
-        before = index
-        if (
-            max(c[0], d[0]) < low_x
-            or min(c[0], d[0]) > high_x
-            or max(c[1], d[1]) < low_y
-            or min(c[1], d[1]) > high_y
-        ):
-            continue
-        if segments_intersect(a, b, c, d):
-            return 0.0
-        best = min(best, point_segment_distance(a[0], a[1], c[0], c[1], d[0], d[1]))
-        best = min(best, point_segment_distance(b[0], b[1], c[0], c[1], d[0], d[1]))
-        best = min(best, point_segment_distance(d[0], d[1], a[0], a[1], b[0], b[1]))
-    return best if best <= limit else np.inf
 
 
 @kernel

@@ -1,23 +1,50 @@
-"""All tables and pictures of some runs, and the folder they are written to."""
+"""All tables and pictures of some runs, what they are of, and the folder they are written to."""
 
 import base64
 import html
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 from shiftsim.errors import ConfigError, one_of
 from shiftsim.files import write_text
-from shiftsim.report import data_tables, details, paper
-from shiftsim.report.about import CITED, citation, made_of, runs_table
+from shiftsim.report import dataset, details, paper
 from shiftsim.report.figures import Figure
-from shiftsim.report.groups import Group, is_stand_in, made_up_note, weights_note
-from shiftsim.report.published import Published
+from shiftsim.report.groups import (
+    Group,
+    has_default_weights,
+    planner_identities,
+    synthetic_weights_note,
+    weights_note,
+)
+from shiftsim.report.paper import Published
 from shiftsim.report.scores import scores
-from shiftsim.report.tables import Table
-from shiftsim.report.writers import ENDINGS, latex_picture, markdown_escape, render
+from shiftsim.report.tables import ENDINGS, Table, latex_picture, markdown_escape, render
 from shiftsim.runs.results import Run
+
+_HASH = 12  # characters shown of a hash
+_PACKAGES = ("python", "numpy", "numba", "torch")
+CITED = "cite.bib"  # the file with the citation
+_CITATION = """@misc{{shiftsim,
+  author = {{{{shiftsim developers}}}},
+  title = {{shiftsim: closed-loop evaluation of driving planners}},
+  year = {{{year}}},
+  note = {{version {version}}}
+}}
+@misc{{shiftdrift,
+  author = {{Canevaro and others}},
+  title = {{Shift \\& Drift: A Zero-Shot Benchmark for Generalizable and Robust Autonomous Driving
+    Motion Planning}}
+}}
+@misc{{nuplan,
+  author = {{Caesar, Holger and Kabzan, Juraj and Tan, Kok Seang and Fong, Whye Kit and Wolff, Eric
+    and Lang, Alex and Fletcher, Luke and Beijbom, Oscar and Omari, Sammy}},
+  title = {{{{nuPlan}}: A closed-loop {{ML}}-based planning benchmark for autonomous vehicles}},
+  year = {{2021}},
+  eprint = {{2106.11810}},
+  archiveprefix = {{arXiv}}
+}}"""
 
 # the kinds of tables: names up to the first "_"
 TABLES = (
@@ -33,7 +60,7 @@ TABLES = (
     "benchmark-comparison",
     "runs",
 )
-_ASK = "the run must say --checkpoint PLANNER=shiftsim"
+_ASK_FOR_WEIGHTS = "the run must say --checkpoint PLANNER=shiftsim"
 _ABOUT_DATA = ("data-statistics", "benchmark-comparison", "runs")
 _LONG = ("planner-comparison-noise", *_ABOUT_DATA)
 BRIEF = tuple(name for name in TABLES if name not in _LONG)  # what a terminal shows
@@ -45,7 +72,7 @@ class Options:
 
     tables: tuple[str, ...] = TABLES  # kinds of tables, of `TABLES`
     by: str | None = None  # splits the rows of the score table further
-    beside: bool = False  # show the published figures as well
+    with_published: bool = False  # show the published figures as well
     allow_partial: bool = False  # show labelled means of incomplete groups
 
     def __post_init__(self) -> None:
@@ -65,33 +92,41 @@ def make_tables(
     """
     chosen = options or Options()
     partial = chosen.allow_partial
-    left_out = [group for group in groups if chosen.beside and is_stand_in(group)]
+    left_out = [group for group in groups if chosen.with_published and has_default_weights(group)]
     groups = [group for group in groups if group not in left_out]
-    stand_ins = weights_note(group.run for group in left_out)
+    default_weights = weights_note(group.run for group in left_out)
     if left_out and not groups:
-        raise ConfigError(f"nothing to show beside published figures: {stand_ins}", hint=_ASK)
-    beside = published if chosen.beside else None
-    statistics = cache(lambda: data_tables.own_statistics(groups))
+        raise ConfigError(
+            f"nothing to show beside published figures: {default_weights}", hint=_ASK_FOR_WEIGHTS
+        )
+    shown_published = published if chosen.with_published else None
+    statistics = cache(lambda: dataset.own_statistics(groups))
     edited = {group.data.label for group in groups if group.data.edits}
     runs = list({group.run.path: group.run for group in groups}.values())
     makers: dict[str, Callable[[], Sequence[Table | None]]] = {
         "semantic-shift": lambda: paper.semantic_shift(
-            groups, published, beside=chosen.beside, allow_partial=partial
+            groups, published, with_published=chosen.with_published, allow_partial=partial
         ),
-        "noise-robustness": lambda: [paper.noise_robustness(groups, beside, allow_partial=partial)],
+        "noise-robustness": lambda: [
+            paper.noise_robustness(groups, shown_published, allow_partial=partial)
+        ],
         "edits": lambda: details.edited_scores(groups, allow_partial=partial),
         "planner-comparison": lambda: [details.planner_comparison(groups)],
         "planner-comparison-noise": lambda: [details.planner_comparison(groups, noisy=True)],
         "scenario-types": lambda: details.scenario_types(groups, allow_partial=partial),
         "scores": lambda: [scores(groups, by=chosen.by, allow_partial=partial)],
         "planning-time": lambda: [details.planning_times(groups)],
-        "data-statistics": lambda: [data_tables.data_statistics(statistics())],
+        "data-statistics": lambda: [dataset.data_statistics(statistics())],
         "benchmark-comparison": lambda: (
-            [data_tables.benchmark_comparison(published, statistics(), edited)] if published else []
+            [dataset.benchmark_comparison(published, statistics(), edited)] if published else []
         ),
         "runs": lambda: [runs_table(runs)],
     }
-    notes = [made_up_note(runs), weights_note(runs), stand_ins and f"left out: {stand_ins}; {_ASK}"]
+    notes = [
+        synthetic_weights_note(runs),
+        weights_note(runs),
+        default_weights and f"left out: {default_weights}; {_ASK_FOR_WEIGHTS}",
+    ]
     out: list[Table] = []
     for name in (name for name in TABLES if name in chosen.tables):
         for table in filter(None, makers[name]()):
@@ -132,17 +167,19 @@ def write_report(
             texts |= {f"{t.name}.csv": part for t, part in zip(tables, parts, strict=True)}
             continue
         if style == "html":
-            parts = [_page(title, report_html(runs, tables, _embedded(pictures)))]
+            coded = {path: base64.b64encode(path.read_bytes()).decode() for path in pictures}
+            images = {f"data:image/png;base64,{coded[p]}": t for p, t in pictures.items()}
+            parts = [_page(title, report_html(runs, tables, images))]
         elif style == "md":
-            images = [f"![{markdown_escape(t)}]({path.name})" for path, t in pictures.items()]
+            shown = [f"![{markdown_escape(t)}]({path.name})" for path, t in pictures.items()]
             head = [f"# {markdown_escape(title)}", markdown_escape(subtitle)]
-            parts = [*head, *parts, *images, f"```bibtex\n{cite}\n```"]
+            parts = [*head, *parts, *shown, f"```bibtex\n{cite}\n```"]
         elif style == "latex":
             files = {figure.save(folder, "pdf"): figure.title for figure in drawn}
             out += files
             texts[CITED] = cite
-            images = [latex_picture(path.name, t) for path, t in files.items()]
-            parts = [f"% {title}\n% {subtitle}\n% cite from {CITED}", *parts, *images]
+            shown = [latex_picture(path.name, t) for path, t in files.items()]
+            parts = [f"% {title}\n% {subtitle}\n% cite from {CITED}", *parts, *shown]
         else:
             parts = [f"{title}\n{subtitle}", *parts, cite]
         texts[f"report.{ENDINGS[style]}"] = "\n\n".join(parts)
@@ -182,12 +219,6 @@ def report_html(runs: Sequence[Run], tables: Sequence[Table], images: Mapping[st
     return "\n".join([STYLE, *parts])
 
 
-def _embedded(pictures: Mapping[Path, str]) -> dict[str, str]:
-    """Titles by addresses that hold the pictures themselves."""
-    coded = {path: base64.b64encode(path.read_bytes()).decode() for path in pictures}
-    return {f"data:image/png;base64,{coded[path]}": title for path, title in pictures.items()}
-
-
 def _page(title: str, body: str) -> str:
     """One HTML file."""
     words = html.escape(title)
@@ -201,3 +232,77 @@ body {{ font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 75r
 <h1>{words}</h1>
 {body}
 </body></html>"""
+
+
+def citation(runs: Sequence[Run]) -> str:
+    """BibTeX entries: shiftsim in the version of the runs, the benchmark's paper, nuPlan."""
+    years = [_date(run)[:4] for run in runs]
+    versions = dict.fromkeys(map(_version, runs))
+    return _CITATION.format(year=max(years), version=", ".join(filter(None, versions)))
+
+
+def made_of(runs: Sequence[Run]) -> str:
+    """Runs, when they ended, and by which version of shiftsim, in one line."""
+    dates = sorted(filter(None, map(_date, runs)))
+    span = " to ".join(dict.fromkeys((*dates[:1], *dates[-1:])))
+    versions = ", ".join(dict.fromkeys(filter(None, map(_version, runs))))
+    names = ", ".join(run.path.name for run in runs)
+    return " · ".join(filter(None, (f"runs: {names}", span, versions and f"shiftsim {versions}")))
+
+
+def runs_table(runs: Sequence[Run]) -> Table:
+    """A column per run: date, data with its hash, settings, weights, versions."""
+    facts: dict[str, Callable[[Run], str]] = {
+        "date": _date,
+        "rollouts finished": lambda run: "{ok} of {expected}".format(**run.manifest["counts"]),
+        "scenarios": lambda run: f"split {run.manifest['split']}",
+        "store": _store,
+        "traffic": lambda run: run.manifest["determining"]["traffic"],
+        "controller": lambda run: run.manifest["determining"]["controller"],
+        "thresholds": lambda run: run.manifest["determining"]["thresholds"]["name"],
+        "metrics": lambda run: f"v{run.manifest['determining']['metric_version']}",
+        "planners": lambda run: ", ".join(run.manifest["config"]["planners"]),
+        "weights": _weights,
+        "noise": lambda run: ", ".join(run.manifest["config"]["noise"]),
+        "seeds": lambda run: ", ".join(map(str, run.manifest["config"]["seeds"])),
+        "shiftsim": _version,
+        **{name: partial(_package, name=name) for name in _PACKAGES},
+    }
+    lines = ((name, *(fact(run) for run in runs)) for name, fact in facts.items())
+    rows = tuple(line for line in lines if any(line[1:]))
+    header = ("run", *(run.path.name for run in runs))
+    return Table("runs", "The runs", header, rows, len(header))
+
+
+def _date(run: Run) -> str:
+    """When a run ended, to the minute, in UTC."""
+    ended = str(run.manifest.get("ended") or run.manifest.get("started", ""))
+    return f"{ended[:16].replace('T', ' ')} UTC" if ended else ""
+
+
+def _version(run: Run) -> str:
+    version, commit = _package(run, name="shiftsim"), run.manifest.get("git")
+    return f"{version} ({commit})" if commit else version
+
+
+def _package(run: Run, *, name: str) -> str:
+    return str(run.manifest.get("versions", {}).get(name, ""))
+
+
+def _store(run: Run) -> str:
+    name = str(run.manifest["store"]).replace("\\", "/").rstrip("/").rpartition("/")[2]
+    return f"{name}, {_short(run.manifest['determining']['store'])}"
+
+
+def _short(text: str) -> str:
+    """The beginning of a hash; other text as it is."""
+    return text if ":" in text else text[:_HASH]
+
+
+def _weights(run: Run) -> str:
+    """What learned planners drove with: the label of the weights, or their hash."""
+    found = {
+        name: str(identity.get("weights") or _short(str(identity.get("checkpoint", ""))))
+        for name, identity in planner_identities(run).items()
+    }
+    return "; ".join(f"{name}: {words}" for name, words in found.items() if words)

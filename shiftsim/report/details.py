@@ -6,13 +6,13 @@ from itertools import combinations
 import numpy as np
 import pyarrow.compute as pc
 
+from shiftsim.edits.sampling import GRADES, graded
 from shiftsim.kernels import BoolArray, FloatArray
 from shiftsim.report.groups import Group, distinct_sets
 from shiftsim.report.paper import traffics
 from shiftsim.report.statistics import FEW_CLUSTERS, cluster_codes, compare, holm
 from shiftsim.report.tables import Cell, Estimate, Number, Table
 from shiftsim.runs.results import Run
-from shiftsim.world.edits.sampling import GRADES, graded
 
 ALL_KINDS = "all"
 

@@ -3,16 +3,14 @@
 from collections.abc import Sequence
 from typing import Any
 
-import pyarrow as pa
 import pyarrow.compute as pc
 
 from shiftsim.errors import ConfigError, beginning
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES, WEIGHTS
 from shiftsim.metrics.interplan import LANES, SORTS, role_of
-from shiftsim.report.words import COLLISIONS, REASONS, UNITS, in_words
-from shiftsim.runs.edits.edited import edit_words
+from shiftsim.report.words import COLLISIONS, REASONS, UNITS, in_words, rows_by_task, task_of
+from shiftsim.runs.edited import edit_words
 from shiftsim.runs.results import Run
-from shiftsim.runs.rollouts import Task
 
 _HAS = ("planners", "noise", "seeds")
 
@@ -40,7 +38,7 @@ def select_tasks(
     wanted = {"planner": planner, "noise": noise, "seed": seed}
     rows = [
         row
-        for row in _rows_of(run.tasks, full)
+        for row in run.tasks.filter(pc.equal(run.tasks["token"], full)).to_pylist()
         if all(value is None or row[name] == value for name, value in wanted.items())
     ]
     if not rows:
@@ -52,18 +50,18 @@ def select_tasks(
             f"run {run.path.name!r} has no task with {given}",
             hint="; ".join(f"{n}: {', '.join(map(str, config[n]))}" for n in _HAS),
         )
-    scores = {_key(row): row["cls"] for row in _rows_of(run.scores, full)}
-    metrics: dict[Task, list[dict[str, Any]]] = {}
-    for row in _rows_of(run.metrics, full):
-        metrics.setdefault(_key(row), []).append(row)
-    for listed in metrics.values():
-        _add_roles(listed)
+    scores, metrics = (
+        rows_by_task(table.filter(pc.equal(table["token"], full)))
+        for table in (run.scores, run.metrics)
+    )
     out, edits = [], edit_words(run.manifest, full)
     for row in rows:
-        known = sorted(metrics.get(_key(row), []), key=_place)
-        cls = scores.get(_key(row))
-        found = {"cls": cls, "why": why(cls, known), "edits": edits, "metrics": known}
-        out.append({**row, **found})
+        task = task_of(row)
+        cls = scores[task][0]["cls"] if task in scores else None
+        listed = metrics.get(task, [])
+        _add_roles(listed)
+        listed.sort(key=_place)
+        out.append(row | {"cls": cls, "why": why(cls, listed), "edits": edits, "metrics": listed})
     return out
 
 
@@ -106,11 +104,6 @@ def explain_tasks(
     return found
 
 
-def _rows_of(table: pa.Table, token: str) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = table.filter(pc.equal(table["token"], token)).to_pylist()
-    return rows
-
-
 def why(cls: float | None, metrics: list[dict[str, Any]]) -> str:
     """A score in one line: what made it 0, or how it is composed; empty for a failed task."""
     if cls is None:
@@ -120,7 +113,11 @@ def why(cls: float | None, metrics: list[dict[str, Any]]) -> str:
     parts = [row for row in scored if row["role"] == "weighted"]
     zero = [row for row in factors if row["score"] == 0.0]
     if zero:
-        causes = (f"{_cause(row['metric'])}{_first_violation(row)}" for row in zero)
+        causes = []
+        for row in zero:
+            is_dated = row["first_violation_iteration"] is not None
+            time = f" at {row['first_violation_s']:.1f} s{_partner(row)}" if is_dated else ""
+            causes.append(f"{in_words(row['metric'], REASONS)}{time}")
         return f"score 0 because of {' and '.join(causes)}"
     if cls == 0.0:
         return "score 0 because every weighted metric is 0"
@@ -130,24 +127,8 @@ def why(cls: float | None, metrics: list[dict[str, Any]]) -> str:
     return f"{cls:.4f} = {product} × ({terms}) / {total:g}"
 
 
-def _cause(metric: str) -> str:
-    """What went wrong, as "at-fault collision (NCR)"."""
-    reason = REASONS.get(metric, metric)
-    return f"{reason} ({SHORT_NAMES[metric]})" if metric in SHORT_NAMES else reason
-
-
-def _first_violation(row: dict[str, Any]) -> str:
-    if row["first_violation_iteration"] is None:
-        return ""
-    return f" at {row['first_violation_s']:.1f} s{_partner(row)}"
-
-
 def _partner(row: dict[str, Any]) -> str:
     return f", track {row['partner_token']}" if row["partner_token"] else ""
-
-
-def _key(row: dict[str, Any]) -> Task:
-    return Task(*(row[name] for name in Task._fields))
 
 
 def explain_lines(task: dict[str, Any]) -> list[str]:

@@ -7,6 +7,7 @@ those under noise hollow marks on dashed lines. Nothing is drawn of groups whose
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from textwrap import wrap
 from types import MappingProxyType
@@ -14,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from shiftsim.edits.sampling import GRADES, graded
 from shiftsim.kernels import BoolArray
 from shiftsim.report.details import recorded_score
 from shiftsim.report.groups import COLUMNS, DataSet, Group, distinct_sets
@@ -22,7 +24,6 @@ from shiftsim.report.paper import traffics
 from shiftsim.report.statistics import score_interval
 from shiftsim.report.tables import Estimate
 from shiftsim.report.words import LONG
-from shiftsim.world.edits.sampling import GRADES, graded
 
 LEVELS = ("none", "low", "mid", "high")
 _KINDS = {"awgn": "white noise (AWGN)", "ou": "correlated noise (OU)"}
@@ -82,16 +83,14 @@ def figures(groups: Sequence[Group], *, allow_partial: bool = False) -> list[Fig
             _finish(drawn, data, "Score per city", note)
             out.append(Figure(f"cities_{data.name}", f"Score per city of {data.label}", drawn))
         if clean:
-            places = [_Place(_heading(short), name) for name, short in COLUMNS.items()]
+            places = [
+                _Place("\n".join([*wrap(LONG[short], 12), f"({short})"]), name)
+                for name, short in COLUMNS.items()
+            ]
             drawn = _dots(clean, places, styles, allow_partial)
             _finish(drawn, data, "Metrics", _BARS)
             out.append(Figure(f"metrics_{data.name}", f"Metrics on {data.label}", drawn))
     return out
-
-
-def _heading(short: str) -> str:
-    """A metric in words, with its abbreviation, on lines of their own."""
-    return "\n".join([*wrap(LONG[short], 12), f"({short})"])
 
 
 def _named_apart(sets: Sequence[DataSet]) -> list[DataSet]:
@@ -114,30 +113,44 @@ def _estimate(
 def _robustness(
     data: DataSet, groups: Sequence[Group], styles: dict[str, Style], allow_partial: bool
 ) -> list[Figure]:
+    """Scores by strength of the noise, a panel for each of its models; none where all is clean."""
     kinds = [kind for kind in _KINDS if any(g.noise.startswith(f"{kind}-") for g in groups)]
-    modes = traffics(groups)
     if not kinds:
         return []
-    figure, panels = _panels(len(modes), len(kinds), (4.1, 3.3))
+    figure, panels = _panels(traffics(groups), kinds, (4.1, 3.3))
     planners = list(dict.fromkeys(group.planner for group in groups))
-    for row, traffic in enumerate(modes):
-        for column, kind in enumerate(kinds):
-            axes = panels[row][column]
-            for place, planner in enumerate(planners):
-                found = {
-                    group.noise: _estimate(group, allow_partial)
-                    for group in groups
-                    if (group.traffic, group.planner) == (traffic, planner)
-                }
-                shift = 0.02 * (place - len(planners) / 2)
-                _curve(axes, planner, found, kind, shift, styles[planner])
-            axes.set_xticks(range(len(LEVELS)), LEVELS)
-            axes.set_xlabel("strength of the noise", fontsize=8)
-            axes.set_title(f"{_KINDS[kind]}, {_TRAFFIC.get(traffic, traffic)}", fontsize=9)
-            _score_axis(axes)
+    for axes, traffic, kind in panels:
+        names = ["none", *(f"{kind}-{level}" for level in LEVELS[1:])]
+        for place, planner in enumerate(planners):
+            found = {
+                group.noise: _estimate(group, allow_partial)
+                for group in groups
+                if (group.traffic, group.planner) == (traffic, planner)
+            }
+            cells = {i: cell for i, name in enumerate(names) if (cell := found.get(name))}
+            if cells:
+                is_partial = any(cell and cell.label for cell in found.values())
+                label = f"{planner} (partial)" if is_partial else planner
+                # shifted a little, so that error bars do not cover those of others
+                _curve(axes, label, cells, 0.02 * (place - len(planners) / 2), styles[planner])
+        axes.set_xticks(range(len(LEVELS)), LEVELS)
+        axes.set_xlabel("strength of the noise", fontsize=8)
+        _finish_axes(axes, f"{_KINDS[kind]}, {_TRAFFIC.get(traffic, traffic)}")
     note = "error bars: standard deviation over seeds; thin line: the clean score"
     _finish(figure, data, "Noise robustness", note, {"clean": "none", "under noise": "some"})
     return [Figure(f"robustness_{data.name}", f"Noise robustness on {data.label}", figure)]
+
+
+def _curve(axes: Any, label: str, cells: dict[int, Estimate], shift: float, style: Style) -> None:
+    """One planner's scores by level."""
+    means = [cell.mean for cell in cells.values()]
+    look = {**style.marks("some"), "linestyle": dashes("some"), "linewidth": 1.3, "capsize": 2}
+    bars = [cell.std or 0.0 for cell in cells.values()]
+    axes.errorbar([place + shift for place in cells], means, yerr=bars, **look)
+    clean = means[0] if 0 in cells else math.nan
+    if 0 in cells:
+        axes.axhline(clean, linewidth=0.8, alpha=0.35, color=style.colour, zorder=1)
+    axes.plot([shift], [clean], label=label, linestyle="none", zorder=4, **style.marks("none"))
 
 
 def _difficulty(
@@ -149,30 +162,26 @@ def _difficulty(
 ) -> Figure:
     """Scores by difficulty, a panel for each kind of edit."""
     found = [graded(name) for name in data.types]
-    kinds, modes = sorted({kind for kind, grade in found if grade}), traffics(clean)
-    figure, panels = _panels(len(modes), len(kinds), (3.4, 3.1))
+    kinds = sorted({kind for kind, grade in found if grade})
+    figure, panels = _panels(traffics(clean), kinds, (3.4, 3.1))
     planners = list(dict.fromkeys(group.planner for group in clean))
-    for row, traffic in enumerate(modes):
-        for column, kind in enumerate(kinds):
-            axes = panels[row][column]
-            for group in (group for group in clean if group.traffic == traffic):
-                shift = 0.06 * (planners.index(group.planner) - (len(planners) - 1) / 2)
-                cells = [recorded_score(group, np.array([k == kind for k, _ in found]), groups)]
-                parts = [np.array([pair == (kind, grade) for pair in found]) for grade in GRADES]
-                cells += [_estimate(group, allow_partial, "cls", where) for where in parts]
-                points = {i: cell.mean for i, cell in enumerate(cells) if cell is not None}
-                style = styles[group.planner]
-                look = {**style.marks("none"), "linestyle": dashes("none"), "linewidth": 1.3}
-                label = f"{group.planner}{'' if group.is_complete else ' (partial)'}"
-                axes.plot([x + shift for x in points], [*points.values()], label=label, **look)
-                for x, where in enumerate(parts, 1):
-                    if interval := score_interval(group, "cls", where):
-                        axes.vlines(x + shift, interval.low, interval.high, color=style.colour)
-            axes.set_xticks(range(1 + len(GRADES)), ["recorded", *GRADES])
-            axes.set_xlim(-0.35, len(GRADES) + 0.35)
-            axes.set_xlabel("difficulty of the edit", fontsize=8)
-            axes.set_title(f"{kind}, {_TRAFFIC.get(traffic, traffic)}", fontsize=9)
-            _score_axis(axes)
+    for axes, traffic, kind in panels:
+        parts = [np.array([pair == (kind, grade) for pair in found]) for grade in GRADES]
+        for group in (group for group in clean if group.traffic == traffic):
+            shift = 0.06 * (planners.index(group.planner) - (len(planners) - 1) / 2)
+            cells = [recorded_score(group, np.array([k == kind for k, _ in found]), groups)]
+            cells += [_estimate(group, allow_partial, "cls", where) for where in parts]
+            points = {i + shift: cell.mean for i, cell in enumerate(cells) if cell is not None}
+            style = styles[group.planner]
+            look = {**style.marks("none"), "linestyle": dashes("none"), "linewidth": 1.3}
+            axes.plot([*points], [*points.values()], label=_label(group), **look)
+            for x, where in enumerate(parts, 1):
+                if interval := score_interval(group, "cls", where):
+                    axes.vlines(x + shift, interval.low, interval.high, color=style.colour)
+        axes.set_xticks(range(1 + len(GRADES)), ["recorded", *GRADES])
+        axes.set_xlim(-0.35, len(GRADES) + 0.35)
+        axes.set_xlabel("difficulty of the edit", fontsize=8)
+        _finish_axes(axes, f"{kind}, {_TRAFFIC.get(traffic, traffic)}")
     note = (
         "recorded: the same scenarios without the edit; bars: 95 % bootstrap interval over "
         "recordings"
@@ -181,43 +190,16 @@ def _difficulty(
     return Figure(f"edits_{data.name}", f"Scores by difficulty of the edits: {data.label}", figure)
 
 
-def _curve(
-    axes: Any,
-    planner: str,
-    found: dict[str, Estimate | None],
-    kind: str,
-    shift: float,
-    style: Style,
-) -> None:
-    """One planner's scores by level; shifted a little, so that error bars do not cover others."""
-    names = ["none", *(f"{kind}-{level}" for level in LEVELS[1:])]
-    points = {i: cell for i, name in enumerate(names) if (cell := found.get(name)) is not None}
-    if not points:
-        return
-    means, errors = ([getattr(c, name) for c in points.values()] for name in ("mean", "std"))
-    bars = [error or 0.0 for error in errors]
-    look = {**style.marks("some"), "linestyle": dashes("some"), "linewidth": 1.3, "capsize": 2}
-    axes.errorbar([place + shift for place in points], means, yerr=bars, **look)
-    clean = means[0] if 0 in points else math.nan
-    if 0 in points:
-        axes.axhline(clean, linewidth=0.8, alpha=0.35, color=style.colour, zorder=1)
-    partial = any(cell and cell.label for cell in found.values())
-    label = f"{planner} (partial)" if partial else planner
-    axes.plot([shift], [clean], label=label, linestyle="none", zorder=4, **style.marks("none"))
-
-
 def _dots(
     groups: Sequence[Group], places: Sequence[_Place], styles: dict[str, Style], allow_partial: bool
 ) -> Any:
     """Planners side by side at every place, one panel per traffic mode."""
-    modes = traffics(groups)
     planners = list(dict.fromkeys(group.planner for group in groups))
-    figure, panels = _panels(len(modes), 1, (max(5.5, 1.05 * len(places)), 2.9))
-    for (axes,), traffic in zip(panels, modes, strict=True):
+    figure, panels = _panels(traffics(groups), [""], (max(5.5, 1.05 * len(places)), 2.9))
+    for axes, traffic, _ in panels:
         for group in (group for group in groups if group.traffic == traffic):
             style = {**styles[group.planner].marks("none"), "linestyle": "none"}
             shift = _SPREAD * ((planners.index(group.planner) + 0.5) / len(planners) - 0.5)
-            label: str | None = f"{group.planner}{'' if group.is_complete else ' (partial)'}"
             for x, place in enumerate(places):
                 estimate = _estimate(group, allow_partial, place.column, place.where)
                 interval = score_interval(group, place.column, place.where)
@@ -225,24 +207,34 @@ def _dots(
                     low, high = interval.low, interval.high
                     axes.vlines(x + shift, low, high, color=style["color"], linewidth=1.3)
                 if estimate is not None:
+                    label = None if x else _label(group)
                     axes.plot([x + shift], [estimate.mean], label=label, **style)
-                label = None
         for x in range(1, len(places)):
             axes.axvline(x - 0.5, color="0.9", linewidth=0.7, zorder=0)
         axes.set_xticks(range(len(places)), [place.heading for place in places])
         axes.set_xlim(-0.5, len(places) - 0.5)
-        axes.set_title(_TRAFFIC.get(traffic, traffic), fontsize=9)
         several = len({place.column for place in places}) > 1
-        _score_axis(axes, "score" if several else "closed-loop score")
+        scores = "score" if several else "closed-loop score"
+        _finish_axes(axes, _TRAFFIC.get(traffic, traffic), scores)
     return figure
 
 
-def _panels(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
-    figure = new_figure(figsize=(size[0] * columns + 0.6, size[1] * rows + 1.1))
-    return figure, figure.subplots(rows, columns, squeeze=False, sharey=True)
+def _label(group: Group) -> str:
+    return f"{group.planner}{'' if group.is_complete else ' (partial)'}"
 
 
-def _score_axis(axes: Any, scores: str = "closed-loop score") -> None:
+def _panels(
+    rows: Sequence[str], columns: Sequence[str], size: tuple[float, float]
+) -> tuple[Any, list[tuple[Any, str, str]]]:
+    """A figure, and its axes with the names of their row and column."""
+    figure = new_figure(figsize=(size[0] * len(columns) + 0.6, size[1] * len(rows) + 1.1))
+    axes = figure.subplots(len(rows), len(columns), squeeze=False, sharey=True)
+    names = product(rows, columns)
+    return figure, [(one, *name) for one, name in zip(axes.flat, names, strict=True)]
+
+
+def _finish_axes(axes: Any, title: str, scores: str = "closed-loop score") -> None:
+    axes.set_title(title, fontsize=9)
     axes.set_ylim(-3.0, 103.0)
     axes.set_ylabel(f"{scores} × 100", fontsize=9)
     axes.label_outer()

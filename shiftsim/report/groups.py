@@ -112,10 +112,10 @@ class DataSet:
     def _part(self, duration: str) -> tuple["DataSet", BoolArray]:
         chosen = np.array([name in (duration, "") for name in self.durations], np.bool_)
         columns = ("tokens", "cities", "recordings", "types", "durations")
-        kept: dict[str, Any] = {
+        columns_of_part: dict[str, Any] = {
             name: tuple(compress(getattr(self, name), chosen.tolist())) for name in columns
         }
-        return replace(self, label=f"{self.label}, {duration}", **kept), chosen
+        return replace(self, label=f"{self.label}, {duration}", **columns_of_part), chosen
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,38 +161,40 @@ def seed_deviation(values: FloatArray) -> float | None:
     return float(values.std(ddof=1)) if len(values) > 1 else None
 
 
-def made_up_note(runs: Iterable[Run]) -> str:
+def planner_identities(run: Run) -> dict[str, dict[str, Any]]:
+    """What identifies each planner of a run, of those that have more than a name."""
+    planners = run.manifest["determining"]["planners"].items()
+    return {name: identity for name, identity in planners if isinstance(identity, dict)}
+
+
+def synthetic_weights_note(runs: Iterable[Run]) -> str:
     """Which planners drove with deterministic weights, so that no score of theirs is believed."""
     names = {
         name
         for run in runs
-        for name, identity in run.manifest["determining"]["planners"].items()
-        if isinstance(identity, dict)
-        and str(identity.get("checkpoint", "")).startswith("deterministic:")
+        for name, identity in planner_identities(run).items()
+        if str(identity.get("checkpoint", "")).startswith("deterministic:")
     }
     return f"MEANINGLESS: made-up weights of {', '.join(sorted(names))}" if names else ""
 
 
 def weights_note(runs: Iterable[Run]) -> str:
     """Which planners drove with weights of our own, in place of their authors'."""
-    identities = (run.manifest["determining"]["planners"].items() for run in runs)
-    said = {
+    notes = {
         f"{name}, {identity['weights']}"
-        for items in identities
-        for name, identity in items
-        if isinstance(identity, dict) and identity.get("weights")
+        for run in runs
+        for name, identity in planner_identities(run).items()
+        if identity.get("weights")
     }
-    return "; ".join(sorted(said))
+    return "; ".join(sorted(notes))
 
 
-def is_stand_in(group: Group) -> bool:
+def has_default_weights(group: Group) -> bool:
     """Whether a planner drove with weights of our own that nobody asked for by `--checkpoint`."""
-    manifest = group.run.manifest
     name = group.planner.partition(" @")[0]
-    identity = manifest["determining"]["planners"].get(name)
-    if not isinstance(identity, dict) or not identity.get("weights"):
+    if not planner_identities(group.run).get(name, {}).get("weights"):
         return False
-    config = manifest["config"]
+    config = group.run.manifest["config"]
     given = [text.partition("=") for text in config.get("checkpoints", ())]
     named = any(not equals or owner == name for owner, equals, _ in given)
     return not named and "checkpoint" not in config.get("planner_args", {}).get(name, {})
@@ -200,9 +202,9 @@ def is_stand_in(group: Group) -> bool:
 
 def recording_note(run: Run) -> str:
     """Which planners of a run were given the recording, the future included."""
-    planners = run.manifest["determining"]["planners"].items()
-    names = [n for n, found in planners if isinstance(found, dict) and found.get("sees_recording")]
-    return f"given the recorded future: {', '.join(sorted(names))}" if names else ""
+    identities = planner_identities(run).items()
+    names = sorted(name for name, identity in identities if identity.get("sees_recording"))
+    return f"given the recorded future: {', '.join(names)}" if names else ""
 
 
 def token_digest(tokens: Iterable[str]) -> str:
@@ -246,8 +248,8 @@ def _labelled_apart(groups: list[Group]) -> list[Group]:
     out = []
     for group in groups:
         values = zip(group.data.traits, zip(*kinds[group.data.label], strict=True), strict=True)
-        telling = [own for own, all_values in values if len(set(all_values)) > 1]
-        label = ", ".join([group.data.label, *telling])
+        differing = [value for value, all_values in values if len(set(all_values)) > 1]
+        label = ", ".join([group.data.label, *differing])
         out.append(replace(group, data=replace(group.data, label=label)))
     return out
 

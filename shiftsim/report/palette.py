@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from shiftsim.errors import MissingExtraError
-from shiftsim.files import whole_file
+from shiftsim.files import atomic_write
 from shiftsim.world.state import AgentKind
 
 _PLAIN = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
@@ -47,7 +47,7 @@ def new_figure(
 def save_picture(figure: Any, path: Path) -> None:
     """Write a figure without time stamps: the same picture has the same bytes."""
     kind = path.suffix.lower()
-    with whole_file(path) as partial:
+    with atomic_write(path) as partial:
         figure.savefig(partial, dpi=150, format=kind[1:] or None, metadata=_PLAIN.get(kind))
 
 

@@ -1,11 +1,11 @@
-"""The paper's tables from own runs: zero-shot generalization and noise robustness."""
+"""The paper's tables from own runs, and its figures: zero-shot generalization, noise robustness."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
 from shiftsim.report.groups import COLUMNS, DataSet, Group, distinct_sets
-from shiftsim.report.published import Published, called_alike
 from shiftsim.report.statistics import FEW_CLUSTERS, score_interval
 from shiftsim.report.tables import Cell, Estimate, Number, Table
 from shiftsim.report.words import LONG, NAMES
@@ -20,6 +20,45 @@ PUBLISHED = "(published)"
 _SETS = {"val14": "Val14", "all": "DeepPlan", "deepplan": "DeepPlan"}
 
 
+@dataclass(frozen=True, slots=True)
+class Published:
+    """Numbers copied from the paper; scores are times 100."""
+
+    source: str  # where they are from
+    # names of each site by its abbreviation, in the paper's order
+    cities: Mapping[str, Sequence[str]]
+    scenarios: Mapping[str, int]  # scenarios of each site, by abbreviation
+    columns: Sequence[str]  # columns of `semantic_shift`: sets, sites, metrics
+    semantic_shift: Mapping[str, Mapping[str, Sequence[float]]]  # values by traffic and planner
+    noises: Sequence[str]  # columns of `robustness`
+    # by traffic, set and planner: mean and deviation of each noise
+    robustness: Mapping[str, Mapping[str, Mapping[str, Sequence[Sequence[float]]]]]
+    sets: Sequence[str]  # columns of `comparison`
+    comparison: Mapping[str, Sequence[str]]  # properties of the data sets, by name of the property
+
+    def abbreviation(self, city: str) -> str:
+        """The paper's abbreviation of a city; empty for other cities."""
+        plain = _letters(city)
+        found = (s for s, names in self.cities.items() if plain in map(_letters, (s, *names)))
+        return next(found, "")
+
+    def scores(self, traffic: str) -> dict[str, dict[str, float]]:
+        """Values of `semantic_shift` under one traffic mode, by planner and column."""
+        return {
+            planner: dict(zip(self.columns, values, strict=True))
+            for planner, values in self.semantic_shift.get(traffic, {}).items()
+        }
+
+
+def called_alike(name: str, listed: Iterable[str]) -> list[str]:
+    """Planners of a published table that are called like one of ours: one or none."""
+    return [other for other in listed if _letters(other) == _letters(name)]
+
+
+def _letters(text: str) -> str:
+    return "".join(c for c in text.casefold() if c.isalnum())
+
+
 class _Column(NamedTuple):
     """A column of scores: its heading, its name in the paper, and what makes a group's cell."""
 
@@ -32,13 +71,13 @@ def semantic_shift(
     groups: Sequence[Group],
     published: Published | None = None,
     *,
-    beside: bool = False,
+    with_published: bool = False,
     allow_partial: bool = False,
 ) -> list[Table]:
     """Clean scores of all scenarios, per city and per metric: one table per set of scenarios.
 
-    The paper's sites give cities their short names and order. `beside` shows its scores as well, in
-    the same table where the cities are the same; `allow_partial` labelled means of what is there.
+    The paper's sites give cities their short names and order. `with_published` shows its scores as
+    well, in the same table where the cities are the same; `allow_partial` labelled partial means.
     """
     clean = [group for group in groups if group.noise == "none"]
     others = [group for group in clean if group.data.known != VAL14]
@@ -49,9 +88,9 @@ def semantic_shift(
         compared = val14 if data.known != VAL14 else []
         columns = _columns(data, compared, published, allow_partial)
         notes = [data.rules, *(group.data.rules for group in compared[:1]), INTERVALS]
-        out.append(_semantic_table(data, mine, columns, notes, published, beside))
+        out.append(_semantic_table(data, mine, columns, notes, published, with_published))
     alike = [one for one in distinct_sets(clean) if published and _is_paper_like(one, published)]
-    if published is not None and beside and not alike:
+    if published is not None and with_published and not alike:
         out.append(published_semantic(published))
     return out
 
@@ -99,9 +138,9 @@ def _semantic_table(
     columns: Sequence[_Column],
     notes: list[str],
     published: Published | None,
-    beside: bool,
+    with_published: bool,
 ) -> Table:
-    paper = published if published and beside and _is_paper_like(data, published) else None
+    paper = published if published and with_published and _is_paper_like(data, published) else None
     rows: list[tuple[Cell, ...]] = []
     for traffic in traffics(groups):
         left = paper.scores(traffic) if paper else {}
@@ -110,13 +149,13 @@ def _semantic_table(
             for name in called_alike(group.planner, left):
                 rows.append(_published_row(traffic, name, left.pop(name), columns))
         rows += [_published_row(traffic, name, left[name], columns) for name in left]
-    notes += [_few_note(data), _own_list_note(data, published) if published else ""]
+    notes += _set_notes(data, published)
     notes += [f"{PUBLISHED[1:-1]}: {paper.source}"] if paper else []
     header = ("traffic", "planner", *(column.heading for column in columns))
     title = f"Zero-shot generalization: {data.label}, clean, scores x 100"
     name = f"semantic-shift_{data.name}"
     words = _words(published)
-    return Table(name, title, header, tuple(rows), 2, tuple(filter(None, notes)), words=words)
+    return Table(name, title, header, tuple(rows), 2, tuple(notes), words=words)
 
 
 def traffics(groups: Iterable[Group]) -> list[str]:
@@ -134,20 +173,19 @@ def _published_row(
     return (traffic, f"{planner} {PUBLISHED}", *cells)
 
 
-def _few_note(data: DataSet) -> str:
-    few = data.num_recordings < FEW_CLUSTERS
-    return f"few recordings ({data.num_recordings}): intervals are too narrow" if few else ""
-
-
-def _own_list_note(data: DataSet, published: Published) -> str:
-    if data.known == VAL14:
-        return ""
-    if not _is_paper_like(data, published):
-        return "not a set of the published benchmark"
-    return (
-        f"own list of {len(data.tokens)} scenarios, not the paper's: the authors' list of "
-        f"{published.comparison['scenario count'][-1]} is unpublished"
-    )
+def _set_notes(data: DataSet, published: Published | None) -> list[str]:
+    """What a reader must know of a set: few recordings, or that it is not the paper's."""
+    notes = []
+    if data.num_recordings < FEW_CLUSTERS:
+        notes.append(f"few recordings ({data.num_recordings}): intervals are too narrow")
+    if published and data.known != VAL14 and not _is_paper_like(data, published):
+        notes.append("not a set of the published benchmark")
+    elif published and data.known != VAL14:
+        notes.append(
+            f"own list of {len(data.tokens)} scenarios, not the paper's: the authors' list of "
+            f"{published.comparison['scenario count'][-1]} is unpublished"
+        )
+    return notes
 
 
 def published_semantic(published: Published) -> Table:

@@ -19,13 +19,13 @@ from shiftsim.metrics import MULTIPLIERS
 from shiftsim.report.groups import (
     COLUMNS,
     Group,
-    made_up_note,
     read_groups,
     recording_note,
+    synthetic_weights_note,
     weights_note,
 )
 from shiftsim.report.tables import Cell, Number, Table, text
-from shiftsim.report.words import REASONS
+from shiftsim.report.words import REASONS, task_of
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
 
@@ -108,9 +108,9 @@ def scores(groups: Sequence[Group], *, by: str | None = None, allow_partial: boo
     for group, caption in zip(groups, captions, strict=True):
         where = (group.data.label, group.traffic) if several else ()
         for row in _score_rows(group, by):
-            labels = (*where, *row.labels)
-            rows += _cells(labels, row, allow_partial)
-            full += _cells_in_full(labels, row, caption, allow_partial)
+            lines = _lines((*where, *row.labels), row, caption, allow_partial=allow_partial)
+            rows += lines[0]
+            full += lines[1]
     header, count = (*heading, *COLUMNS.values()), len(heading)
     header_in_full = (*header, "statistic", "done", "expected", "label")
     machine = Table("scores", "", header_in_full, tuple(full), count)
@@ -121,53 +121,37 @@ def scores(groups: Sequence[Group], *, by: str | None = None, allow_partial: boo
 def _describe(group: Group) -> str:
     """What stands beside every printed score."""
     data = group.data
-    said = (made_up_note([group.run]), weights_note([group.run]), recording_note(group.run))
-    notes = [note for note in said if note]
+    run = group.run
+    notes = filter(None, (synthetic_weights_note([run]), weights_note([run]), recording_note(run)))
     return (
         f"split {data.label} ({len(data.tokens)} scenarios) · "
-        f"traffic {group.run.manifest['determining']['traffic']} · controller {data.controller} · "
+        f"traffic {run.manifest['determining']['traffic']} · controller {data.controller} · "
         f"thresholds {data.thresholds} · metrics v{data.metric_version} · scores x 100"
         f"{''.join(f' · {note}' for note in notes)}"
     )
 
 
-def _is_withheld(row: ScoreRow, allow_partial: bool) -> bool:
-    return not row.is_complete and not (allow_partial and row.means)
-
-
-def _numbers(values: dict[str, float]) -> list[Cell]:
-    return [Number(100.0 * value) for value in values.values()]
-
-
-def _cells(labels: Sequence[str], row: ScoreRow, allow_partial: bool) -> list[tuple[Cell, ...]]:
-    """One or two lines: the means, and their deviation over the seeds."""
+def _lines(
+    labels: tuple[str, ...], row: ScoreRow, caption: str, *, allow_partial: bool
+) -> tuple[list[tuple[Cell, ...]], list[tuple[Cell, ...]]]:
+    """The lines of a row for people and for machines: the means, and their deviation over seeds."""
     count = f"({row.num_done}/{row.num_expected}"
-    if _is_withheld(row, allow_partial):
-        return [(*labels, f"– {count} done)", *["–"] * (len(COLUMNS) - 1))]
-    means = _numbers(row.means)
+    done = (str(row.num_done), str(row.num_expected))
+    if not row.is_complete and not (allow_partial and row.means):
+        dashes, empty = ["–"] * (len(COLUMNS) - 1), [None] * len(COLUMNS)
+        note = f"withheld {count} done); {caption}"
+        return [(*labels, f"– {count} done)", *dashes)], [(*labels, *empty, "mean", *done, note)]
+    means: list[Cell] = [Number(100.0 * value) for value in row.means.values()]
+    tail = (*done, caption if row.is_complete else f"partial {count}); {caption}")
+    full = [(*labels, *means, "mean", *tail)]
     if not row.is_complete:
         means[0] = f"{means[0]} partial {count})"
-    out: list[tuple[Cell, ...]] = [(*labels, *means)]
+    shown = [(*labels, *means)]
     if row.deviations:
-        first = (*[""] * (len(labels) - 1), f"± {row.num_seeds} seeds")
-        out.append((*first, *_numbers(row.deviations)))
-    return out
-
-
-def _cells_in_full(
-    labels: Sequence[str], row: ScoreRow, caption: str, allow_partial: bool
-) -> list[tuple[Cell, ...]]:
-    counts = (str(row.num_done), str(row.num_expected))
-    if _is_withheld(row, allow_partial):
-        note = f"withheld ({row.num_done}/{row.num_expected} done); {caption}"
-        return [(*labels, *[None] * len(COLUMNS), "mean", *counts, note)]
-    partial = "" if row.is_complete else f"partial ({row.num_done}/{row.num_expected}); "
-    tail = (*counts, f"{partial}{caption}")
-    out: list[tuple[Cell, ...]] = [(*labels, *_numbers(row.means), "mean", *tail)]
-    if row.deviations:
-        statistic = f"std over {row.num_seeds} seeds"
-        out.append((*labels, *_numbers(row.deviations), statistic, *tail))
-    return out
+        spread = [Number(100.0 * value) for value in row.deviations.values()]
+        shown.append((*[""] * (len(labels) - 1), f"± {row.num_seeds} seeds", *spread))
+        full.append((*labels, *spread, f"std over {row.num_seeds} seeds", *tail))
+    return shown, full
 
 
 def worst_rollouts(run: Run, count: int = 10) -> list[dict[str, Any]]:
@@ -183,14 +167,11 @@ def worst_rollouts(run: Run, count: int = 10) -> list[dict[str, Any]]:
     rows = ordered.take(np.sort(firsts)[:count]).to_pylist()
     tokens = pa.array([row["token"] for row in rows], pa.string())
     metrics = run.metrics.filter(pc.is_in(run.metrics["token"], value_set=tokens)).to_pylist()
-    violated = {(_key(row), row["metric"]): row["first_violation_s"] for row in metrics}
+    violated = {(task_of(row), row["metric"]): row["first_violation_s"] for row in metrics}
     return [
-        {**_key(row)._asdict(), "cls": row["cls"], "reason": _reason(row, violated)} for row in rows
+        {**task_of(row)._asdict(), "cls": row["cls"], "reason": _reason(row, violated)}
+        for row in rows
     ]
-
-
-def _key(row: dict[str, Any]) -> Task:
-    return Task(*(row[name] for name in Task._fields))
 
 
 def _reason(row: dict[str, Any], violated: dict[tuple[Task, str], float | None]) -> str:
@@ -201,7 +182,7 @@ def _reason(row: dict[str, Any], violated: dict[tuple[Task, str], float | None])
     if not name or row[name] == 1.0:
         return ""
     words = REASONS[name] if below else f"{REASONS[name]} {row[name]:.2f}"
-    seconds = violated[_key(row), name]
+    seconds = violated[task_of(row), name]
     return words if seconds is None else f"{words} {seconds:.1f} s"
 
 

@@ -1,12 +1,19 @@
-"""A table as data, its cells, and its plain text."""
+"""A table as data, and as text, Markdown, CSV, LaTeX and HTML."""
 
-from collections.abc import Mapping, Sequence
+import csv
+import html
+import io
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from textwrap import wrap
 from typing import TypeAlias
 
+from shiftsim.errors import one_of
 from shiftsim.report.words import LONG, legend
 
+ENDINGS = {"text": "txt", "md": "md", "csv": "csv", "latex": "tex", "html": "html"}
+FORMATS = tuple(ENDINGS)
 _GAP = 2  # blanks between columns of text
 
 
@@ -130,3 +137,171 @@ def _pieces(widths: Sequence[int], num_labels: int, width: int) -> list[list[int
         pieces[-1].append(column)
         used += widths[column] + _GAP
     return pieces
+
+
+def render(table: Table, style: str, *, width: int = 0) -> str:
+    """A table in one of `FORMATS`; as text, those wider than `width` are printed in pieces."""
+    one_of("format", style, FORMATS)
+    return text(table, width) if style == "text" else _WRITERS[style](table)
+
+
+def _markdown(table: Table) -> str:
+    rule = ["---"] * table.num_labels + ["---:"] * (len(table.header) - table.num_labels)
+    head, *rows = ([markdown_escape(cell) for cell in line] for line in table.lines)
+    body = [f"| {' | '.join(line)} |" for line in (head, rule, *rows)]
+    title = [f"### {markdown_escape(table.title)}", ""] if table.title else []
+    notes = [line for note in table.remarks for line in ("", markdown_escape(note))]
+    return "\n".join([*title, *body, *notes])
+
+
+def markdown_escape(value: str) -> str:
+    """Text that Markdown prints as it is, also inside a table."""
+    return re.sub(r"([\\`*_{}\[\]<>|#~$])", r"\\\1", " ".join(value.split()))
+
+
+def _csv(table: Table) -> str:
+    """Every number in full and in a column of its own; notes are the last column of every row."""
+    table = table.full or table
+    columns = [
+        [f"{name}{ending}", *values]
+        for index, name in enumerate(table.header)
+        for ending, values in _parts([row[index] for row in table.rows]).items()
+    ]
+    labels = [_labels(row, table.header) for row in table.rows]
+    if any(labels):
+        columns.append(["label", *labels])
+    if table.notes:
+        columns.append(["notes", *[" | ".join(table.notes)] * len(table.rows)])
+    return csv_text(zip(*columns, strict=True))
+
+
+def csv_text(rows: Iterable[Sequence[str]]) -> str:
+    """Rows as CSV, without a line end behind the last one."""
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows(rows)
+    return out.getvalue().rstrip("\n")
+
+
+def _parts(cells: Sequence[Cell]) -> dict[str, list[str]]:
+    """One or several columns, by what the cells hold; keys are added to the column's name."""
+    if any(isinstance(cell, Interval) for cell in cells):
+        return {f" {end}": [_full(getattr(c, end, None)) for c in cells] for end in ("low", "high")}
+    out = {"": [_plain(cell) for cell in cells]}
+    spreads = [cell.std if isinstance(cell, Estimate) else None for cell in cells]
+    if any(spread is not None for spread in spreads):
+        out[" std"] = [_full(spread) for spread in spreads]
+    return out
+
+
+def _plain(cell: Cell) -> str:
+    if cell is None or isinstance(cell, str):
+        return cell or ""
+    if isinstance(cell, Number):
+        return f"{cell.value:.0f}" if cell.digits == 0 else _full(cell.value)
+    assert isinstance(cell, Estimate)
+    return _full(cell.mean)
+
+
+def _full(value: float | None) -> str:
+    return "" if value is None else repr(float(value))
+
+
+def _labels(row: Sequence[Cell], header: Sequence[str]) -> str:
+    named = zip(header, row, strict=True)
+    found = [f"{n} {c.label}" for n, c in named if isinstance(c, Estimate) and c.label]
+    return "; ".join(found)
+
+
+_LATEX = {
+    **{c: f"\\{c}" for c in "&%$#_{}"},
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    '"': "''",
+    "±": r"$\pm$",
+    "×": r"$\times$",
+    "·": r"$\cdot$",
+    "−": r"$-$",
+    "≥": r"$\geq$",
+    "≤": r"$\leq$",
+    "√": r"$\surd$",
+    "σ": r"$\sigma$",
+    "θ": r"$\theta$",
+    "–": "--",
+    "…": r"\dots{}",
+    "→": r"$\rightarrow$",
+}
+_LATEX_TABLE = str.maketrans(_LATEX)
+
+
+def latex_escape(value: str) -> str:
+    """Text that LaTeX prints as it is."""
+    return " ".join(value.split()).translate(_LATEX_TABLE)
+
+
+def _latex(table: Table) -> str:
+    columns = "l" * table.num_labels + "r" * (len(table.header) - table.num_labels)
+
+    def line(cells: Sequence[str]) -> str:
+        # a cell that begins with "[" would be read as an option of the \\ or \toprule before it
+        safe = (f"{{{cell}}}" if cell.startswith("[") else cell for cell in cells)
+        return f"  {' & '.join(safe)} \\\\"
+
+    head, *rows = (line([latex_escape(cell) for cell in cells]) for cells in table.lines)
+    notes = "; ".join(latex_escape(note) for note in table.remarks)
+    caption = ". ".join(filter(None, (latex_escape(table.title), notes)))
+    begin = [
+        r"\begin{table}  % needs \usepackage{booktabs}",
+        r"\centering",
+        f"\\caption{{{caption}}}",
+        f"\\label{{tab:{table.name}}}",
+        f"\\begin{{tabular}}{{{columns}}}",
+    ]
+    end = [r"\bottomrule", r"\end{tabular}", r"\end{table}"]
+    return "\n".join([*begin, r"\toprule", head, r"\midrule", *rows, *end])
+
+
+def latex_picture(name: str, title: str) -> str:
+    """A picture in LaTeX by the name of its file."""
+    lines = (
+        r"\begin{figure}  % needs \usepackage{graphicx}",
+        r"\centering",
+        f"\\includegraphics[width=\\linewidth]{{{name}}}",
+        f"\\caption{{{latex_escape(title)}}}",
+        f"\\label{{fig:{name.partition('.')[0]}}}",
+        r"\end{figure}",
+    )
+    return "\n".join(lines)
+
+
+def _html(table: Table) -> str:
+    """A section; its table lies in a box that scrolls where the page is too narrow."""
+
+    def row(cells: Sequence[str], tag: str) -> str:
+        kinds = ["" if i < table.num_labels else " class=n" for i in range(len(cells))]
+        parts = (f"<{tag}{kind}>{cell}</{tag}>" for kind, cell in zip(kinds, cells, strict=True))
+        return f"<tr>{''.join(parts)}</tr>"
+
+    def heading(name: str) -> str:
+        words = table.words.get(name)
+        return f"<small>{html.escape(words)}</small> {name}" if words else html.escape(name)
+
+    head, *rows = table.lines
+    title = html.escape(table.title or table.name)
+    lines = [
+        f'<section id="{html.escape(table.name)}">',
+        f"<h2>{title}</h2>",
+        f'<div class="wide" tabindex="0" role="region" aria-label="{title}"><table>',
+        f"<thead>{row([*map(heading, head)], 'th')}</thead>\n<tbody>",
+        *(row([*map(html.escape, cells)], "td") for cells in rows),
+        "</tbody></table></div>",
+        *(f"<p>{html.escape(note)}</p>" for note in table.notes),
+    ]
+    return "\n".join([*lines, "</section>"])
+
+
+_WRITERS: dict[str, Callable[[Table], str]]
+_WRITERS = {"md": _markdown, "csv": _csv, "latex": _latex, "html": _html}

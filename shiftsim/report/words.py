@@ -1,11 +1,13 @@
-"""What metrics, units and violations are called where people read them."""
+"""What metrics, units and violations are called where people read them; which one is the worst."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
 
-from shiftsim.metrics import SHORT_NAMES
+from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES
+from shiftsim.runs.rollouts import Task
 from shiftsim.world.state import AgentKind, Tracks
 
 COLLISIONS = "no_ego_at_fault_collisions"
@@ -40,14 +42,27 @@ UNITS = {  # nuPlan's names, shortened
 }
 
 
-def in_words(metric: str) -> str:
+def in_words(metric: str, names: Mapping[str, str] = NAMES) -> str:
     """A metric as "no at-fault collision (NCR)"; one that is not scored by its name."""
-    return f"{NAMES[metric]} ({SHORT_NAMES[metric]})" if metric in NAMES else metric
+    return f"{names[metric]} ({SHORT_NAMES[metric]})" if metric in names else metric
 
 
 def legend(shorts: Iterable[str], words: Mapping[str, str] = LONG) -> str:
     """What those of some headings mean that are short: "no at-fault collision (NCR), …"."""
     return ", ".join(f"{words[name]} ({name})" for name in shorts if name in words)
+
+
+def task_of(row: Mapping[str, Any]) -> Task:
+    """The task that a row of one of a run's tables is of."""
+    return Task(*(row[name] for name in Task._fields))
+
+
+def rows_by_task(table: pa.Table) -> dict[Task, list[dict[str, Any]]]:
+    """The rows of each task in a run's table."""
+    out: dict[Task, list[dict[str, Any]]] = {}
+    for row in table.to_pylist():
+        out.setdefault(task_of(row), []).append(row)
+    return out
 
 
 def task_words(row: Mapping[str, Any]) -> str:
@@ -69,3 +84,34 @@ def violation_words(row: Mapping[str, Any], tracks: Tracks) -> str:
         elif unit:
             words.append(f"{value:.3g} {unit}" if abs(value) >= 0.01 else f"under 0.01 {unit}")
     return ", ".join(words)
+
+
+class Violation(NamedTuple):
+    """A scored metric below 1."""
+
+    short: str  # the metric's abbreviation
+    reason: str  # what went wrong
+    time: float | None  # when it began [s from the start]; None where it has no moment
+    is_multiplier: bool  # whether the metric multiplies the score
+    row: Mapping[str, Any]  # of `metrics.parquet`
+
+    def __str__(self) -> str:
+        return self.reason if self.time is None else f"{self.reason} {self.time:.1f} s"
+
+
+def violations(rows: Iterable[Mapping[str, Any]]) -> list[Violation]:
+    """The scored metrics below 1 among rows of `metrics.parquet`, the earliest first."""
+    found = [
+        Violation(
+            SHORT_NAMES[name], REASONS[name], row["first_violation_s"], name in MULTIPLIERS, row
+        )
+        for row in rows
+        if (name := row["metric"]) in REASONS and row["score"] is not None and row["score"] < 1.0
+    ]
+    return sorted(found, key=lambda one: (one.time is None, one.time or 0.0))
+
+
+def worst_violation(found: Iterable[Violation]) -> Violation | None:
+    """The one that cost most and has a moment: the first of a multiplier, else the first."""
+    known = [one for one in found if one.time is not None]
+    return next((one for one in known if one.is_multiplier), known[0] if known else None)

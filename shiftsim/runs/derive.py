@@ -1,6 +1,6 @@
 """Runs made of other runs, without simulating: shards joined, and rollouts scored again."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
 from functools import partial
@@ -11,15 +11,16 @@ from typing import Any
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.runs.config import RunConfig, default_workers, make_config, parse_shard
-from shiftsim.runs.edits.edited import make_edits
-from shiftsim.runs.execute import Progress, ended, record
+from shiftsim.runs.edited import make_edits
+from shiftsim.runs.execute import OnProgress, Progress, record, results_of
 from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.manifest import check_target, code_digest, difference, make_manifest, now
 from shiftsim.runs.prepare import RUNS, run_name
-from shiftsim.runs.results import MISSING, OK, Run, TaskResult, open_run, stored_results
+from shiftsim.runs.results import Run, open_run
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.scenarios import open_run_store
-from shiftsim.runs.task import Batch, Scenarios, attempt, score_rollout
+from shiftsim.runs.tables import MISSING, OK, TaskResult, stored_results
+from shiftsim.runs.task import Batch, ScenarioReader, attempt, score_rollout
 from shiftsim.runs.workers import map_unordered
 
 
@@ -46,66 +47,52 @@ def merge_runs(runs: Sequence[Run], *, out: str | None = None, allow_partial: bo
         "merged": now(),
         "merged_from": [run.path.name for run in runs],
     }
-    writer = RunWriter(target, manifest)
-    try:
+    with closing(RunWriter(target, manifest)) as writer:
         for run in runs:
-            for result, place in stored_results(run.path):
-                if result.task in writer.ended:
-                    raise ConfigError(
-                        f"task {tuple(result.task)!r} of {str(run.path)!r} is in another shard too",
-                        hint="name every shard once",
-                    )
-                writer.add(result, stored=place)
+            for result in stored_results(run.path):
+                writer.add(result)
         errors = {task: error for run in runs for task, error in _without_result(run)}
         return writer.finish(
             manifest | {"state": "finished"},
             _expected(first),
             lambda task: errors.get(task, f"shard missing; there are {', '.join(shards)}"),
         )
-    finally:
-        writer.close()
 
 
 def _check_shards(runs: Sequence[Run], *, allow_partial: bool) -> list[str]:
-    first = runs[0]
-    numbers: dict[int, Run] = {}
-    for run in runs:
-        shard = run.manifest["shard"]
+    first, shards = runs[0], [run.manifest["shard"] for run in runs]
+    for run, shard in zip(runs, shards, strict=True):
         if not shard:
             raise ConfigError(
                 f"{str(run.path)!r} is not a shard", hint="merge joins runs made with --shard i/n"
             )
         differing = difference(run.manifest, first.manifest["determining"], shard)
-        if differing or parse_shard(shard)[1] != parse_shard(first.manifest["shard"])[1]:
+        if differing or parse_shard(shard)[1] != parse_shard(shards[0])[1]:
             raise ConfigError(
                 f"{str(run.path)!r} and {str(first.path)!r} are not of the same run: "
-                f"{differing or 'their shards are ' + shard + ' and ' + first.manifest['shard']}",
+                f"{differing or f'their shards are {shard} and {shards[0]}'}",
                 hint="name the shards of one run",
             )
-        number, count = parse_shard(shard)
-        if number in numbers:
-            raise ConfigError(
-                f"{str(run.path)!r} and {str(numbers[number].path)!r} are both shard {shard}",
-                hint="name every shard once",
-            )
-        numbers[number] = run
-    missing = [f"{number}/{count}" for number in range(1, count + 1) if number not in numbers]
+        if shards.count(shard) > 1:
+            raise ConfigError(f"shard {shard} is there twice", hint="name every shard once")
+    _, count = parse_shard(shards[0])
+    missing = {f"{number}/{count}" for number in range(1, count + 1)}.difference(shards)
     if missing and not allow_partial:
         raise ConfigError(
-            f"shards are missing: {', '.join(missing)}",
+            f"shards are missing: {', '.join(sorted(missing))}",
             hint="name all of them, or --allow-partial for a result that is labelled so",
         )
-    return [run.manifest["shard"] for run in runs]
+    return shards
 
 
 def _expected(manifest: dict[str, Any]) -> list[Task]:
     """All tasks of the whole run."""
-    determining = manifest["determining"]
+    fingerprint = manifest["determining"]
     return [
         Task(planner, noise, seed, token)
-        for planner in determining["planners"]
-        for noise, fields in determining["noise"].items()
-        for seed in ([0] if fields["kind"] == "none" else determining["seeds"])
+        for planner in fingerprint["planners"]
+        for noise, fields in fingerprint["noise"].items()
+        for seed in ([0] if fields["kind"] == "none" else fingerprint["seeds"])
         for token in manifest["tokens"]
     ]
 
@@ -124,8 +111,8 @@ class Rescorer:
     def __init__(self, run: Path, store: str, config: RunConfig) -> None:
         self.config, self._run = config, open_run(run)
         edits = self._run.manifest.get("edits")
-        made = make_edits(edits, self._run.path.name) if edits else None
-        self._scenarios = Scenarios(store, made)
+        edit_set = make_edits(edits, self._run.path.name) if edits else None
+        self._scenarios = ScenarioReader(store, edit_set)
 
     def __call__(self, batch: Batch) -> list[TaskResult]:
         """The results of tasks."""
@@ -146,7 +133,7 @@ def rescore(
     store: str | None = None,
     out: str | None = None,
     workers: int = 0,
-    on_progress: Callable[[Progress], None] = lambda progress: None,
+    on_progress: OnProgress = lambda progress: None,
     argv: Sequence[str] = (),
 ) -> Run:
     """Write a run folder (`runs/<id>`) as if the run had been made with other thresholds.
@@ -161,7 +148,7 @@ def rescore(
         load_metric(metric)
     found = open_run_store(run, store)
     here, simulated = code_digest(), run.manifest["determining"].get("code", "")
-    determining = run.manifest["determining"] | {
+    fingerprint = run.manifest["determining"] | {
         "thresholds": asdict(thresholds_of(thresholds)),
         "metrics": sorted(metrics),
         "metric_version": METRIC_VERSION,
@@ -169,8 +156,8 @@ def rescore(
     }
     values = run.manifest["config"] | {"thresholds": thresholds, "metrics": list(metrics)}
     config = make_config(values, where=str(run.path / "manifest.json"))
-    target = Path(out) if out else RUNS / run_name(config, run.manifest["split"], determining)
-    check_target(target, determining)
+    target = Path(out) if out else RUNS / run_name(config, run.manifest["split"], fingerprint)
+    check_target(target, fingerprint)
     statuses = dict(zip(run.rollout_places, run.tasks["status"].to_pylist(), strict=True))
     done = [task for task, status in statuses.items() if status == OK]
     without = [task for task in done if run.rollout_places[task] is None]
@@ -184,14 +171,13 @@ def rescore(
         config=config,
         split=run.manifest["split"],
         store=run.manifest["store"] if store is None else found.source,
-        determining=determining,
+        fingerprint=fingerprint,
         argv=argv,
     )
     if edits := run.manifest.get("edits"):
         manifest["edits"] = edits
-    writer = RunWriter(target, manifest)
-    try:
-        for result, _ in stored_results(run.path):
+    with closing(RunWriter(target, manifest)) as writer:
+        for result in stored_results(run.path):
             if result.status != OK:  # it stays so
                 writer.add(replace(result, seconds={}))
         outcomes = map_unordered(
@@ -202,13 +188,11 @@ def rescore(
             alone=1,
             group=attrgetter("token"),
         )
+
+        def add(result: TaskResult) -> None:
+            writer.add(replace(result, location=run.rollout_places[result.task]))
+
         with closing(outcomes):
-
-            def add(result: TaskResult) -> None:
-                writer.add(result, stored=run.rollout_places[result.task])
-
-            record(map(ended, outcomes), add, Progress(0, len(done), 0), on_progress)
+            record(map(results_of, outcomes), add, Progress(0, len(done), 0), on_progress)
         manifest |= {"state": "finished", "ended": now(), "rescored_from": run.path.name}
         return writer.finish(manifest, statuses, dict(_without_result(run)).__getitem__)
-    finally:
-        writer.close()

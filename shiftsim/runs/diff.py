@@ -21,7 +21,7 @@ from shiftsim.world.scenario import FULL_DURATION
 
 # columns of a stored rollout in the order of cause and effect within one step
 _KEYS = {*Task._fields, "iteration", "time_us", "planning_seconds"}
-_LATER = ("degraded", "plan_steps", "command_", "noise_")
+_LATER = ("degraded", "plan", "command_", "noise_")
 _UNITS = {"mps": "m/s", "mps2": "m/s²", "radps": "rad/s", "radps2": "rad/s²"}
 _UNITS |= {"m": "m", "rad": "rad"}
 _AXES = ("x [m]", "y [m]", "heading [rad]")
@@ -198,16 +198,12 @@ def _change(
         except ValueError as error:
             where = f"a rollout of scenario {task.token!r} in {first.path} or {second.path}"
             raise DataError(f"{where} is damaged: {error}", hint="make the run again") from error
-        note = "" if departure else _why_only_scored(first, second)
+        if departure is None:  # why scores differ where the ego drove the same
+            traffic = [run.manifest["determining"]["traffic"] for run in (first, second)]
+            note = "the rollouts are the same: they were scored differently"
+            if traffic[0] != traffic[1]:
+                note = f"the ego drove the same, but in other traffic ({', '.join(traffic)})"
     return Change(task, planner, rows[0]["cls"], rows[1]["cls"], metrics, departure, note)
-
-
-def _why_only_scored(first: Run, second: Run) -> str:
-    """Why scores differ where the ego drove the same."""
-    ours, theirs = (run.manifest["determining"]["traffic"] for run in (first, second))
-    if ours != theirs:
-        return f"the ego drove the same, but in other traffic ({ours}, {theirs})"
-    return "the rollouts are the same: they were scored differently"
 
 
 def find_departure(first: pa.RecordBatch, second: pa.RecordBatch) -> Departure | None:
@@ -217,7 +213,8 @@ def find_departure(first: pa.RecordBatch, second: pa.RecordBatch) -> Departure |
         ValueError: One is damaged.
     """
     rows = min(len(first), len(second))
-    ours, theirs = (_quantities(table, rows) for table in (first, second))
+    tokens = sorted({*_track_tokens(first), *_track_tokens(second)})
+    ours, theirs = (_quantities(table, rows, tokens) for table in (first, second))
     best: tuple[int, str] | None = None
     for name in _ordered(ours.keys() & theirs.keys()):
         row = _first_difference(ours[name], theirs[name])
@@ -243,16 +240,21 @@ def _ordered(names: Iterable[str]) -> list[str]:
     return sorted(names, key=rank)
 
 
-def _quantities(table: pa.RecordBatch, rows: int) -> dict[str, np.ndarray]:
+def _track_tokens(table: pa.RecordBatch) -> list[str]:
+    has_tracks = "track_tokens" in table.schema.names
+    return table["track_tokens"].flatten().unique().to_pylist() if has_tracks else []
+
+
+def _quantities(table: pa.RecordBatch, rows: int, tokens: list[str]) -> dict[str, np.ndarray]:
     """(rows, n) numbers of each quantity that a rollout stores, but of noise that its key makes."""
     found = {
         name: column.to_numpy(zero_copy_only=False)
         for name, column in zip(table.schema.names, table.columns, strict=True)
         if name not in _KEYS and not pa.types.is_list(column.type) and not column.null_count
     }
-    found["plan_steps"] = stored_plans(table)
-    if "track_valid" in table.schema.names:
-        found |= {f"track_{name}": values for name, values in stored_tracks(table).items()}
+    found["plan"] = stored_plans(table)
+    if "track_tokens" in table.schema.names:
+        found |= {f"track_{name}": values for name, values in stored_tracks(table, tokens).items()}
     return {
         name: values[:rows].reshape(rows, math.prod(values.shape[1:])).astype(np.float64)
         for name, values in found.items()
@@ -269,7 +271,7 @@ def _first_difference(first: np.ndarray, second: np.ndarray) -> int | None:
 
 
 def _quantity(name: str, index: int) -> str:
-    if name == "plan_steps":
+    if name == "plan":
         pose, axis = divmod(index, 3)
         return f"plan, pose {pose} {_AXES[axis]}"
     if name.startswith("track_"):

@@ -1,19 +1,16 @@
-"""Which scenarios of a store are used: the automatic filter, and splits made of what passes.
+"""The automatic filter: which scenarios of a store are used.
 
-The filter drives scenarios as recorded, and drops those that cannot be driven so.
-
-The verdicts lie beside the scenarios, in `filter/verdicts.parquet` of the store; the scenarios
-themselves stay as they are. Runs over a whole store use the accepted ones.
+It drives scenarios as recorded, and drops those that cannot be driven so. The results lie beside
+the scenarios, in `filter/verdicts.parquet` of the store; the scenarios themselves stay as they are.
+Runs over a whole store use the accepted ones.
 """
 
 import hashlib
 import json
-from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -21,33 +18,39 @@ import numpy as np
 import pyarrow as pa
 
 from shiftsim.data.store.reading import open_store
-from shiftsim.data.store.tables import Table, write_blocks
-from shiftsim.errors import ConfigError, DataError, one_of
-from shiftsim.files import below
+from shiftsim.data.store.tables import Table, digest, write_blocks
+from shiftsim.errors import ConfigError, DataError
+from shiftsim.files import safe_join
 from shiftsim.metrics import METRIC_VERSION, MetricResult, compute_metrics, thresholds_of
-from shiftsim.runs import verdicts
 from shiftsim.runs.config import default_workers
 from shiftsim.runs.journal import Journal
-from shiftsim.runs.results import TaskResult
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.scenarios import Split
-from shiftsim.runs.task import Scenarios, attempt
-from shiftsim.runs.verdicts import (
-    ACCEPTED,
-    AREA,
-    COLLISION,
-    DROPPED,
-    FAILED,
-    OFF_ROUTE,
-    STANDING,
-    VERDICTS,
-    Verdicts,
-)
+from shiftsim.runs.tables import TaskResult
+from shiftsim.runs.task import ScenarioReader, attempt
 from shiftsim.runs.workers import map_unordered
 from shiftsim.sim.loop import simulate
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import center_poses
 
+RESULTS = "filter/verdicts.parquet"
+ACCEPTED, DROPPED, FAILED = "accepted", "dropped", "failed"
+COLLISION, AREA = "at-fault collision", "drivable area"
+STANDING, OFF_ROUTE = "path too short", "progress along the route"
+
+SCHEMA = pa.schema(
+    [
+        pa.field("token", pa.string(), nullable=False),
+        pa.field("verdict", pa.string(), nullable=False),  # accepted, dropped or failed
+        pa.field("reason", pa.string(), nullable=False),  # rules broken, or the error
+        pa.field("no_at_fault_collisions", pa.float64()),  # score
+        pa.field("drivable_area_compliance", pa.float64()),  # score
+        pa.field("max_outside_m", pa.float64()),  # furthest corner outside the drivable area
+        pa.field("path_m", pa.float64()),  # travelled from iteration 0 to the last one
+        pa.field("progress_m", pa.float64()),  # of it along the route driven
+        pa.field("partner_token", pa.string()),  # of the first at-fault collision
+        pa.field("first_violation_s", pa.float64()),  # since iteration 0, of the first rule broken
+    ]
+)
 _UNFINISHED = "filter/unfinished.sqlite"
 _COLLISIONS, _DRIVABLE = "no_ego_at_fault_collisions", "drivable_area_compliance"
 _PROGRESS = "expert_total_progress_along_route"
@@ -71,12 +74,75 @@ class FilterConfig:
             )
 
 
+@dataclass(frozen=True)
+class FilterResults:
+    """Which scenarios of a store may be used, and why others may not."""
+
+    path: Path  # the file
+    # one row per scenario, sorted by token; the columns of the file
+    rows: tuple[Mapping[str, Any], ...]
+    hash: str  # digest of the file
+    config: Mapping[str, Any]  # what a scenario had to satisfy
+
+    @property
+    def accepted(self) -> tuple[str, ...]:
+        """Tokens of the accepted scenarios, sorted."""
+        return tuple(row["token"] for row in self.rows if row["verdict"] == ACCEPTED)
+
+    @property
+    def rejected(self) -> tuple[Mapping[str, Any], ...]:
+        """Rows of the scenarios that were dropped or could not be driven."""
+        return tuple(row for row in self.rows if row["verdict"] != ACCEPTED)
+
+    def counts(self) -> dict[str, int]:
+        """How many scenarios there are by verdict, and how many break each rule."""
+        names = (ACCEPTED, DROPPED, FAILED, COLLISION, AREA, STANDING, OFF_ROUTE)
+        out = dict.fromkeys(names, 0)
+        for row in self.rows:
+            out[row["verdict"]] += 1
+            for reason in row["reason"].split(", ") if row["verdict"] == DROPPED else ():
+                out[reason] += 1
+        return out
+
+
+def _read(store: Path) -> FilterResults:
+    """The results that a store holds.
+
+    Raises:
+        DataError: The file is missing or damaged.
+    """
+    path = store / RESULTS
+    table = Table(path, SCHEMA)
+    config = table.footer.get("config")
+    if not isinstance(config, dict):
+        raise DataError(f"{path}: the footer has no 'config'", hint=f"shiftsim filter {store}")
+    return FilterResults(path, tuple(table.read().to_pylist()), digest(path), config)
+
+
+def read_filter_results(store: str | Path, store_hash: str) -> FilterResults | None:
+    """The results for a store, whose content has a hash; None where it was not filtered.
+
+    Raises:
+        DataError: The file is damaged, or of another content of the store.
+    """
+    path = Path(store)
+    if not (path / RESULTS).is_file():
+        return None
+    found = _read(path)
+    if Table(found.path, SCHEMA).footer.get("store") != store_hash:
+        raise DataError(
+            f"{found.path}: the verdicts are of another content of the store",
+            hint=f"shiftsim filter {path}, or --all to use every scenario",
+        )
+    return found
+
+
 class Playback:
     """Finds the verdict on one scenario after the other."""
 
     def __init__(self, store: Path, config: FilterConfig) -> None:
         self.config = config
-        self._scenarios = Scenarios(str(store))
+        self._scenarios = ScenarioReader(str(store))
 
     def __call__(self, token: str) -> dict[str, Any]:
         """The row of the verdict, also where the scenario cannot be driven."""
@@ -131,7 +197,7 @@ def filter_store(
     *,
     workers: int = 0,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Verdicts:
+) -> FilterResults:
     """Find the verdict on every scenario of a store, and write them into it.
 
     A filter that was interrupted goes on where it stopped. Verdicts that were found with the same
@@ -145,12 +211,12 @@ def filter_store(
     opened = open_store(path)
     conditions = _conditions(config, opened.hash, opened.reviews.route_hash)
     number = max(1, min(workers or default_workers(), len(opened)))
-    unfinished = below(path, _UNFINISHED)
+    unfinished = safe_join(path, _UNFINISHED)
     unfinished.parent.mkdir(exist_ok=True)
     journal = Journal(unfinished, keep=True)
     try:
-        kept = [row for _, key, row, _ in journal.items() if key.startswith(conditions["hash"])]
-        rows = (*_finished(path, conditions), *kept)
+        resumed = [row for _, key, row, _ in journal.items() if key.startswith(conditions["hash"])]
+        rows = (*_finished(path, conditions), *resumed)
         done = {row["token"]: row for row in rows if row["verdict"] != FAILED}
         waiting = [token for token in opened.tokens if token not in done]
         on_progress(len(done), len(opened))
@@ -162,12 +228,12 @@ def filter_store(
                 done[outcome.task] = row
                 on_progress(len(done), len(opened))
         found = [dict(done[token]) for token in opened.tokens]
-        table = pa.Table.from_pylist(found, schema=verdicts.SCHEMA)
-        write_blocks(path / VERDICTS, [table], conditions)
+        table = pa.Table.from_pylist(found, schema=SCHEMA)
+        write_blocks(path / RESULTS, [table], conditions)
         journal.remove()
     finally:
         journal.close()
-    return verdicts.read(path)
+    return _read(path)
 
 
 def _conditions(config: FilterConfig, store_hash: str, route_hash: str) -> dict[str, Any]:
@@ -186,74 +252,15 @@ def _conditions(config: FilterConfig, store_hash: str, route_hash: str) -> dict[
 
 def _failed(token: str, reason: str) -> dict[str, Any]:
     row = {"token": token, "verdict": FAILED, "reason": reason}
-    return dict.fromkeys(verdicts.SCHEMA.names) | row
+    return dict.fromkeys(SCHEMA.names) | row
 
 
 def _finished(store: Path, conditions: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
-    if not (store / VERDICTS).is_file():
+    if not (store / RESULTS).is_file():
         return ()
     try:
-        found = verdicts.read(store)
+        found = _read(store)
     except DataError:
         return ()  # it is written anew
-    same = Table(found.path, verdicts.SCHEMA).footer.get("hash") == conditions["hash"]
+    same = Table(found.path, SCHEMA).footer.get("hash") == conditions["hash"]
     return found.rows if same else ()
-
-
-def choose_scenarios(
-    rows: Iterable[Mapping[str, str]],
-    usable: Collection[str],
-    *,
-    wanted: Mapping[str, Collection[str]],
-    per_type: int | None = None,
-    limit: int | None = None,
-) -> tuple[str, ...]:
-    """Tokens of some scenarios of a store, sorted: the first ones up to the limits.
-
-    The rows hold `token`, `type` and `city` of every scenario, `usable` the tokens to choose from,
-    and `wanted` values by column, none for any.
-
-    Raises:
-        ConfigError: No scenario has one of the values wanted.
-    """
-    table = sorted(rows, key=itemgetter("token"))
-    for column, values in wanted.items():
-        known = sorted({row[column] for row in table})
-        for value in values:
-            one_of(column, value, known)
-    counts: Counter[str] = Counter()
-    chosen = []
-    for row in table:
-        fits = all(not values or row[column] in values for column, values in wanted.items())
-        if not fits or row["token"] not in usable:
-            continue
-        counts[row["type"]] += 1
-        if per_type is None or counts[row["type"]] <= per_type:
-            chosen.append(row["token"])
-    return tuple(chosen[:limit])
-
-
-def write_split(path: Path, tokens: tuple[str, ...]) -> Split:
-    """Write a split that `read_split` reads: TOML with count and hash, or text for `.txt`.
-
-    It is named after the file.
-
-    Raises:
-        ConfigError: There are no tokens, the file ends otherwise, or it cannot be written.
-    """
-    split = Split(path.stem, tokens)
-    if not tokens:
-        raise ConfigError(f"split {split.name!r} would be empty", hint="ask for less")
-    if path.suffix == ".txt":
-        lines = list(tokens)
-    elif path.suffix == ".toml":
-        head = f'name = {json.dumps(split.name)}\ncount = {len(tokens)}\nhash = "{split.hash}"'
-        lines = [head, "tokens = [", *(f'    "{token}",' for token in tokens), "]"]
-    else:
-        raise ConfigError(f"split {str(path)!r} is no .toml or .txt file", hint="name it so")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("\n".join([*lines, ""]), encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"cannot write {str(path)!r}: {error}", hint="choose another") from error
-    return split

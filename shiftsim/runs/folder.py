@@ -9,30 +9,19 @@ import os
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 
-from shiftsim.data.store.tables import TableWriter
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.files import below, draft, whole_file, write_text
+from shiftsim.files import atomic_write, safe_join, write_text
 from shiftsim.runs.journal import Journal
-from shiftsim.runs.results import (
-    JOURNAL,
-    MISSING,
-    OK,
-    PLACE,
-    STATUSES,
-    TABLES,
-    TEXTS,
-    Run,
-    TaskResult,
-    open_run,
-    stored_results,
-)
+from shiftsim.runs.results import JOURNAL, Run, open_run
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.rollouts.columns import decode_rows
 from shiftsim.runs.rollouts.files import (
@@ -42,12 +31,12 @@ from shiftsim.runs.rollouts.files import (
     RolloutReader,
     next_number,
     num_rows,
-    part_file,
     part_name,
     without_key,
 )
+from shiftsim.runs.tables import MISSING, STATUSES, TABLES, TaskResult, stored_results
 
-WRITE_OPTIONS: dict[str, Any] = {
+_WRITE_OPTIONS: dict[str, Any] = {
     "compression": "zstd",
     "compression_level": 3,
     "version": "2.6",
@@ -55,11 +44,10 @@ WRITE_OPTIONS: dict[str, Any] = {
     "use_dictionary": True,
     "write_statistics": True,
 }
-ROW_GROUP = 1 << 16  # rows
-_CHUNK = 256  # results turned into tables at once
+_ROW_GROUP = 1024  # tasks
 
 
-class Ended(NamedTuple):
+class TaskRecord(NamedTuple):
     """A task that has ended."""
 
     number: int  # its entry in the journal
@@ -88,48 +76,54 @@ class RunWriter:
         """
         self.path = path
         path.mkdir(parents=True, exist_ok=True)
-        self.rollouts = below(path, FOLDER)
+        self.rollouts = safe_join(path, FOLDER)
         self._journal = Journal(path / JOURNAL, keep=resume)
-        self.ended = dict(self._entries())
-        before = _finished(path)
+        self.ended = dict(self._records())
+        try:
+            before = open_run(path)
+        except (ConfigError, DataError):
+            before = None
         if before is not None and resume and not self.ended:
             self._journal.put_all(map(_entry, stored_results(path)))
-            self.ended = dict(self._entries())
+            self.ended = dict(self._records())
         if before is None or not before.is_complete:
             self._write_manifest(manifest | {"state": "running", "counts": {}})
         self.rollouts.mkdir(exist_ok=True)
         self._number = next_number(self.rollouts)  # of the next file that is linked to
         self._linked: dict[Path, Path] = {}
 
-    def _entries(self) -> Iterator[tuple[Task, Ended]]:
+    def _records(self) -> Iterator[tuple[Task, TaskRecord]]:
         for number, key, values, has_rollout in self._journal.items():
-            place = values["place"] and Place(
-                part_file(self.rollouts, values["place"][0]), *values["place"][1:]
-            )
-            yield Task(*json.loads(key)), Ended(number, values["status"], place, has_rollout)
+            result = TaskResult.from_json(Task(*json.loads(key)), values, self.rollouts)
+            yield result.task, TaskRecord(number, result.status, result.location, has_rollout)
 
-    def results(self) -> Iterator[TaskResult]:
-        """What has ended so far, without the rollouts."""
-        for task, ended in self.ended.items():
-            values = self._journal.values(ended.number)
-            known = {name: values[name] for name in (*TEXTS, "seconds", "scores", "metrics")}
-            yield TaskResult(task, **known)
+    def result(self, task: Task) -> TaskResult:
+        """What became of a task that has ended, without its rollout."""
+        values = self._journal.values(self.ended[task].number)
+        return TaskResult.from_json(task, values, self.rollouts)
 
-    def add(self, result: TaskResult, *, stored: Place | None = None) -> None:
-        """Put one result on disk; its rollout may be `stored` by another run already.
+    def add(self, result: TaskResult) -> None:
+        """Put one result on disk; a file of another run that holds its rollout is linked to.
 
         Raises:
             OSError: The disk is full; what is there already stays.
         """
-        place = stored and stored._replace(file=self._link(stored.file))
-        number = self._journal.put(*_entry((result, place)), result.rollout)
-        self.ended[result.task] = Ended(number, result.status, place, bool(result.rollout))
+        if result.location is not None:
+            file = self._link(result.location.file)
+            result = replace(result, location=result.location._replace(file=file))
+        number = self._journal.put(*_entry(result), result.rollout)
+        record = TaskRecord(number, result.status, result.location, bool(result.rollout))
+        self.ended[result.task] = record
 
     def _link(self, file: Path) -> Path:
-        """Have a file of another run in this one, too; returns where it is here."""
+        """Have a file of another run in this one too, without its bytes where the disk can."""
         if file not in self._linked:
             target = self.rollouts / part_name(self._number)
-            _link(file, target)
+            try:
+                os.link(file, target)
+            except OSError:
+                with atomic_write(target) as partial:
+                    shutil.copyfile(file, partial)
             self._linked[file], self._number = target, self._number + 1
         return self._linked[file]
 
@@ -144,24 +138,23 @@ class RunWriter:
         `expected` are all tasks of a complete run; `absent` says why one has no result.
         """
         counts = {"expected": 0, **dict.fromkeys(STATUSES, 0)}
-        tables: list[_SortedTable] = []
-        try:
-            for name, schema in TABLES.items():
-                tables.append(_SortedTable(self.path / f"{name}.parquet", schema))
-            places = self._write_rollouts()
-            tasks = iter(sorted(expected))
-            while chunk := list(islice(tasks, _CHUNK)):
-                rows = [self._values(task, places.get(task), absent) for task in chunk]
-                for values in rows:
+        places = self._write_rollouts()
+        tasks = iter(sorted(expected))
+        with ExitStack() as files:
+            tables = {name: files.enter_context(self._table(name)) for name in TABLES}
+            while chunk := list(islice(tasks, _ROW_GROUP)):
+                rows: dict[str, list[dict[str, Any]]] = {name: [] for name in TABLES}
+                for task in chunk:
+                    if task in self.ended:
+                        result = replace(self.result(task), location=places.get(task))
+                    else:
+                        result = TaskResult(task, MISSING, error=absent(task))
                     counts["expected"] += 1
-                    counts[values["status"]] += 1
-                for table, content in zip(tables, _contents(chunk, rows), strict=True):
-                    table.add(content)
-            for table in tables:
-                table.close()
-        finally:
-            for table in tables:
-                table.discard()
+                    counts[result.status] += 1
+                    for name, found in result.rows().items():
+                        rows[name] += found
+                for name, table in tables.items():
+                    table.write_table(pa.Table.from_pylist(rows[name], TABLES[name]))
         self._write_manifest({**manifest, "counts": counts})
         self._journal.remove()  # what it points to is needed until then
         used = {place.file for place in places.values()}
@@ -170,22 +163,17 @@ class RunWriter:
                 path.unlink()
         return open_run(self.path)
 
+    @contextmanager
+    def _table(self, name: str) -> Iterator[pq.ParquetWriter]:
+        with (
+            atomic_write(self.path / f"{name}.parquet") as partial,
+            pq.ParquetWriter(partial, TABLES[name], **_WRITE_OPTIONS) as table,
+        ):
+            yield table
+
     def close(self) -> None:
         """Let another process work on the folder."""
         self._journal.close()
-
-    def _values(
-        self, task: Task, place: Place | None, absent: Callable[[Task], str]
-    ) -> dict[str, Any]:
-        """What the tables say of a task beyond its key."""
-        if task not in self.ended:
-            texts = dict.fromkeys(TEXTS, "") | {"status": MISSING, "error": absent(task)}
-            return {**texts, "seconds": {}, **dict.fromkeys(PLACE)}
-        columns = (place.file.name, place.row, place.rows) if place else (None, None, None)
-        return {
-            **self._journal.values(self.ended[task].number),
-            **dict(zip(PLACE, columns, strict=True)),
-        }
 
     def _write_rollouts(self) -> dict[Task, Place]:
         """Put the rollouts of a run that ends into files, those of a scenario together.
@@ -196,17 +184,17 @@ class RunWriter:
         Returns:
             Where they are.
         """
-        kept: Counter[Path] = Counter()
-        for ended in self.ended.values():
-            if ended.place:
-                kept[ended.place.file] += ended.place.rows
-        whole = {file for file, rows in kept.items() if rows == num_rows(file)}
+        rows_used: Counter[Path] = Counter()
+        for record in self.ended.values():
+            if record.place:
+                rows_used[record.place.file] += record.place.rows
+        complete = {file for file, rows in rows_used.items() if rows == num_rows(file)}
         places: dict[Task, Place] = {}
         writer, reader = PartWriter(self.rollouts), RolloutReader()
         try:
             for task in sorted(self.ended, key=lambda task: (task.token, task)):
                 number, _, place, has_rollout = self.ended[task]
-                if place and place.file in whole:
+                if place and place.file in complete:
                     places[task] = place
                 elif place:
                     places[task] = writer.add(task, without_key(reader.read(place)))
@@ -222,79 +210,6 @@ class RunWriter:
         write_text(self.path / "manifest.json", f"{text}\n")
 
 
-def _entry(found: tuple[TaskResult, Place | None]) -> tuple[str, dict[str, Any]]:
-    """A result as the journal has it, without its rollout."""
-    result, place = found
-    values = {name: getattr(result, name) for name in (*TEXTS, "seconds", "scores", "metrics")}
-    values["place"] = place and (place.file.name, place.row, place.rows)
-    return json.dumps(result.task), values
-
-
-def _contents(tasks: list[Task], values: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], ...]:
-    """Rows of the tables, in the order of `TABLES`."""
-    names = (*TEXTS, *PLACE)
-    keyed = [(task._asdict(), row) for task, row in zip(tasks, values, strict=True)]
-    done = [(key, row) for key, row in keyed if row["status"] == OK]
-    return (
-        [{**key, **{name: row[name] for name in names}, **row["seconds"]} for key, row in keyed],
-        [{**key, **row["scores"]} for key, row in done],
-        [{**key, **metric} for key, row in done for metric in row["metrics"]],
-    )
-
-
-class _SortedTable:
-    """A table that grows at its end; the file is there when it is closed, and not before.
-
-    Row groups are cut at fixed places whatever the pieces were.
-    """
-
-    def __init__(self, path: Path, schema: pa.Schema) -> None:
-        self.path, self.schema = path, schema
-        self._partial = draft(path)
-        self._writer = TableWriter(self._partial, schema, **WRITE_OPTIONS)
-        self._pending = schema.empty_table()
-
-    def add(self, rows: list[dict[str, Any]]) -> None:
-        self.add_table(pa.Table.from_pylist(rows, self.schema))
-
-    def add_table(self, table: pa.Table) -> None:
-        self._pending = pa.concat_tables([self._pending, table])
-        while len(self._pending) >= ROW_GROUP:
-            self._write(ROW_GROUP)
-
-    def _write(self, count: int) -> None:
-        group = self._pending.slice(0, count).combine_chunks()
-        self._writer.write_table(group, row_group_size=ROW_GROUP)
-        self._pending = self._pending.slice(count)
-
-    def close(self) -> None:
-        self._write(len(self._pending))
-        self._writer.close()
-        self._partial.replace(self.path)
-
-    def discard(self) -> None:
-        """Remove what is not finished."""
-        with suppress(OSError):
-            self._writer.close()
-        with suppress(OSError):  # a draft is in nobody's way
-            self._partial.unlink(missing_ok=True)
-
-
-def _link(source: Path, target: Path) -> None:
-    """The same file once more, without its bytes where the disk can do that."""
-    if target.exists() and target.samefile(source):
-        return
-    target.unlink(missing_ok=True)
-    try:
-        os.link(source, target)
-    except OSError:
-        with whole_file(target) as partial:
-            shutil.copyfile(source, partial)
-
-
-def _finished(path: Path) -> Run | None:
-    """The run in a folder, if there is one that has ended."""
-    try:
-        return open_run(path)
-    except (ConfigError, DataError):
-        return None
+def _entry(result: TaskResult) -> tuple[str, dict[str, Any]]:
+    """A result as an entry of the journal, without its rollout."""
+    return json.dumps(result.task), result.to_json()

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.files import below, locked
+from shiftsim.files import lock, safe_join
 
 _SETTINGS = (
     "locking_mode = exclusive",  # no third file, whose memory is shared between processes
@@ -27,7 +27,6 @@ _SETTINGS = (
 )
 # any other error is one of the disk
 _DAMAGED = (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
-_INSERT = "insert into entries (key, content, data) values (?, ?, ?)"
 
 
 class Journal:
@@ -39,10 +38,10 @@ class Journal:
         Raises:
             ConfigError: Another process works with it.
         """
-        self.path = below(path.parent, path.name)
-        self._appended = below(path.parent, f"{path.name}-wal")
+        self.path = safe_join(path.parent, path.name)
+        self._appended = safe_join(path.parent, f"{path.name}-wal")
         try:
-            self._lock = locked(path)
+            self._lock = lock(path)
         except BlockingIOError as error:
             raise ConfigError(
                 f"another process is working on {str(path.parent)!r}",
@@ -57,7 +56,7 @@ class Journal:
         vfs = "" if sys.platform == "win32" else "?vfs=unix-none"
         address = f"{self.path.absolute().as_uri()}{vfs}"
         database = sqlite3.connect(address, uri=True, isolation_level=None)
-        with self._explained():
+        with self._errors():
             for setting in _SETTINGS:
                 database.execute(f"pragma {setting}")
             database.execute(
@@ -72,15 +71,17 @@ class Journal:
         Raises:
             OSError: The disk is full; what is there already stays.
         """
-        row = (key, json.dumps(values, default=_plain), data)
-        with self._explained():
-            number = self._database.execute(_INSERT, row).lastrowid
+        # NumPy scalars as Python's
+        row = (key, json.dumps(values, default=lambda value: value.item()), data)
+        with self._errors():
+            query = "insert into entries (key, content, data) values (?, ?, ?)"
+            number = self._database.execute(query, row).lastrowid
         assert number is not None
         return number
 
     def put_all(self, entries: Iterable[tuple[str, Mapping[str, Any]]]) -> None:
         """Put entries on disk: all of them or, where the process is ended, none."""
-        with self._explained():
+        with self._errors():
             self._database.execute("begin")
             for key, values in entries:
                 self.put(key, values)
@@ -91,21 +92,21 @@ class Journal:
         if self._lock.seek(0, os.SEEK_END) == 0:
             return
         query = "select number, key, content, length(data) from entries order by number"
-        with self._explained():
+        with self._errors():
             for number, key, content, size in self._database.execute(query):
                 yield number, key, json.loads(content), size > 0
 
     def values(self, number: int) -> dict[str, Any]:
         """The values of an entry."""
-        return dict(json.loads(self._select("content", number)))
+        return dict(json.loads(self._column("content", number)))
 
     def data(self, number: int) -> bytes:
         """The bytes of an entry."""
-        return bytes(self._select("data", number))
+        return bytes(self._column("data", number))
 
-    def _select(self, column: str, number: int) -> Any:
-        query = f"select {column} from entries where number = ?"
-        with self._explained():
+    def _column(self, name: str, number: int) -> Any:
+        query = f"select {name} from entries where number = ?"
+        with self._errors():
             return self._database.execute(query, (number,)).fetchone()[0]
 
     def close(self) -> None:
@@ -120,10 +121,10 @@ class Journal:
             os.truncate(self._appended, 0)  # else closing copies all of it
         self.close()
         self._appended.unlink(missing_ok=True)
-        self.path.unlink()  # at last: whoever finds it comes here again
+        self.path.unlink()  # last: whoever finds it comes here again
 
     @contextmanager
-    def _explained(self) -> Iterator[None]:
+    def _errors(self) -> Iterator[None]:
         try:
             yield
         except sqlite3.DatabaseError as error:
@@ -140,8 +141,3 @@ class Journal:
 def has_entries(path: Path) -> bool:
     """Whether there is a journal with something in it; another process may be working with it."""
     return path.is_file() and path.stat().st_size > 0
-
-
-def _plain(value: Any) -> Any:
-    """NumPy scalars as Python's."""
-    return value.item()

@@ -3,8 +3,6 @@
 import hashlib
 import os
 import platform
-import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -15,26 +13,26 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-from shiftsim import __version__
+from shiftsim._version import __version__
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.files import PACKAGE, sources
+from shiftsim.files import PACKAGE
 from shiftsim.runs.config import RunConfig
 from shiftsim.runs.journal import has_entries
 from shiftsim.runs.results import FORMAT_VERSION, JOURNAL, read_manifest
 
 _PACKAGES = ("numpy", "numba", "scipy", "shapely", "pyarrow", "torch")
-# what computes a result: a task, and everything that may be named by a setting
-_ROOTS = ("runs/task.py", "planners/**/*.py", "sim/traffic/**/*.py")
+# what computes a result, and everything that may be named by a setting
+_SOURCES = (
+    "kernels.py",
+    "data/store/*.py",
+    *(
+        f"{name}/**/*.py"
+        for name in "compat edits geometry metrics planners runs sim world".split()
+    ),
+)
 
 State: TypeAlias = Literal["new", "unfinished", "failed", "complete"]
-_EARLIER_JOURNAL = "unfinished.jsonl"
-_MAX_MESSAGE = 600  # characters
-_DIGEST = re.compile("[0-9a-f]{16,64}")
 _NAMES = {"tokens": "scenarios", "review": "reviews"}  # in messages
-_DIGESTS = ("store", "tokens", "filter", "review", "code")
-# on disk when a run ends, of 15 s in non-reactive traffic with few others, so rather too little
-_BYTES_PER_TASK = 15e3
-_BYTES_PER_ROLLOUT = 73e3
 
 
 def make_manifest(
@@ -43,10 +41,13 @@ def make_manifest(
     config: RunConfig,
     split: str,
     store: str,
-    determining: dict[str, Any],
+    fingerprint: dict[str, Any],
     argv: Sequence[str],
 ) -> dict[str, Any]:
-    """What a run folder says about how its results were made; state and counts come later."""
+    """What a run folder says about how its results were made; state and counts come later.
+
+    The run fingerprint, `determining` in the file, is everything that scores depend on.
+    """
     return {
         "format": FORMAT_VERSION,
         "run": folder.name,
@@ -57,7 +58,7 @@ def make_manifest(
         "shard": config.shard,
         "store": store,
         "counts": {},
-        "determining": determining,
+        "determining": fingerprint,
         "started": now(),
         "versions": versions(),
         "machine": {
@@ -78,9 +79,9 @@ def now() -> str:
 def code_digest() -> str:
     """Digest of all sources that results depend on: two versions of them are not mixed."""
     digest = hashlib.blake2b(digest_size=8)
-    roots = [path for pattern in _ROOTS for path in PACKAGE.glob(pattern)]
-    for name, source in sorted(sources(roots).items()):
-        digest.update(f"{name}\n".encode() + source)
+    for path in sorted(path for pattern in _SOURCES for path in PACKAGE.glob(pattern)):
+        name = path.relative_to(PACKAGE).as_posix()
+        digest.update(f"{name}\n".encode() + path.read_bytes())
     return digest.hexdigest()
 
 
@@ -114,16 +115,10 @@ def state_of(folder: Path) -> State:
 
     Raises:
         DataError: The folder holds something else.
-        ConfigError: It holds an unfinished run of an earlier version.
     """
     if not folder.exists() or (folder.is_dir() and not _has_content(folder)):
         return "new"
     manifest = read_manifest(folder)
-    if has_entries(folder / _EARLIER_JOURNAL):
-        raise ConfigError(
-            f"{str(folder)!r} holds an unfinished run of an earlier version of shiftsim",
-            hint="it cannot be finished: remove the folder and run again",
-        )
     has_results = has_entries(folder / JOURNAL)
     if manifest["state"] == "running" and not has_results:
         return "new"
@@ -142,7 +137,7 @@ def _has_content(folder: Path) -> bool:
     return names != {JOURNAL} or has_entries(folder / JOURNAL) if names else False
 
 
-def check_target(folder: Path, determining: dict[str, Any], *, shard: str = "") -> State:
+def check_target(folder: Path, fingerprint: dict[str, Any], *, shard: str = "") -> State:
     """How far the run in a folder is, to which another one is to be written: the same, or none yet.
 
     Raises:
@@ -156,46 +151,24 @@ def check_target(folder: Path, determining: dict[str, Any], *, shard: str = "") 
         ) from error
     if state == "new":
         return state
-    different = difference(read_manifest(folder), determining, shard)
-    if different:
+    differs = difference(read_manifest(folder), fingerprint, shard)
+    if differs:
         raise ConfigError(
-            f"{str(folder)!r} holds another run: {different}"[:_MAX_MESSAGE],
+            f"{str(folder)!r} holds another run: {differs}",
             hint="choose another --out, or remove that folder",
         )
     return state
 
 
-def difference(manifest: dict[str, Any], determining: dict[str, Any], shard: str = "") -> str:
-    """What tells a run from the one of a manifest, in words; empty when nothing does."""
+def difference(manifest: dict[str, Any], fingerprint: dict[str, Any], shard: str = "") -> str:
+    """The settings that differ from those of a manifest, in words; empty when none does."""
     before = {**manifest.get("determining", {}), "shard": manifest.get("shard", "")}
-    after = {**determining, "shard": shard}
+    after = {**fingerprint, "shard": shard}
     names = [n for n in sorted({*before, *after}) if before.get(n) != after.get(n)]
-    if not names:
-        return ""
-    first = _in_words(names[0], before.get(names[0]), after.get(names[0]))
-    shown = ", ".join(_NAMES.get(name, name) for name in names)
-    return f"{shown} differ{first and f' ({first})'}"
+    return f"{', '.join(_NAMES.get(name, name) for name in names)} differ" if names else ""
 
 
-def _in_words(name: str, old: Any, new: Any) -> str:
-    """How one setting differs; empty for digests, which say nothing."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        if old.keys() == new.keys():
-            inner = next(key for key in old if old[key] != new[key])
-            return _in_words(f"{name} {inner}", old[inner], new[inner])
-        old, new = list(old), list(new)
-    if any(isinstance(value, str) and _DIGEST.fullmatch(value) for value in (old, new)):
-        return "" if name in _DIGESTS else f"{name} is another"
-    return f"{name}: {_value(old)}, not {_value(new)}"
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, list):
-        return ", ".join(map(str, value)) or "none"
-    return "none" if value in (None, "", {}) else str(value)
-
-
-def check_resumable(folder: Path, determining: dict[str, Any], *, shard: str = "") -> None:
+def check_resumable(folder: Path, fingerprint: dict[str, Any], *, shard: str = "") -> None:
     """Refuse to begin anew where an unfinished run with other settings seems to be meant.
 
     Raises:
@@ -209,27 +182,8 @@ def check_resumable(folder: Path, determining: dict[str, Any], *, shard: str = "
                 continue
         except (DataError, KeyError):
             continue
-        different = difference(manifest, determining, shard)
-        text = f"no unfinished run with these settings; {str(other)!r} is another one: {different}"
+        differs = difference(manifest, fingerprint, shard)
         raise ConfigError(
-            text[:_MAX_MESSAGE], hint="give its settings, or leave out --resume to begin anew"
-        )
-
-
-def check_space(folder: Path, num_tasks: int, *, with_rollouts: bool) -> None:
-    """Refuse a run that cannot end in its folder, which need not exist yet.
-
-    Raises:
-        ConfigError: The disk has too little space.
-    """
-    place = folder.absolute()
-    while not place.exists():
-        place = place.parent
-    needed = num_tasks * (_BYTES_PER_TASK + _BYTES_PER_ROLLOUT * with_rollouts)
-    free = shutil.disk_usage(place).free
-    if needed > free:
-        raise ConfigError(
-            f"{num_tasks} tasks need about {needed / 1e9:.1f} GB, "
-            f"{str(place)!r} has {free / 1e9:.1f} GB free",
-            hint="choose another --out" + ", or --save-rollouts failed" * with_rollouts,
+            f"no unfinished run with these settings; {str(other)!r} is another one: {differs}",
+            hint="give its settings, or leave out --resume to begin anew",
         )

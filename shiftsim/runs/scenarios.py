@@ -5,21 +5,24 @@ their maps, so that the folder alone is enough to score, view and plot it anywhe
 """
 
 import hashlib
+import json
 import shutil
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from shiftsim.data.store.reading import ScenarioStore, open_store
 from shiftsim.data.store.tables import REVIEW
-from shiftsim.errors import ConfigError, DataError, nearest
-from shiftsim.files import below, read_toml, store_path
-from shiftsim.runs.config import DEFAULT_STORE
+from shiftsim.errors import ConfigError, DataError, nearest, one_of
+from shiftsim.files import read_toml, safe_join, store_path
+from shiftsim.runs.config import DEFAULT_STORE, RunConfig
 from shiftsim.runs.results import Run
 
 if TYPE_CHECKING:
-    from shiftsim.runs.edits.edited import EditSet
+    from shiftsim.runs.edited import EditSet
 
 BUNDLE = "store"  # folder below that of the run
 
@@ -34,7 +37,7 @@ def open_named_store(name: str) -> ScenarioStore:
         return open_store(name)
     path = store_path(name)
     if name == DEFAULT_STORE and not path.exists():
-        from shiftsim.data.demo.store import demo_store
+        from shiftsim.data.synthetic.store import demo_store
 
         path = demo_store(path)
     if not path.exists():
@@ -80,7 +83,7 @@ def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
         )
     found.hash = run.manifest["determining"]["store"]
     if edits := run.manifest.get("edits"):
-        from shiftsim.runs.edits.edited import EditedStore, make_edits
+        from shiftsim.runs.edited import EditedStore, make_edits
 
         return EditedStore(found, make_edits(edits, run.path.name), edits.get("made"))
     return found
@@ -92,18 +95,97 @@ def open_edits(name: str, store: ScenarioStore) -> "EditSet":
     Raises:
         ConfigError: There is no such file, or it is wrong.
     """
-    from shiftsim.runs.edits.edited import read_edits
+    from shiftsim.runs.edited import read_edits
 
     path, known = Path(store.path), store.tokens
     edits = read_edits(name, path)
     return edits.with_splits(lambda split: find_split(split, path, known).tokens)
 
 
+class Selection(NamedTuple):
+    """The scenarios of a run, whatever its shard."""
+
+    split: str  # name of the split
+    present: list[str]  # tokens that the store holds
+    missing: list[str]  # tokens that it does not hold
+    num_dropped: int  # scenarios left out because the filter dropped them
+    fingerprint: dict[str, Any]  # what identifies them
+    edits: "EditSet | None" = None  # what makes them of recorded ones
+    edited: Mapping[str, Any] = {}  # which are made of which, for the manifest
+
+    @property
+    def tokens(self) -> tuple[str, ...]:
+        """All tokens."""
+        return (*self.present, *self.missing)
+
+
+def select_scenarios(
+    config: RunConfig, store: ScenarioStore, given: "EditSet | None" = None
+) -> Selection:
+    """The scenarios of a run; edits that are `given` take the place of those in the settings.
+
+    Raises:
+        ShiftsimError: A split or edits are unknown or wrong, or scenarios are missing.
+    """
+    known = tuple(store.tokens)
+    usable, fingerprint = known, {"store": store.hash}
+    if config.split in ("", store.path.name) and not config.all_scenarios:
+        usable, filter_hash = _usable(config, store)
+        if filter_hash:
+            fingerprint["filter"] = filter_hash
+    split = find_split(config.split, Path(store.path), usable)
+    name, tokens, store_tokens, edited = split.name, split.tokens, set(known), dict[str, Any]()
+    edits = given or (open_edits(config.edits, store) if config.edits else None)
+    if edits is not None:
+        edits.require_traffic(config.traffic)
+        edited = edits.describe(store, tokens)
+        name, tokens, store_tokens = f"{name}+{edits.name}", tuple(edited), set(edited)
+        fingerprint["edits"] = edits.digest
+    tokens = tokens[: config.limit] if config.limit else tokens
+    missing = sorted(set(tokens) - store_tokens)
+    if missing and not config.allow_partial:
+        raise DataError(
+            f"split {split.name!r} needs {len(tokens)} scenarios, store {config.store!r} "
+            f"lacks {len(missing)} of them, such as {missing[0]!r}",
+            hint="convert the missing scenarios, or --allow-partial",
+        )
+    if len(missing) == len(tokens):
+        raise DataError(
+            f"split {split.name!r}: store {config.store!r} holds none of its scenarios",
+            hint="name the store that was converted for this split",
+        )
+    fingerprint["tokens"] = token_hash(tokens)
+    if store.is_reviewed and store.reviews.hash:
+        fingerprint["review"] = store.reviews.hash
+    present = [token for token in tokens if token in store_tokens]
+    dropped = len(known) - len(usable)
+    return Selection(name, present, missing, dropped, fingerprint, edits, edited)
+
+
+def _usable(config: RunConfig, store: ScenarioStore) -> tuple[tuple[str, ...], str]:
+    """The scenarios of a whole store that filter and review accept, and the filter's hash."""
+    from shiftsim.runs.filter import read_filter_results
+
+    known, filter_hash = tuple(store.tokens), ""
+    usable, results = known, read_filter_results(store.path, store.hash)
+    if results is not None:
+        if not results.accepted:
+            raise DataError(
+                f"store {config.store!r}: the filter dropped all {len(results.rows)} scenarios",
+                hint="`shiftsim filter` says why; --all to use them nevertheless",
+            )
+        accepted, filter_hash = set(results.accepted), results.hash
+        usable = tuple(token for token in known if token in accepted)
+    if store.is_reviewed:
+        usable = store.reviews.usable(known, usable)
+    return usable, filter_hash
+
+
 def write_bundle(store: ScenarioStore, folder: Path, tokens: Iterable[str]) -> dict[str, Any]:
     """Copy scenarios with their recordings and maps into a run folder; for its manifest."""
-    target = below(folder, BUNDLE)
+    target = safe_join(folder, BUNDLE)
     if not target.exists():
-        partial = below(folder, f".{BUNDLE}.tmp")
+        partial = safe_join(folder, f".{BUNDLE}.tmp")
         shutil.rmtree(partial, ignore_errors=True)
         _copy(store, partial, set(tokens))
         partial.rename(target)
@@ -208,4 +290,63 @@ def read_split(path: Path) -> Split:
                 f"split {str(path)!r} says {name} = {table[name]!r}, but it is {value!r}",
                 hint="the file was edited or cut off; fetch or write it again",
             )
+    return split
+
+
+def choose_scenarios(
+    rows: Iterable[Mapping[str, str]],
+    usable: Collection[str],
+    *,
+    wanted: Mapping[str, Collection[str]],
+    per_type: int | None = None,
+    limit: int | None = None,
+) -> tuple[str, ...]:
+    """Tokens of some scenarios of a store, sorted: the first ones up to the limits.
+
+    The rows hold `token`, `type` and `city` of every scenario, `usable` the tokens to choose from,
+    and `wanted` values by column, none for any.
+
+    Raises:
+        ConfigError: No scenario has one of the values wanted.
+    """
+    table = sorted(rows, key=itemgetter("token"))
+    for column, values in wanted.items():
+        known = sorted({row[column] for row in table})
+        for value in values:
+            one_of(column, value, known)
+    counts: Counter[str] = Counter()
+    chosen = []
+    for row in table:
+        fits = all(not values or row[column] in values for column, values in wanted.items())
+        if not fits or row["token"] not in usable:
+            continue
+        counts[row["type"]] += 1
+        if per_type is None or counts[row["type"]] <= per_type:
+            chosen.append(row["token"])
+    return tuple(chosen[:limit])
+
+
+def write_split(path: Path, tokens: tuple[str, ...]) -> Split:
+    """Write a split that `read_split` reads: TOML with count and hash, or text for `.txt`.
+
+    It is named after the file.
+
+    Raises:
+        ConfigError: There are no tokens, the file ends otherwise, or it cannot be written.
+    """
+    split = Split(path.stem, tokens)
+    if not tokens:
+        raise ConfigError(f"split {split.name!r} would be empty", hint="ask for less")
+    if path.suffix == ".txt":
+        lines = list(tokens)
+    elif path.suffix == ".toml":
+        head = f'name = {json.dumps(split.name)}\ncount = {len(tokens)}\nhash = "{split.hash}"'
+        lines = [head, "tokens = [", *(f'    "{token}",' for token in tokens), "]"]
+    else:
+        raise ConfigError(f"split {str(path)!r} is no .toml or .txt file", hint="name it so")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("\n".join([*lines, ""]), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"cannot write {str(path)!r}: {error}", hint="choose another") from error
     return split

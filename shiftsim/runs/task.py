@@ -8,7 +8,7 @@ them: the open store, what copies of each planner are made from, and the last sc
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -16,17 +16,16 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 import pyarrow as pa
 
-from shiftsim.data.store.reading import open_store
+from shiftsim.data.store.reading import ScenarioStore, open_store
 from shiftsim.errors import ConfigError, ShiftsimError, readable
 from shiftsim.files import place_of
 from shiftsim.metrics import METRIC_VERSION, SHORT_NAMES, MetricRow, compute_metrics
-from shiftsim.metrics.interplan import add_interplan
-from shiftsim.planners.original import Original
+from shiftsim.planners.prototype import PlannerPrototype
 from shiftsim.planners.registry import RunPlanner
 from shiftsim.runs.config import RunConfig
-from shiftsim.runs.results import FAILED, OK, TABLES, TaskResult
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.rollouts.columns import encode_rows, rollout_rows
+from shiftsim.runs.tables import FAILED, OK, TABLES, TaskResult
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import Rollout, Setting, drive, simulate_together
 from shiftsim.sim.noise import NoiseModel, is_standard
@@ -35,7 +34,7 @@ from shiftsim.sim.traffic import BatchTraffic, Traffic, make_traffic
 from shiftsim.world.scenario import Scenario
 
 if TYPE_CHECKING:
-    from shiftsim.runs.edits.edited import EditSet
+    from shiftsim.runs.edited import EditSet
 
 T = TypeVar("T")
 
@@ -61,28 +60,12 @@ class Batch:
         return [Batch((task,)) for task in self.tasks]
 
 
-class Stopwatch:
-    """How long parts of a task took: `seconds` by column of `tasks.parquet` [s]."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
-        """Measure what is done within, whether it succeeds or not."""
-        began = perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[name] = perf_counter() - began
-
-
-class Scenarios:
+class ScenarioReader:
     """A store that is opened when it is needed, and the scenario that was read last."""
 
     def __init__(self, store: str, edits: "EditSet | None" = None) -> None:
         self.store, self.edits = store, edits
-        self._open: Any = None
+        self._open: ScenarioStore | None = None
         self._last: Scenario | None = None
 
     def read(self, token: str) -> Scenario:
@@ -95,105 +78,124 @@ class Scenarios:
         return self._last
 
 
-@dataclass
+@contextmanager
+def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    """Measure what is done within, whether it succeeds or not."""
+    began = perf_counter()
+    try:
+        yield
+    finally:
+        seconds[name] = perf_counter() - began
+
+
 class TaskRunner:
     """Does batches of tasks, one after the other."""
 
-    config: RunConfig  # the settings of the run
-    store: str  # folder or URL of the scenario store
-    planners: Mapping[str, RunPlanner]  # the planners, by name
-    noises: Mapping[str, NoiseModel]  # the noise models, by name
-    traffic: RunPlanner | None = None  # who drives the other vehicles, where that is a planner
-    edits: "EditSet | None" = None  # what makes the scenarios of recorded ones
-    _originals: dict[str, Original] = field(default_factory=dict, init=False)
-
-    def __post_init__(self) -> None:
-        self._scenarios = Scenarios(self.store, self.edits)
+    def __init__(
+        self,
+        config: RunConfig,
+        store: str,
+        planners: Mapping[str, RunPlanner],
+        noises: Mapping[str, NoiseModel],
+        *,
+        traffic: RunPlanner | None = None,
+        edits: "EditSet | None" = None,
+    ) -> None:
+        """Planners and noise models are by name; `traffic` is a planner that drives vehicles."""
+        self.config, self.planners, self.noises = config, planners, noises
+        self.traffic, self.edits = traffic, edits
+        self._scenarios = ScenarioReader(store, edits)
+        self._prototypes: dict[str, PlannerPrototype] = {}
         self._network: BatchTraffic | None = None
 
     def __call__(self, batch: Batch) -> list[TaskResult]:
         """One result per task."""
         if len(batch.tasks) == 1:
-            return [self._alone(batch.tasks[0])]
-        return self._together(batch)
+            return [self._run_one(batch.tasks[0])]
+        return self._run_together(batch)
 
-    def _alone(self, task: Task) -> TaskResult:
-        watch = Stopwatch()
-        result = attempt(task, partial(self._drive, task, watch))
-        return replace(result, seconds=watch.seconds)
+    def _run_one(self, task: Task) -> TaskResult:
+        seconds: dict[str, float] = {}
+        return replace(attempt(task, partial(self._drive, task, seconds)), seconds=seconds)
 
-    def _drive(self, task: Task, watch: Stopwatch) -> TaskResult:
-        with watch("read_seconds"):
+    def _drive(self, task: Task, seconds: dict[str, float]) -> TaskResult:
+        with _timed(seconds, "read_seconds"):
             scenario = self._scenarios.read(task.token)
-        with watch("simulate_seconds"):
+        with _timed(seconds, "simulate_seconds"):
             planner = self._planner(task)
             try:
                 rollout = Rollout(scenario, planner, self._setting(task))
                 log = drive(rollout)
             finally:
-                if planner is not None:
-                    self._originals[task.planner].release(planner)
-        return self._scored(task, rollout, log, watch)
+                self._release(task, planner)
+        return self._score(task, rollout, log, seconds)
 
-    def _together(self, batch: Batch) -> list[TaskResult]:
+    def _run_together(self, batch: Batch) -> list[TaskResult]:
         """Several tasks in lock step; each of them fails for itself."""
-        watches = {task: Stopwatch() for task in batch.tasks}
-        begun = {task: attempt(task, partial(self._begin, task, watches[task])) for task in watches}
-        rollouts = {task: found for task, found in begun.items() if isinstance(found, Rollout)}
-        results = {task: found for task, found in begun.items() if isinstance(found, TaskResult)}
+        seconds: dict[Task, dict[str, float]] = {task: {} for task in batch.tasks}
+        results, rollouts = dict[Task, TaskResult](), dict[Task, Rollout]()
+        for task in batch.tasks:
+            found = attempt(task, partial(self._begin, task, seconds[task]))
+            if isinstance(found, TaskResult):
+                results[task] = found
+            else:
+                rollouts[task] = found
         began = perf_counter()
         try:
             logs = simulate_together(list(rollouts.values()))
         except (Exception, SystemExit):
             # the shared pass itself failed: too little memory for all of them?
-            return [self._alone(task) for task in batch.tasks]
+            return [self._run_one(task) for task in batch.tasks]
         finally:
             for task, rollout in rollouts.items():
-                if rollout.planner is not None:
-                    self._originals[task.planner].release(rollout.planner)
+                self._release(task, rollout.planner)
         share = (perf_counter() - began) / max(1, len(logs))
         for (task, rollout), log in zip(rollouts.items(), logs, strict=True):
-            watches[task].seconds["simulate_seconds"] = share
-            score = partial(self._scored, task, rollout, log, watches[task])
-            results[task] = attempt(task, score)
-        return [replace(results[task], seconds=watches[task].seconds) for task in batch.tasks]
+            seconds[task]["simulate_seconds"] = share
+            results[task] = attempt(task, partial(self._score, task, rollout, log, seconds[task]))
+        return [replace(results[task], seconds=seconds[task]) for task in batch.tasks]
 
-    def _begin(self, task: Task, watch: Stopwatch) -> Rollout:
-        with watch("read_seconds"):
+    def _begin(self, task: Task, seconds: dict[str, float]) -> Rollout:
+        with _timed(seconds, "read_seconds"):
             scenario = self._scenarios.read(task.token)
         return Rollout(scenario, self._planner(task), self._setting(task))
 
-    def _scored(
-        self, task: Task, rollout: Rollout, log: SimulationLog | Exception, watch: Stopwatch
+    def _score(
+        self,
+        task: Task,
+        rollout: Rollout,
+        log: SimulationLog | Exception,
+        seconds: dict[str, float],
     ) -> TaskResult:
         if isinstance(log, Exception):
             raise log
-        scenario = rollout.scenario
-        watch.seconds.update(planning_times(log))
-        with watch("metrics_seconds"):
+        scenario, per_step = rollout.scenario, log.planning_seconds * 1e3
+        seconds["planner_seconds"] = float(log.planning_seconds.sum())
+        seconds["planning_ms_mean"] = float(per_step.mean())
+        seconds["planning_ms_p95"] = float(np.percentile(per_step, 95))
+        with _timed(seconds, "metrics_seconds"):
             scores, metrics = score_rollout(scenario, log, self.config)
-        keep = self.config.save_rollouts
-        stored = b""
+        keep, encoded = self.config.save_rollouts, b""
         if keep == "all" or (keep == "failed" and scores["cls"] == 0.0):
-            # walkers of an edit wait for the ego
+            # pedestrians of an edit wait for the ego
             own_tracks = self.config.traffic != "nonreactive" or self.edits is not None
             own_noise = not is_standard(self.noises[task.noise])
-            stored = encode_rows(rollout_rows(log, with_tracks=own_tracks, with_noise=own_noise))
+            encoded = encode_rows(rollout_rows(log, with_tracks=own_tracks, with_noise=own_noise))
         return TaskResult(
             task,
             OK,
             scenario.scenario_type,
             scores=scores,
             metrics=metrics,
-            rollout=stored,
-            doubt=rollout.doubt,
+            rollout=encoded,
+            warning=rollout.warning,
         )
 
     def _setting(self, task: Task) -> Setting:
         return Setting(
             noise=self.noises[task.noise],
             seed=task.seed,
-            traffic=self._driven(self.traffic) if self.traffic else self._modelled(),
+            traffic=self._make_traffic(),
             controller=self.config.controller,
             strict=self.config.strict,
         )
@@ -202,34 +204,35 @@ class TaskRunner:
         """The planner of a task, which has nothing of other tasks."""
         if self.config.controller == "log-playback":
             return None
-        return self._original(task.planner, self.planners[task.planner]).copy()
+        return self._prototype(task.planner, self.planners[task.planner]).copy()
 
-    def _modelled(self) -> Traffic:
-        """Traffic that no planner drives, for one rollout; a network is loaded once."""
-        if self._network is not None:
-            return self._network.fork()
-        model = make_traffic(self.config.traffic, self.config.device)
-        if not isinstance(model, BatchTraffic):
-            return model
-        self._network = model
-        return model.fork()
+    def _release(self, task: Task, planner: Planner | None) -> None:
+        if planner is not None:
+            self._prototypes[task.planner].release(planner)
 
-    def _driven(self, planner: RunPlanner) -> Traffic:
-        """Traffic whose vehicles a planner drives, for one rollout."""
-        from shiftsim.sim.traffic.planned import PlannedTraffic
+    def _make_traffic(self) -> Traffic:
+        """The traffic of one rollout; a network is loaded once."""
+        if self.traffic is not None:
+            from shiftsim.sim.traffic.planned import PlannedTraffic
 
-        return PlannedTraffic(self._original(self.config.traffic, planner).copy)
+            return PlannedTraffic(self._prototype(self.config.traffic, self.traffic).copy)
+        if self._network is None:
+            model = make_traffic(self.config.traffic, self.config.device)
+            if not isinstance(model, BatchTraffic):
+                return model
+            self._network = model
+        return self._network.fork()
 
-    def _original(self, name: str, planner: RunPlanner) -> Original:
-        if name not in self._originals:
-            self._originals[name] = Original(planner.make)
-        return self._originals[name]
+    def _prototype(self, name: str, planner: RunPlanner) -> PlannerPrototype:
+        if name not in self._prototypes:
+            self._prototypes[name] = PlannerPrototype(planner.make)
+        return self._prototypes[name]
 
     def close(self) -> None:
         """Let the planners release what they hold."""
-        for original in self._originals.values():
-            original.close()
-        self._originals.clear()
+        for prototype in self._prototypes.values():
+            prototype.close()
+        self._prototypes.clear()
 
 
 def attempt(task: Task, work: Callable[[], T]) -> T | TaskResult:
@@ -253,22 +256,14 @@ def attempt(task: Task, work: Callable[[], T]) -> T | TaskResult:
         )
 
 
-def planning_times(log: SimulationLog) -> dict[str, float]:
-    """What `tasks.parquet` says of the planner's speed: its total [s], mean and p95 [ms]."""
-    per_step = log.planning_seconds * 1e3
-    return {
-        "planner_seconds": float(log.planning_seconds.sum()),
-        "planning_ms_mean": float(per_step.mean()),
-        "planning_ms_p95": float(np.percentile(per_step, 95)),
-    }
-
-
 def score_rollout(
     scenario: Scenario, log: SimulationLog, config: RunConfig
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """The row of `scores.parquet` and the rows of `metrics.parquet`, beyond the key."""
     result = compute_metrics(log, scenario.map, thresholds=config.thresholds, own=config.metrics)
     if scenario.script is not None and scenario.script.profile == "interplan":
+        from shiftsim.metrics.interplan import add_interplan
+
         result = add_interplan(result, log, scenario.map, scenario.script)
     profile = {"thresholds": config.thresholds, "metric_version": METRIC_VERSION}
     scores = {
@@ -285,25 +280,23 @@ def score_rollout(
     start_us = int(log.time_us[0])
     order = {name: place for place, name in enumerate(SHORT_NAMES)}
     ordered = sorted(result.rows, key=lambda row: order.get(row.metric, len(order)))
-    rows = [_metric_row(row, start_us) for row in ordered]
-    own = _storable([_metric_row(row, start_us) for row in result.extra])
-    return scores, [{**row, **profile} for row in (*rows, *own)]
-
-
-def _storable(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Rows of custom metrics as the table will hold them."""
-    table = TABLES["metrics"]
-    try:
-        schema = pa.schema([table.field(name) for name in rows[0]] if rows else [])
-        return list(pa.Table.from_pylist(rows, schema).to_pylist())
+    custom = [_metric_row(row, start_us, profile) for row in result.extra]
+    try:  # what metrics of users return is read back as the table will hold it
+        custom = list(pa.Table.from_pylist(custom, _METRIC_COLUMNS).to_pylist())
     except (pa.ArrowException, UnicodeError, TypeError, ValueError) as error:
         raise ConfigError(
             f"a custom metric returned what metrics.parquet cannot hold: {error}",
             hint="return a number, or a MetricRow of texts and numbers",
         ) from error
+    return scores, [*(_metric_row(row, start_us, profile) for row in ordered), *custom]
 
 
-def _metric_row(row: MetricRow, start_us: int) -> dict[str, Any]:
+_METRIC_COLUMNS = pa.schema(
+    [column for column in TABLES["metrics"] if column.name not in Task._fields]
+)
+
+
+def _metric_row(row: MetricRow, start_us: int, profile: Mapping[str, str]) -> dict[str, Any]:
     first = row.violation
     return {
         "metric": row.metric,
@@ -316,4 +309,5 @@ def _metric_row(row: MetricRow, start_us: int) -> dict[str, Any]:
         "first_violation_s": None if first is None else (first.time_us - start_us) * 1e-6,
         "first_violation_value": None if first is None else first.value,
         "partner_token": None if first is None else first.partner,
+        **profile,
     }

@@ -1,44 +1,41 @@
-"""Run a function over many tasks: in this process, or in supervised worker processes.
+"""Run a function over many tasks: here, in supervised worker processes, or on a dask cluster.
 
-A worker process is a fresh interpreter that talks over one socket: nothing is forked, the caller's
-main script is not imported again, and a worker that dies, or hangs and is killed, costs the one
-task it was working on. The standard pools do not give that: theirs break as a whole.
+A worker that dies, or hangs and is killed, costs the one task it was working on. dask only hands
+the tasks out: on each of its threads one supervised process does them, so that a crash costs one
+task there as well, and no worker of the cluster. What a lost machine was doing, dask gives to
+another one.
 """
 
-import logging
-import os
 import pickle
-import signal
-import socket
-import subprocess
 import sys
+import threading
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from math import inf
-from multiprocessing.connection import Connection, wait
-from threading import Event, Thread
+from multiprocessing.connection import wait
 from time import monotonic, time
 from typing import Any, Generic, Literal, TypeVar
+from uuid import uuid4
 
-from shiftsim.errors import ConfigError
-from shiftsim.files import fresh_python
+from shiftsim.errors import ConfigError, import_extra
 from shiftsim.kernels import machine_code
+from shiftsim.processes import Process, ProcessEndedError, close, packed, start
 
 T = TypeVar("T")
 R = TypeVar("R")
 
-_LOG = logging.getLogger(__name__)
 MakeFunction = Callable[[], Callable[[T], R]]
 _MAX_START_FAILURES = 3  # workers in a row that die before they are ready for a task
 _LOOK_AHEAD = 128  # tasks among which one for a worker is chosen
-_PAUSE = 0.5  # s, before a process that ended is started again
 _TIME_TO_LOAD = 10.0  # s, on top of the limit of a worker's first task
 _TIME_TO_COMPILE = 20.0  # s, for one kernel: longer than any takes
-# one thread per worker: the parallelism is across scenarios
-_ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("NUMBA", "OMP", "OPENBLAS", "MKL")}
+_CONNECT = 30.0  # s, for a scheduler to answer
+_HANDED_OUT = 64  # tasks at the scheduler at once, more where there are more threads
+# on a worker of the cluster: its processes by job and thread; kept from one task to the next
+_POOLS: "dict[tuple[str, int], Pool]" = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,54 +81,18 @@ def map_unordered(
         ConfigError: Workers cannot be started.
     """
     if workers <= 1 and not limit:
-        yield from _serial(make, tasks)
+        function = make()
+        try:
+            for task in tasks:
+                yield Outcome(task, function(task))
+        finally:
+            close(function)
         return
-    payload = _payload(make)
-    pool = Pool(payload, max(1, workers), limit, pieces, group)
+    pool = Pool(packed(make), max(1, workers), limit, pieces, group)
     try:
         yield from pool.run(tasks, alone)
     finally:
         pool.close()
-
-
-@contextmanager
-def beside(make: Callable[[], object]) -> Iterator[None]:
-    """Keep what `make` makes in a process of its own, which is started again when it ends.
-
-    Raises:
-        ConfigError: It cannot be made there.
-    """
-    payload, leaving = _payload(make), Event()
-    worker = _Worker(payload)
-
-    def keep() -> None:
-        nonlocal worker
-        while True:
-            try:
-                worker.receive()  # once, when it is ready again
-            except _DeathError as death:
-                if leaving.wait(_PAUSE):
-                    return
-                _LOG.warning("a process for the device is started again: %s", death)
-                worker = _Worker(payload)
-
-    try:
-        worker.receive()
-    except _DeathError as death:
-        raise ConfigError(
-            f"the process for the device cannot start: {death}",
-            hint="run with --workers 1 to see why",
-        ) from death
-    # a process that a thread started is killed when this thread ends: it must outlive it
-    keeper = Thread(target=keep, daemon=True)
-    keeper.start()
-    try:
-        yield
-    finally:
-        leaving.set()
-        while keeper.is_alive():
-            worker.process.kill()
-            keeper.join(_PAUSE)
 
 
 def _seconds_since_compiling() -> float:
@@ -139,76 +100,22 @@ def _seconds_since_compiling() -> float:
     return time() - max((path.stat().st_mtime for path in machine_code()), default=-inf)
 
 
-def _payload(make: Callable[[], object]) -> bytes:
-    return pickle.dumps((sys.path, pickle.dumps(make)))
-
-
-def _serial(make: MakeFunction[T, R], tasks: Iterable[T]) -> Generator[Outcome[T, R], None, None]:
-    function = make()
-    try:
-        for task in tasks:
-            yield Outcome(task, function(task))
-    finally:
-        _close(function)
-
-
-def _close(function: object) -> None:
-    if (close := getattr(function, "close", None)) is not None:
-        close()
-
-
+@dataclass(eq=False)
 class _Worker:
-    """One interpreter and the socket to it."""
+    """A process of the pool, and the task that it is at."""
 
-    def __init__(self, payload: bytes) -> None:
-        ours, theirs = socket.socketpair()
-        self.process = _start(theirs)
-        theirs.close()
-        self.connection: Connection[Any, Any] = Connection(ours.detach())
-        self.task: Any = None
-        self.state: Literal["starting", "idle", "busy"] = "starting"
-        self.is_new = True
-        self.deadline = inf
-        with suppress(OSError):  # a worker that is dead already is noticed when it is waited for
-            self.connection.send_bytes(payload)
+    process: Process
+    task: Any = None
+    state: Literal["starting", "idle", "busy"] = "starting"
+    is_new: bool = True
+    deadline: float = inf
 
     def give(self, task: object, seconds: float) -> None:
         """Hand over a task that may take so long."""
         self.task, self.state = task, "busy"
         self.deadline = monotonic() + seconds + _TIME_TO_LOAD * self.is_new
         self.is_new = False
-        with suppress(OSError):
-            self.connection.send(task)
-
-    def receive(self) -> Any:
-        """The next message.
-
-        Raises:
-            _DeathError: The process has ended.
-        """
-        try:
-            message = self.connection.recv()
-        except (EOFError, OSError, pickle.UnpicklingError) as error:
-            raise _DeathError(self.end()) from error
-        self.state, self.deadline = "idle", inf
-        return message
-
-    def end(self) -> str:
-        """Close the socket, wait for the process, and say how it ended."""
-        self.connection.close()
-        try:
-            code = self.process.wait(timeout=5)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            code = self.process.wait()
-        if code < 0:
-            with suppress(ValueError):
-                return f"worker process killed by {signal.Signals(-code).name}"
-        return f"worker process ended with exit code {code}"
-
-
-class _DeathError(Exception):
-    """A worker process has ended; the text says how."""
+        self.process.send(task)
 
 
 class Pool:
@@ -222,7 +129,7 @@ class Pool:
         pieces: Callable[[Any], Sequence[Any]] | None = None,
         group: Callable[[Any], object] | None = None,
     ) -> None:
-        """A pool without workers; `payload` is what `serve` reads first."""
+        """A pool without workers; `payload` is for `processes.start`."""
         self.payload, self.size, self.limit = payload, size, limit
         self.pieces = pieces or (lambda task: (task,))
         self.group = group
@@ -235,14 +142,14 @@ class Pool:
         done = 0
         while waiting or self._in("busy"):
             while len(self.workers) < min(self.size, len(waiting) + len(self._in("busy"))):
-                self.workers.append(_Worker(self.payload))
+                self.workers.append(_Worker(start(self.payload)))
             ready = self._in("idle")
             if done < alone:
                 ready = [] if self._in("busy") else ready[:1]
             for worker in ready[: len(waiting)]:
-                task = waiting.popleft() if done < alone else self._taken(waiting, worker)
+                task = waiting.popleft() if done < alone else self._next_task(waiting, worker)
                 worker.give(task, self._seconds(task))
-            for outcome in self._heard():
+            for outcome in self._wait():
                 done += 1
                 parts = self.pieces(outcome.task) if outcome.death else ()
                 if len(parts) > 1:
@@ -250,7 +157,7 @@ class Pool:
                 else:
                     yield outcome
 
-    def _taken(self, waiting: deque[Any], worker: _Worker) -> Any:
+    def _next_task(self, waiting: deque[Any], worker: _Worker) -> Any:
         """The next task for a worker: of its own group, else of one that no other is at."""
         place = 0
         if self.group is not None:
@@ -271,15 +178,15 @@ class Pool:
     def _in(self, state: str) -> list[_Worker]:
         return [worker for worker in self.workers if worker.state == state]
 
-    def _heard(self) -> Generator[Outcome[Any, Any], None, None]:
-        """Wait for the workers; what they say, and those that are late are killed."""
-        watched: dict[Any, _Worker] = {
-            worker.connection: worker for worker in self.workers if worker.state != "idle"
+    def _wait(self) -> Generator[Outcome[Any, Any], None, None]:
+        """Outcomes of the workers that answer next; those that are late are killed."""
+        workers: dict[Any, _Worker] = {
+            worker.process.connection: worker for worker in self.workers if worker.state != "idle"
         }
-        first = min(worker.deadline for worker in watched.values())
+        first = min(worker.deadline for worker in workers.values())
         patience = None if first == inf else max(0.0, first - monotonic())
-        for connection in wait(list(watched), patience):
-            outcome = self._hear(watched[connection])
+        for connection in wait(list(workers), patience):
+            outcome = self._receive(workers[connection])
             if outcome is not None:
                 yield outcome
         now = monotonic()
@@ -290,25 +197,27 @@ class Pool:
             return
         for worker in late:
             worker.process.kill()
-            worker.end()
+            worker.process.end()
             self.workers.remove(worker)
             allowed = self._seconds(worker.task)
             yield Outcome(worker.task, None, f"took longer than {allowed:g} s", is_late=True)
 
-    def _hear(self, worker: _Worker) -> Outcome[Any, Any] | None:
+    def _receive(self, worker: _Worker) -> Outcome[Any, Any] | None:
         starting = worker.state == "starting"
         try:
-            message = worker.receive()
-        except _DeathError as death:
+            message = worker.process.receive()
+        except ProcessEndedError as end:
+            death = f"worker process {end}"
             self.workers.remove(worker)
             if not starting:
-                return Outcome(worker.task, None, str(death))
+                return Outcome(worker.task, None, death)
             self.failed_starts += 1
             if self.failed_starts >= _MAX_START_FAILURES:
                 raise ConfigError(
                     f"workers cannot start: {death}", hint="run with --workers 1 to see why"
-                ) from death
+                ) from end
             return None
+        worker.state, worker.deadline = "idle", inf
         self.failed_starts = 0
         return None if starting else Outcome(worker.task, message)
 
@@ -317,58 +226,79 @@ class Pool:
         for worker in self.workers:
             if worker.state != "idle":
                 worker.process.kill()
-            worker.connection.close()
+            worker.process.connection.close()
         for worker in self.workers:
-            worker.end()
+            worker.process.end()
 
 
-def _start(theirs: socket.socket) -> subprocess.Popen[bytes]:
-    """Start an interpreter that serves a socket; interrupts from the terminal do not reach it."""
-    command = "import sys, shiftsim.runs.workers as w; w.serve(*map(int, sys.argv[1:]))"
-    words, env = fresh_python(command, str(os.getpid()), str(theirs.fileno()))
-    env |= _ONE_THREAD
-    if sys.platform == "win32":
-        group = subprocess.CREATE_NEW_PROCESS_GROUP
-        process = subprocess.Popen(words, stdin=subprocess.PIPE, creationflags=group, env=env)
-        assert process.stdin is not None
-        with process.stdin as pipe:
-            pipe.write(theirs.share(process.pid))
-        return process
-    return subprocess.Popen(
-        words, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, process_group=0, env=env
-    )
+def map_on_cluster(
+    make: MakeFunction[T, R],
+    tasks: Iterable[T],
+    *,
+    scheduler: str,
+    alone: int = 0,
+    limit: float = 0.0,
+    pieces: Callable[[T], Sequence[T]] | None = None,
+) -> Generator[Outcome[T, R], None, None]:
+    """As `map_unordered`, on the cluster whose scheduler is at an address.
 
-
-def serve(parent: int, handle: int) -> None:
-    """Main function of a worker process: do tasks from a socket until it closes."""
-    _end_with(parent)
-    if sys.platform == "win32":  # handles are not inherited: it comes through the standard input
-        handle = socket.fromshare(sys.stdin.buffer.read()).detach()
-    connection: Connection[Any, Any] = Connection(handle)
-    try:
-        path, pickled = pickle.loads(connection.recv_bytes())
-        sys.path[:] = path
-        function = pickle.loads(pickled)()
-        try:
-            connection.send("ready")
-            while True:
-                connection.send(function(connection.recv()))
-        finally:
-            _close(function)
-    except (EOFError, BrokenPipeError, ConnectionResetError):
-        pass  # the parent has gone
-
-
-def _end_with(parent: int) -> None:
-    """Have this process killed when its parent dies, even in the middle of an endless task.
-
-    Elsewhere than on Linux it notices at its next message only.
+    Raises:
+        MissingExtraError: dask.distributed is not installed.
+        ConfigError: There is no scheduler at that address.
     """
-    if sys.platform != "linux":
-        return
-    import ctypes
+    distributed: Any = import_extra("distributed", "cluster")
+    try:
+        client = distributed.Client(scheduler, timeout=_CONNECT, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"no dask scheduler answers at {scheduler!r}: {error}",
+            hint="start one with `dask scheduler`, and workers with `dask worker ADDRESS`",
+        ) from error
+    job = uuid4().hex
+    work = partial(_work, job, pickle.dumps((sys.path, pickle.dumps(make), limit, pieces)))
+    waiting = deque(tasks)
+    pending: dict[Any, Any] = {}  # future -> task
+    done, window = 0, 1
+    futures = distributed.as_completed([], loop=client.loop)
+    try:
+        while waiting or pending:
+            if done % _HANDED_OUT == 0 or done == alone:
+                window = max(_HANDED_OUT, 2 * sum(client.nthreads().values()))
+            while waiting and len(pending) < (window if done >= alone else 1):
+                task = waiting.popleft()
+                future = client.submit(work, task, pure=False)
+                pending[future] = task
+                futures.add(future)
+            future = next(futures)
+            task = pending.pop(future)
+            done += 1
+            try:
+                yield from future.result()
+            except distributed.KilledWorker as error:  # every worker that took it was lost
+                parts = pieces(task) if pieces else (task,)
+                if len(parts) > 1:
+                    waiting.extendleft(reversed(parts))
+                else:
+                    yield Outcome(task, None, f"lost with several workers: {error}")
+    finally:
+        client.cancel(list(pending), force=True)
+        client.run(_forget, job)
+        client.close()
 
-    set_parent_death_signal = 1  # PR_SET_PDEATHSIG of <linux/prctl.h>
-    ctypes.CDLL(None).prctl(set_parent_death_signal, int(signal.SIGKILL))
-    if os.getppid() != parent:
-        raise SystemExit("the parent ended before its worker had begun")
+
+def _work(job: str, payload: bytes, task: Any) -> list[Outcome[Any, Any]]:
+    """Do one task on a thread of a worker of the cluster."""
+    key = (job, threading.get_ident())
+    if key not in _POOLS:
+        for other in [other for other in _POOLS if other[1] == key[1]]:
+            _POOLS.pop(other).close()  # of a run whose main process was killed
+        paths, make, limit, pieces = pickle.loads(payload)
+        here = [*sys.path, *(path for path in paths if path not in sys.path)]
+        _POOLS[key] = Pool(pickle.dumps((here, make)), 1, limit, pieces)
+    return list(_POOLS[key].run([task], 0))
+
+
+def _forget(job: str) -> None:
+    """End the processes of a job on a worker of the cluster."""
+    for key in [key for key in _POOLS if key[0] == job]:
+        _POOLS.pop(key).close()

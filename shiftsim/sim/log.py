@@ -7,15 +7,12 @@ iterations: the state reached after the last planner call is never stored.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Tracks, TrafficLights
 
 NUM_KEPT = 18  # poses of a plan
-_PER_UNIT = np.array([1e3, 1e3, 1e4])  # whole numbers per m, m, rad: what a picture can show
-_MOST = 2.0e8  # of them; second differences with their sign then fit into 32 bits
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +39,7 @@ class SimulationLog:
 
     Example:
         ```python
-        log = shiftsim.simulate(shiftsim.open_store("demo")["03b23c"], "idm")
+        log = shiftsim.simulate(shiftsim.open_store("demo")["01f13e"], "idm")
         print(log.ego[-1, :2], log.commands[:, 0].min())
         ```
     """
@@ -67,48 +64,6 @@ class SimulationLog:
             f"<SimulationLog of {self.token}: {len(self.ego)} samples, {gone:.1f} m, "
             f"{self.tracks.num_tracks} tracks>"
         )
-
-
-def pack_plans(plans: FloatArray, ego: FloatArray) -> tuple[IntArray, NDArray[np.int32]]:
-    """Plans as few small numbers: what bends of the path remain to the next pose, 1 mm or 0.1 mrad.
-
-    Args:
-        plans: (K, P, 3) as in `SimulationLog`; poses behind the first NaN are left out.
-        ego: (K, 11) states they begin at.
-
-    Returns:
-        `lengths`: (K,) numbers of each plan, three per pose; `steps`: the numbers of all. They are
-        second differences along the plan of its offsets from the ego, their sign in the last bit.
-    """
-    known = ~np.isnan(plans[..., 0])
-    steps = plans - ego[:, None, :3]
-    steps *= _PER_UNIT
-    np.rint(steps, out=steps)
-    is_whole = bool(known.all())
-    if not is_whole:
-        known = np.logical_and.accumulate(known, axis=1)
-        steps[~known] = 0.0
-    np.maximum(np.minimum(steps, _MOST, out=steps), -_MOST, out=steps)
-    bends = steps.astype(np.int32)
-    for _ in range(2):
-        bends[:, 1:] -= bends[:, :-1].copy()
-    coded = (bends << 1) ^ (bends >> 31)
-    return 3 * known.sum(axis=1), (coded if is_whole else coded[known]).ravel()
-
-
-def unpack_plans(lengths: IntArray, steps: IntArray, ego: FloatArray) -> FloatArray:
-    """The plans (K, 18, 3) that `pack_plans` made numbers of, rounded.
-
-    Raises:
-        ValueError: The numbers are not whole poses, or more than 18 of them.
-    """
-    if (lengths > 3 * NUM_KEPT).any():
-        raise ValueError(f"a plan of {lengths.max() // 3} poses")
-    known = np.arange(NUM_KEPT) < lengths[:, None] // 3
-    bends = np.zeros((*known.shape, 3), np.int64)
-    bends[known] = ((steps >> 1) ^ -(steps & 1)).reshape(-1, 3)
-    offsets = np.cumsum(np.cumsum(bends, axis=1), axis=1) / _PER_UNIT
-    return np.where(known[..., None], ego[:, None, :3] + offsets, np.nan)
 
 
 def as_recorded(scenario: Scenario) -> SimulationLog:

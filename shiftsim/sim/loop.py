@@ -8,41 +8,34 @@ times; its last answer is never executed, and the state at T - 1 is neither reac
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from time import perf_counter
-from typing import Any, TypeAlias, TypeVar, cast
+from typing import Any, ParamSpec, TypeAlias, TypeVar, cast
 
 import numpy as np
 
 from shiftsim.errors import ConfigError, DataError, InvalidTrajectoryError, PlannerError, one_of
 from shiftsim.sim.dynamics.bicycle import command_and_step
-from shiftsim.sim.dynamics.lqr import TRACKED, raise_for_status
+from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
 from shiftsim.sim.dynamics.perfect import KEPT_US, follow_perfectly, sample_poses
-from shiftsim.sim.execute import Course, execute
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.noise import NoiseModel, sample_noise
-from shiftsim.sim.plan_check import (
-    GOOD,
-    Fault,
-    doubt_of,
-    find_fault,
-    find_form_fault,
-    plain,
-)
+from shiftsim.sim.plan_check import contiguous, find_fault, find_warning
 from shiftsim.sim.planner import (
     BatchPlanner,
     Observation,
+    ObservationBuilder,
     Planner,
-    Sight,
     rollout_rows,
     scene_info,
 )
-from shiftsim.sim.traffic import BatchTraffic, LogReplay, Move, Traffic, make_traffic
+from shiftsim.sim.traffic import BatchTraffic, Move, Traffic, make_traffic
 from shiftsim.sim.traffic.scripted import Scripted
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import NUM_STATE, Command, Trajectory, center_poses
 
 T = TypeVar("T")
+P = ParamSpec("P")
+Plan: TypeAlias = Trajectory | Command | None
 MIN_ITERATIONS = 3
 CONTROLLERS = ("lqr", "perfect", "log-playback")
 
@@ -97,7 +90,7 @@ class Rollout:
         self.scenario = scenario
         self.planner = planner
         self.iteration = 0
-        self.doubt = ""  # why the first plan is most likely not what was meant
+        self.warning = ""  # why the first plan is most likely not what was meant
         # nuPlan rule 12: the last answer of the planner is never executed
         self.num_samples = scenario.num_iterations - 1
         self._times = scenario.iteration_times
@@ -106,7 +99,6 @@ class Rollout:
         # rows: the past samples, then the iterations; the ego is filled up to the present, the
         # tracks from the log until the traffic rewrites them
         self._time_us = scenario.time_us[rows]
-        self._clock: list[int] = self._time_us.tolist()
         self._ego = np.full((len(rows), NUM_STATE), np.nan)
         self._ego[: start + 1] = scenario.ego[rows[: start + 1]]
         self._tracks = scenario.tracks.rows(rows)
@@ -116,12 +108,11 @@ class Rollout:
         if scenario.script is not None and scenario.script.has_pedestrians:
             self._traffic = Scripted(self._traffic)
         self._traffic.start(scenario, self._tracks, start)
-        self._sight = Sight(self._time_us, self._ego, self._tracks, self._lights)
-        self._is_tracked = planner is not None and setting.controller == "lqr"
-        noise = sample_noise(
+        arrays = self._time_us, self._ego, self._tracks, self._lights
+        self._observations = ObservationBuilder(*arrays)
+        self._noise = sample_noise(
             setting.noise, seed=setting.seed, token=scenario.token, num_steps=self.num_samples
         )
-        self._noise = plain(noise)
         self._commands = np.full((self.num_samples, 2), np.nan)
         self._plans = np.full((self.num_samples, len(KEPT_US), 3), np.nan)
         self._seconds = np.zeros(self.num_samples)
@@ -136,9 +127,9 @@ class Rollout:
 
     def observe(self) -> Observation:
         """What the planner sees now."""
-        return self._sight.at(self.iteration, self._start + self.iteration)
+        return self._observations.at(self.iteration, self._start + self.iteration)
 
-    def advance(self, plan: Trajectory | Command | None, seconds: float = 0.0) -> None:
+    def advance(self, plan: Plan, seconds: float = 0.0) -> None:
         """Store this sample, and move the ego and the traffic to the next one.
 
         The plan took `seconds`; it is None only under log playback without a planner.
@@ -148,75 +139,30 @@ class Rollout:
             self._traffic.step(*move)
         self._go_on()
 
-    def drive_on(self) -> None:
-        """Let the planner take steps at once, as far as it goes, if it can and nothing else acts.
-
-        Each counts with the mean of their times.
-        """
-        offers = "drive_on" in vars(type(self.planner))  # a class that inherits may plan otherwise
-        replays = type(self._traffic) is LogReplay and self.scenario.script is None
-        if not (offers and replays and self._is_tracked):
-            return
-        first, stop = self.iteration, self.num_samples
-        arrays = self._ego, self._noise, self._commands, self._plans
-        began = perf_counter()
-        driven = cast(Any, self.planner).drive_on(
-            Course(self._time_us, self._start, first, stop, *arrays)
-        )
-        self._seconds[first:driven] = (perf_counter() - began) / max(driven - first, 1)
-        self.iteration = driven
-
-    def _follow(self, plan: Trajectory | Command | None, seconds: float) -> Move | None:
+    def _follow(self, plan: Plan, seconds: float) -> Move | None:
         """Store this sample and move the ego; what the traffic is to do, None after the last."""
         iteration, row = self.iteration, self._start + self.iteration
         self._seconds[iteration] = seconds
-        moves = iteration + 1 < self.num_samples
         if self.planner is not None:
             self._note_fallback()
+            plan = self._checked(plan)
+        if iteration + 1 == self.num_samples:
+            return None
         # nuPlan rule 13: the ego moves first, and the traffic sees where it was before
-        if self._is_tracked and isinstance(plan, Trajectory):
-            self._track(plan, moves)
-        else:
-            if self.planner is not None:
-                plan = self._checked(plan)
-            if moves:
-                self._move_ego(plan)
-        return Move(iteration, self._ego[row], self._tracks, row + 1) if moves else None
+        self._move_ego(plan)
+        return Move(iteration, self._ego[row], self._tracks, row + 1)
 
     def _go_on(self) -> None:
         """Go to the next sample, which may be the last one."""
         self.iteration += 1
-        if not self.done and self._is_finished(self._start + self.iteration):
+        script = self.scenario.script
+        if self.done or script is None or script.termination is None:
+            return
+        row = self._start + self.iteration
+        x, y, _ = center_poses(self._ego[row : row + 1, :3])[0].tolist()
+        if script.termination.is_reached(self.scenario.map, x, y):
             # nuPlan rule 719: interPlan asks the planner once more where the goal is reached
             self.num_samples = self.iteration + 1
-
-    def _is_finished(self, row: int) -> bool:
-        """Whether the ego is where an edit ends the rollout."""
-        finish = self.scenario.script.finish if self.scenario.script is not None else None
-        if finish is None:
-            return False
-        x, y, _ = center_poses(self._ego[row : row + 1, :3])[0].tolist()
-        return finish.is_reached(self.scenario.map, x, y)
-
-    def _move_ego(self, plan: Trajectory | Command | None) -> None:
-        """Write the next state of the ego, and note the command."""
-        iteration, row = self.iteration, self._start + self.iteration
-        now_us, next_us = self._clock[row], self._clock[row + 1]
-        state, after = self._ego[row], self._ego[row + 1]
-        noise, command = self._noise[iteration], self._commands[iteration]
-        controller = self.setting.controller
-        if controller == "log-playback":
-            after[:] = self.scenario.ego[self.scenario.iteration_rows[iteration + 1]]
-        elif isinstance(plan, Command):
-            if controller == "perfect":
-                raise ConfigError(
-                    "perfect tracking needs a planner that returns a trajectory, not a command",
-                    hint="use the controller 'lqr', which sends commands to the motion model",
-                )
-            command[:] = plan.acceleration, plan.steering_rate
-            command_and_step(now_us, next_us, state, command, noise[0], noise[1], after)
-        elif isinstance(plan, Trajectory):
-            follow_perfectly(plan, next_us, after)
 
     def _note_fallback(self) -> None:
         """Note whether the plan is a fallback by the planner's own account."""
@@ -229,48 +175,47 @@ class Rollout:
                 )
             self._degraded[iteration] = True
 
-    def _track(self, plan: Trajectory, moves: bool) -> None:
-        """Check a plan, note its poses, and let the tracker follow it."""
-        iteration, row = self.iteration, self._start + self.iteration
-        now_us, next_us = self._clock[row], self._clock[row + 1]
-        self._refuse(find_form_fault(plan))
-        times, states = plain(plan.time_us), plain(plan.states)
-        code, status = execute(
-            times,
-            states,
-            now_us if plan.relative else 0,
-            now_us,
-            next_us,
-            row,
-            iteration,
-            moves,
-            self._ego,
-            self._noise,
-            self._commands,
-            self._plans,
-        )
-        if code != GOOD:
-            self._refuse(find_fault(plan, now_us, next_us))
-        if status != TRACKED:
-            raise_for_status(status, now_us, plan.starting_at(now_us).time_us)
-        if iteration == 0:
-            self.doubt = doubt_of(plan, self._plans[0, 0], self._ego[row])
-
-    def _refuse(self, fault: Fault | None) -> None:
-        if fault is not None:
-            where = f"iteration {self.iteration}"
-            raise InvalidTrajectoryError(f"{where}: {fault.message}", fault.hint)
-
     def _checked(self, plan: Any) -> Trajectory | Command:
         """The plan in log time; its poses are noted."""
         iteration, row = self.iteration, self._start + self.iteration
-        now_us, next_us = self._clock[row], self._clock[row + 1]
-        self._refuse(find_fault(plan, now_us, next_us))
-        if isinstance(plan, Trajectory):
-            time_us = plan.time_us + now_us if plan.relative else plain(plan.time_us)
-            plan = Trajectory(time_us, plain(plan.states))
-            sample_poses(plan.time_us, plan.states, now_us, KEPT_US, self._plans[iteration])
+        now_us, next_us = self._time_us[row : row + 2].tolist()
+        fault = find_fault(plan, now_us, next_us)
+        if fault is not None:
+            raise InvalidTrajectoryError(f"iteration {iteration}: {fault.message}", fault.hint)
+        if isinstance(plan, Command):
+            return plan
+        plan, poses = plan.starting_at(now_us), self._plans[iteration]
+        plan = Trajectory(contiguous(plan.time_us), contiguous(plan.states))
+        sample_poses(plan.time_us, plan.states, now_us, KEPT_US, poses)
+        if iteration == 0 and self.setting.controller == "lqr":
+            self.warning = find_warning(plan, poses[0], self._ego[row])
         return plan
+
+    def _move_ego(self, plan: Plan) -> None:
+        """Write the next state of the ego, and note the command."""
+        iteration, row = self.iteration, self._start + self.iteration
+        now_us, next_us = self._time_us[row : row + 2].tolist()
+        state, after = self._ego[row], self._ego[row + 1]
+        (accel, rate), command = self._noise[iteration], self._commands[iteration]
+        controller = self.setting.controller
+        if plan is None or controller == "log-playback":
+            after[:] = self.scenario.ego[self.scenario.iteration_rows[iteration + 1]]
+        elif isinstance(plan, Command):
+            if controller == "perfect":
+                raise ConfigError(
+                    "perfect tracking needs a planner that returns a trajectory, not a command",
+                    hint="use the controller 'lqr', which sends commands to the motion model",
+                )
+            command[:] = plan.acceleration, plan.steering_rate
+            command_and_step(now_us, next_us, state, command, accel, rate, after)
+        elif controller == "perfect":
+            follow_perfectly(plan, next_us, after)
+        else:
+            times, states = plan.time_us, plan.states
+            status = track_and_step(
+                now_us, next_us, state, times, states, accel, rate, after, command
+            )
+            raise_for_status(status, now_us, times)
 
     def log(self) -> SimulationLog:
         """The finished rollout."""
@@ -314,15 +259,14 @@ def simulate(
     """
     rollout = Rollout(scenario, planner, setting, **changes)
     log = drive(rollout)
-    if rollout.doubt:
-        warnings.warn(f"{type(planner).__name__}: {rollout.doubt}", stacklevel=2)
+    if rollout.warning:
+        warnings.warn(f"{type(planner).__name__}: {rollout.warning}", stacklevel=2)
     return log
 
 
 def drive(rollout: Rollout) -> SimulationLog:
     """Drive a fresh rollout to its end; errors are those of `simulate`."""
     planner = rollout.planner
-    rollout.drive_on()
     while not rollout.done:
         plan, seconds = None, 0.0
         if planner is not None:
@@ -349,7 +293,8 @@ def simulate_together(rollouts: Sequence[Rollout]) -> list[SimulationLog | Excep
         plans, seconds = _plans([rollouts[i] for i in active])
         moves: dict[int, Move] = {}
         for index, plan, share in zip(active, plans, seconds, strict=True):
-            move = _attempt(partial(_follow, rollouts[index], plan, share))
+            rollout = rollouts[index]
+            move = plan if isinstance(plan, Exception) else _attempt(rollout._follow, plan, share)
             if isinstance(move, Exception):
                 ended[index] = move
             elif move is not None:
@@ -359,7 +304,7 @@ def simulate_together(rollouts: Sequence[Rollout]) -> list[SimulationLog | Excep
             models = [cast(BatchTraffic, rollouts[i]._traffic) for i in batch]
             models[0].step_batch(models, [moves.pop(i) for i in batch])
         for index, move in moves.items():
-            error = _attempt(partial(rollouts[index]._traffic.step, *move))
+            error = _attempt(rollouts[index]._traffic.step, *move)
             if error is not None:
                 ended[index] = error
         for index in (i for i in active if i not in ended):
@@ -367,9 +312,6 @@ def simulate_together(rollouts: Sequence[Rollout]) -> list[SimulationLog | Excep
             if rollouts[index].done:
                 ended[index] = rollouts[index].log()
     return [ended[i] for i in range(len(rollouts))]
-
-
-Plan: TypeAlias = Trajectory | Command | None
 
 
 def _plans(rollouts: Sequence[Rollout]) -> tuple[list[Plan | Exception], list[float]]:
@@ -383,20 +325,14 @@ def _plans(rollouts: Sequence[Rollout]) -> tuple[list[Plan | Exception], list[fl
     out, seconds = list[Plan | Exception](), list[float]()
     for planner, observation in zip(planners, seen, strict=True):
         began = perf_counter()
-        out.append(_attempt(partial(planner.plan, observation)) if planner is not None else None)
+        out.append(_attempt(planner.plan, observation) if planner is not None else None)
         seconds.append(perf_counter() - began)
     return out, seconds
 
 
-def _follow(rollout: Rollout, plan: Plan | Exception, seconds: float) -> Move | None:
-    if isinstance(plan, Exception):
-        raise plan
-    return rollout._follow(plan, seconds)
-
-
-def _attempt(work: Callable[[], T]) -> T | Exception:
+def _attempt(work: Callable[P, T], *args: P.args, **keywords: P.kwargs) -> T | Exception:
     """What it returns, or the error: one scenario fails, its neighbours in the batch do not."""
     try:
-        return work()
+        return work(*args, **keywords)
     except Exception as error:
         return error

@@ -58,7 +58,7 @@ class NoiseModel:
     Example:
         ```python
         rough = shiftsim.NoiseModel("ou", sigma_accel=1.0, sigma_rate=0.2, name="rough")
-        scenario = shiftsim.open_store("demo")["03b23c"]
+        scenario = shiftsim.open_store("demo")["01f13e"]
         log = shiftsim.simulate(scenario, "idm", noise=rough, seed=3)
         ```
     """

@@ -4,7 +4,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shiftsim.errors import InvalidTrajectoryError
 from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.world.state import NUM_STATE, STATE_COLUMNS, Command, Trajectory
 
@@ -18,7 +17,6 @@ SHORT = (
 )
 
 GOOD, _NOT_INCREASING, _TOO_LARGE, _STARTS_LATE, _ENDS_EARLY, _TOO_SHORT, _TOO_LONG = range(7)
-_INT64, _FLOAT64 = np.dtype(np.int64), np.dtype(np.float64)
 
 
 class Fault(NamedTuple):
@@ -31,32 +29,10 @@ class Fault(NamedTuple):
     hint: str  # what to do about it
 
 
-def validate_plan(plan: object, now_us: int, next_us: int) -> None:
-    """Accept a trajectory or command that can be executed from one iteration to the next [us].
-
-    Raises:
-        InvalidTrajectoryError: It cannot be executed; the message says why.
-    """
-    fault = find_fault(plan, now_us, next_us)
-    if fault is not None:
-        raise InvalidTrajectoryError(fault.message, hint=fault.hint)
-
-
 def find_fault(plan: Any, now_us: int, next_us: int) -> Fault | None:
-    """The first thing that is wrong with a plan, or None (arguments as of `validate_plan`)."""
+    """Why a plan cannot be executed from one iteration to the next [us]; None where it can."""
     if isinstance(plan, Command):
-        return _command_fault(plan)
-    fault = find_form_fault(plan)
-    if fault is not None:
-        return fault
-    if plan.relative:
-        now_us, next_us = 0, next_us - now_us
-    code, row, column = check_values(plain(plan.time_us), plain(plan.states), now_us, next_us)
-    return None if code == GOOD else _explain(code, row, column, plan, now_us, next_us)
-
-
-def find_form_fault(plan: Any) -> Fault | None:
-    """What is wrong with the types and shapes of a trajectory, or None."""
+        return _find_command_fault(plan)
     if not isinstance(plan, Trajectory):
         return Fault(
             "type",
@@ -64,7 +40,7 @@ def find_form_fault(plan: Any) -> Fault | None:
             "return shiftsim.Trajectory.from_poses(times, poses) or a shiftsim.Command",
         )
     times, states = plan.time_us, plan.states
-    if not (_is_array(times, 1, _INT64) and _is_array(states, 2, _FLOAT64)) or (
+    if not (_is_array(times, 1, np.int64) and _is_array(states, 2, np.float64)) or (
         states.shape != (len(times), NUM_STATE)
     ):
         return Fault(
@@ -73,7 +49,10 @@ def find_form_fault(plan: Any) -> Fault | None:
             f"need int64 (H,) and float64 (H, {NUM_STATE})",
             "Trajectory.from_poses builds both from times (H,) [s] and poses (H, 3)",
         )
-    return None
+    if plan.relative:
+        now_us, next_us = 0, next_us - now_us
+    code, row, column = check_values(contiguous(times), contiguous(states), now_us, next_us)
+    return None if code == GOOD else _explain(code, row, column, plan, now_us, next_us)
 
 
 def is_short(plan: object) -> bool:
@@ -81,7 +60,7 @@ def is_short(plan: object) -> bool:
     return isinstance(plan, Trajectory) and bool(plan.time_us[-1] - plan.time_us[0] < LOOK_AHEAD_US)
 
 
-def doubt_of(plan: Trajectory, start: FloatArray, ego: FloatArray) -> str:
+def find_warning(plan: Trajectory, start: FloatArray, ego: FloatArray) -> str:
     """Why a plan that can be executed is most likely not what was meant; empty where it may be.
 
     `start` is where it is now, and `ego` where the ego is: x [m], y [m] and more.
@@ -92,7 +71,7 @@ def doubt_of(plan: Trajectory, start: FloatArray, ego: FloatArray) -> str:
     return SHORT if is_short(plan) else ""
 
 
-def _command_fault(command: Command) -> Fault | None:
+def _find_command_fault(command: Command) -> Fault | None:
     for name in ("acceleration", "steering_rate"):
         value = getattr(command, name)
         try:
@@ -108,11 +87,11 @@ def _command_fault(command: Command) -> Fault | None:
     return None
 
 
-def _is_array(value: object, ndim: int, dtype: np.dtype[Any]) -> bool:
+def _is_array(value: object, ndim: int, dtype: type) -> bool:
     return isinstance(value, np.ndarray) and value.ndim == ndim and value.dtype == dtype
 
 
-def plain(array: Any) -> Any:
+def contiguous(array: Any) -> Any:
     """The array, or a contiguous writable copy: kernels are compiled for that kind alone."""
     return array if array.flags.carray else array.copy()
 

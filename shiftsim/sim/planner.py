@@ -3,9 +3,9 @@
 A planner is any object with `reset(scene)` and `plan(observation)`; nothing needs to be subclassed.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, make_dataclass
-from typing import Any, Protocol, TypeVar, cast, runtime_checkable
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -142,7 +142,7 @@ class Planner(Protocol):
                 return shiftsim.Command(acceleration=-0.5, steering_rate=0.0)
 
 
-        print(shiftsim.simulate(shiftsim.open_store("demo")["03b23c"], Coast()))
+        print(shiftsim.simulate(shiftsim.open_store("demo")["01f13e"], Coast()))
         ```
     """
 
@@ -232,67 +232,24 @@ def observe_log(
     return Observation(iteration, int(scenario.time_us[now]), history, lights)
 
 
-_Frozen = TypeVar("_Frozen")
+class ObservationBuilder:
+    """What a planner is shown of a rollout: read-only arrays that end with the present row.
 
-
-def _quick(kind: type[_Frozen]) -> Callable[..., _Frozen]:
-    """The constructor of a frozen dataclass with slots, in half of its time.
-
-    Its own one writes each field past the lock. This fills an object without one, which becomes an
-    object of the class when it is whole; that is possible as both have the same slots.
-    """
-
-    def lock(made: Any) -> None:
-        made.__class__ = kind
-
-    names = [item.name for item in fields(cast(Any, kind))]
-    namespace = {"__post_init__": lock}
-    unlocked: Any = make_dataclass(kind.__name__, names, slots=True, namespace=namespace)
-    return cast(Callable[..., _Frozen], unlocked)
-
-
-_tracks, _history, _observation = _quick(Tracks), _quick(History), _quick(Observation)
-
-
-class Sight:
-    """What a planner is shown of a rollout, in arrays that cannot be written.
-
-    They end with the present row, and nothing leads from them to the rows of the rollout that they
-    are views of.
+    Nothing leads from them to the arrays of the rollout, of which they are views.
     """
 
     def __init__(
         self, time_us: IntArray, ego: FloatArray, tracks: Tracks, lights: TrafficLights
     ) -> None:
         """Arrays of a rollout."""
-        self._times = time_us.tolist()
-        # these show nothing of later rows: the times are known, and the ego has not been there
-        self._time_us, self._ego = memoryview(readonly(time_us)), memoryview(readonly(ego))
-        arrays = tracks.valid, tracks.poses, tracks.velocities, tracks.sizes
-        self._tracks = tuple(map(readonly, arrays))
-        self._kinds, self._tokens = readonly(tracks.kinds), tracks.tokens
-        self._connectors, self._status = lights.connector_ids, lights.status.tobytes()
-        self._listed, self._lights = b"?", TrafficLights.empty(1)
+        self._arrays = time_us, ego, tracks, lights
 
     def at(self, iteration: int, row: int) -> Observation:
         """What a planner sees at an iteration, which is a row of the arrays."""
-        past = slice(row + 1 - HISTORY_SAMPLES if row >= HISTORY_SAMPLES else 0, row + 1)
-        valid, poses, velocities, sizes = self._tracks
-        tracks = _tracks(
-            readonly(valid[past]),
-            readonly(poses[past]),
-            readonly(velocities[past]),
-            readonly(sizes[past]),
-            self._kinds,
-            self._tokens,
+        time_us, ego, tracks, lights = self._arrays
+        past = slice(max(row + 1 - HISTORY_SAMPLES, 0), row + 1)
+        history = History(
+            readonly(time_us[past]), readonly(ego[past]), tracks.rows(past).readonly()
         )
-        history = _history(_array(self._time_us[past]), _array(self._ego[past]), tracks)
-        count = len(self._connectors)
-        listed = self._status[row * count : (row + 1) * count]
-        if listed != self._listed:
-            status: Any = np.ndarray((1, count), np.int8, listed)
-            self._listed, self._lights = listed, TrafficLights(self._connectors, status)
-        return _observation(iteration, self._times[row], history, self._lights)
-
-
-_array: Any = np.asarray  # of a memoryview: `base` is that view, and takes the least time
+        present = lights.rows(slice(row, row + 1)).readonly()
+        return Observation(iteration, int(time_us[row]), history, present)

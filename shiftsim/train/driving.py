@@ -1,27 +1,41 @@
 """Drives scenarios in a worker: to collect labelled states, or to score a policy.
 
 Several scenarios go in lock step, so that the network sees them as one batch. Either the network
-drives or PDM-Closed, through the actions that it is imitated with.
+drives or PDM-Closed, through the actions that it is imitated with: the tracker turns its plan into
+an acceleration and a steering rate; CaRL's action asks for an acceleration and a steering angle.
+The angle is the present one and what the rate adds to it in `tau` seconds. CaRL's angle is reached
+within 0.1 s: a larger `tau` steers harder than the tracker.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 from shiftsim.env.episode import Episode
 from shiftsim.errors import ShiftsimError
-from shiftsim.planners.learned.carl.planner import Carl, CarlFeatures, command_of
+from shiftsim.kernels import FloatArray
+from shiftsim.planners.learned.carl.planner import (
+    MAX_ACCELERATION,
+    MAX_BRAKING,
+    MAX_STEERING,
+    Action,
+    Carl,
+    CarlFeatures,
+    command_of,
+)
+from shiftsim.planners.pdm.planner import PdmClosed
 from shiftsim.runs.scenarios import open_named_store
+from shiftsim.sim.dynamics.lqr import NUPLAN, raise_for_status, track
 from shiftsim.sim.loop import Setting
-from shiftsim.train.expert import Action, Expert
-from shiftsim.train.network import forward, from_official, lay_out, tensor_of
-from shiftsim.train.pictures import blocks_of, packed
+from shiftsim.sim.planner import Observation, SceneInfo
+from shiftsim.train.states import State, compress_raster
+from shiftsim.world.state import STEERING, VX
 
 EVERY = 2  # steps of which one is kept: neighbours are nearly the same
-_SOON = 30  # steps before an infraction
+_URGENT_STEPS = 30  # before an infraction
+# m/s; throttle of setting off; throttle of staying
+SLOW, PARTING, HOLD = 0.3, 0.02, -0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,15 +58,6 @@ class Job:
     tau: float  # of the labels [s]
 
 
-class State(NamedTuple):
-    """A labelled state."""
-
-    picture: bytes  # `pictures.packed`
-    measurements: Action  # (10,) of `CarlFeatures`
-    action: Action  # (2,) what the expert would do
-    is_urgent: bool = False  # whether the network ended with an infraction soon after
-
-
 class Driven(NamedTuple):
     """What a job came to."""
 
@@ -61,39 +66,66 @@ class Driven(NamedTuple):
     failed: list[str]  # why a scenario was not
 
 
-class Student(Carl):
+def encode_action(acceleration: float, steering_rate: float, steering: float, tau: float) -> Action:
+    """(2,) the action in [-1, 1] that stands for a command at a steering angle.
+
+    `acceleration` [m/s^2], `steering_rate` [rad/s], `steering` [rad], `tau` [s].
+    """
+    most = MAX_ACCELERATION if acceleration >= 0.0 else MAX_BRAKING
+    angle = steering + tau * steering_rate
+    action = np.array([acceleration / most, angle / MAX_STEERING])
+    return np.clip(action, -1.0, 1.0).astype(np.float32)
+
+
+def brake_at_stand(action: Action, speed: float) -> Action:
+    """The action, which brakes where a vehicle at `speed` [m/s] is to stand or come to a stand.
+
+    Braking at a stand changes nothing, as nobody drives backwards. But a network that is taught
+    a throttle of 0 there errs to either side, and creeps into what it waits for.
+    """
+    if speed < SLOW and action[0] < PARTING:
+        action[0] = min(float(action[0]), HOLD)
+    return action
+
+
+class Expert:
+    """PDM-Closed in one scenario."""
+
+    def __init__(self, scene: SceneInfo, tau: float) -> None:
+        """`tau` as in `encode_action`."""
+        self._planner, self._tau = PdmClosed(), tau
+        self._planner.reset(scene)
+
+    def act(self, observation: Observation) -> Action:
+        """What it would do now."""
+        plan = self._planner.plan(observation)
+        ego: FloatArray = observation.history.ego[-1].copy()
+        now = observation.time_us
+        status, acceleration, rate = track(now, ego, plan.time_us, plan.states, NUPLAN)
+        raise_for_status(status, now, plan.time_us)
+        action = encode_action(acceleration, rate, float(ego[STEERING]), self._tau)
+        return brake_at_stand(action, float(ego[VX]))
+
+
+class PolicyPlanner(Carl):
     """The network that is trained, as a planner."""
 
-    def __init__(self, checkpoint: str) -> None:
-        super().__init__(checkpoint)
-        network = self.networks[0]
-        network.load_state_dict(from_official(network.state_dict()))
-        with torch.no_grad():
-            self._laid = lay_out(network)
-
-    def infer(self, features: Sequence[CarlFeatures]) -> list[Action]:
-        """Actions (2,) in [-1, 1], as the network is trained to."""
-        with torch.inference_mode():
-            blocks = blocks_of([f.pictures for f in features], [False] * len(features))
-            measured = torch.from_numpy(np.stack([f.measurements for f in features]))
-            return list(forward(self._laid, tensor_of(blocks), measured).action.numpy())
-
-    def remember(self, action: Action) -> None:
-        """Take an action that somebody else did as its own last one."""
+    def set_last_action(self, action: Action) -> None:
+        """Take the action of somebody else as its own last one."""
         self._last_action = action
 
 
-class Lane:
+class DrivenScenario:
     """One scenario under way."""
 
-    def __init__(self, start: Start, job: Job, scenario: Any, student: Student) -> None:
-        self.start, self.job, self.student = start, job, student
+    def __init__(self, start: Start, job: Job, scenario: Any, policy: PolicyPlanner) -> None:
+        self.start, self.job, self.policy = start, job, policy
         setting = Setting(start.noise, start.seed)
         self.episode = Episode(scenario, setting, np.zeros(2, np.float32))
-        student.reset(self.episode.scene)
+        policy.reset(self.episode.scene)
         self.expert = Expert(self.episode.scene, job.tau)
         self.states: list[State] = []
-        self.features: CarlFeatures | None = None  # what the student is asked about
+        self.features: CarlFeatures | None = None  # what the network is asked about
         self.action: Action | None = None  # what is done in this step
 
     @property
@@ -102,29 +134,29 @@ class Lane:
         return self.episode.is_over or (not self.job.is_test and self.episode.infraction != "")
 
     @property
-    def learnt(self) -> list[State]:
+    def labelled(self) -> list[State]:
         """What was noted; the last of it is urgent where the network drove into an infraction."""
         by_network = 0 <= self.start.expert_steps < self.episode.iteration
         if not (self.episode.infraction and by_network):
             return self.states
-        calm = max(0, len(self.states) - _SOON // EVERY)
-        return self.states[:calm] + [state._replace(is_urgent=True) for state in self.states[calm:]]
+        first = max(0, len(self.states) - _URGENT_STEPS // EVERY)
+        return self.states[:first] + [one._replace(is_urgent=True) for one in self.states[first:]]
 
-    def look(self) -> None:
+    def prepare(self) -> None:
         """Note the state and its label, where it is kept, and who drives."""
         step, observation = self.episode.iteration, self.episode.observe()
         is_expert = self.start.expert_steps < 0 or step < self.start.expert_steps
         is_kept = not self.job.is_test and step % EVERY == 0
         self.action = self.expert.act(observation) if is_expert or is_kept else None
-        features = self.student.features(observation) if is_kept or not is_expert else None
+        features = self.policy.features(observation) if is_kept or not is_expert else None
         if is_kept and features is not None and self.action is not None:
-            state = State(packed(features.pictures), features.measurements, self.action)
+            state = State(compress_raster(features.pictures), features.measurements, self.action)
             self.states.append(state)
         self.features = None if is_expert else features
 
     def advance(self, action: Action) -> None:
         """Drive one step."""
-        self.student.remember(action)
+        self.policy.set_last_action(action)
         ego = self.episode.log.ego[self.episode.iteration]
         self.episode.advance(command_of(action, ego))
 
@@ -134,41 +166,43 @@ class Driver:
 
     def __init__(self, store: str, checkpoint: str) -> None:
         """`checkpoint` is of the network that drives; any where PDM-Closed does."""
-        self._store, self._student = open_named_store(store), Student(checkpoint)
+        self._store, self._policy = open_named_store(store), PolicyPlanner(checkpoint)
 
     def __call__(self, job: Job) -> Driven:
         """Drive all scenarios of a job."""
-        lanes, failed = [], []
+        scenarios, failed = [], []
         for start in job.starts:
             try:
                 scenario = self._store.read(start.token)
-                lanes.append(Lane(start, job, scenario, self._student.fork()))
+                scenarios.append(DrivenScenario(start, job, scenario, self._policy.fork()))
             except ShiftsimError as error:
                 failed.append(f"{start.token}: {error.message}")
-        active = list(lanes)
-        while active := [lane for lane in active if not lane.is_over]:
-            active = _step(active, self._student, failed)
-        states = [state for lane in lanes for state in lane.learnt]
-        ended = [lane.episode for lane in lanes if job.is_test and lane.episode.is_over]
+        active = list(scenarios)
+        while active := [one for one in active if not one.is_over]:
+            active = _step(active, self._policy, failed)
+        states = [state for one in scenarios for state in one.labelled]
+        ended = [one.episode for one in scenarios if job.is_test and one.episode.is_over]
         return Driven(states, [episode.scores.get("cls", 0.0) for episode in ended], failed)
 
 
-def _step(lanes: list[Lane], student: Student, failed: list[str]) -> list[Lane]:
+def _step(
+    scenarios: list[DrivenScenario], policy: PolicyPlanner, failed: list[str]
+) -> list[DrivenScenario]:
     """Drive all of them one step; those that can go on."""
-    seen = []
-    for lane in lanes:
+    ready = []
+    for one in scenarios:
         try:
-            lane.look()
-            seen.append(lane)
+            one.prepare()
+            ready.append(one)
         except ShiftsimError as error:  # a scenario in which the expert fails teaches nothing
-            failed.append(f"{lane.start.token}: {error.message}")
-    asked = [lane for lane in seen if lane.features is not None]
+            failed.append(f"{one.start.token}: {error.message}")
+    asked = [one for one in ready if one.features is not None]
     if asked:
-        for lane, action in zip(
-            asked, student.infer([lane.features for lane in asked if lane.features]), strict=True
+        for one, action in zip(
+            asked, policy.infer([one.features for one in asked if one.features]), strict=True
         ):
-            lane.action = action
-    for lane in seen:
-        if lane.action is not None:
-            lane.advance(lane.action)
-    return seen
+            one.action = action
+    for one in ready:
+        if one.action is not None:
+            one.advance(one.action)
+    return ready

@@ -9,9 +9,9 @@ import numpy as np
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.runs.workers import map_unordered
-from shiftsim.train.curves import Say
-from shiftsim.train.driving import Driven, Driver, Job, Start, State
-from shiftsim.train.settings import Settings
+from shiftsim.train.driving import Driven, Driver, Job, Start
+from shiftsim.train.folder import OnMessage, Settings
+from shiftsim.train.states import State
 
 NOISES = {  # how often states are collected under each
     "none": 0.4,
@@ -31,7 +31,8 @@ _BEGUN, _BEGUN_STEPS = 0.5, 75
 
 _SEE = "see whether `shiftsim run -p pdm-closed` works on the store"
 
-Show = Callable[[int, int], None]
+OnProgress = Callable[[int, int], None]  # gets how many of how many jobs are done
+RunJobs = Callable[[list[Job]], list[Driven]]  # `run_jobs` for some weights
 
 
 class Towns(NamedTuple):
@@ -93,8 +94,10 @@ def collecting_jobs(
     return jobs
 
 
-def do(settings: Settings, checkpoint: str, jobs: list[Job], show: Show) -> list[Driven]:
-    """Do jobs in worker processes; the results in the order of the jobs.
+def run_jobs(
+    settings: Settings, checkpoint: str, on_progress: OnProgress, jobs: list[Job]
+) -> list[Driven]:
+    """Drive jobs in worker processes; the results in the order of the jobs.
 
     Raises:
         ConfigError: A worker died.
@@ -106,12 +109,12 @@ def do(settings: Settings, checkpoint: str, jobs: list[Job], show: Show) -> list
         if outcome.result is None:
             raise ConfigError(f"{outcome.death}", hint="go on with --resume")
         found[places[id(outcome.task)]] = outcome.result
-        show(len(found), len(jobs))
+        on_progress(len(found), len(jobs))
     return [found[place] for place in range(len(jobs))]
 
 
 def collect(
-    settings: Settings, towns: Towns, checkpoint: str, number: int, tau: float, show: Show, say: Say
+    settings: Settings, towns: Towns, number: int, tau: float, run: RunJobs, on_message: OnMessage
 ) -> Iterator[State]:
     """The labelled states of a round; PDM-Closed drives in the first if nobody else can."""
     random = np.random.default_rng([settings.seed, 2, number])
@@ -121,30 +124,25 @@ def collect(
         expected = count / jobs_done if jobs_done else _EXPECTED * float(np.mean(sizes))
         needed = int(np.ceil((wanted - count) / max(expected, 1.0)))
         by_expert = number == 0 and not settings.checkpoint
-        jobs = collecting_jobs(towns, needed, tau, random, by_expert=by_expert)
         before, failed = count, list[str]()
-        for driven in do(settings, checkpoint, jobs, show):
+        for driven in run(collecting_jobs(towns, needed, tau, random, by_expert=by_expert)):
             jobs_done += 1
             count += len(driven.states)
             failed += driven.failed
             yield from driven.states
         if failed:
-            say(f"{len(failed)} scenarios ended early, such as {failed[0]}")
+            on_message(f"{len(failed)} scenarios ended early, such as {failed[0]}")
         if count == before:
             raise DataError(f"no state could be collected: {failed[0]}", hint=_SEE)
 
 
 def mean_scores(
-    settings: Settings, towns: Towns, checkpoint: str, tau: float, *, by_expert: bool, show: Show
+    towns: Towns, count: int, tau: float, run: RunJobs, *, by_expert: bool
 ) -> dict[str, float]:
-    """Mean closed-loop score by noise, on towns that are left out."""
-    sizes, jobs = [], []
-    for noise in TESTED:
-        more = test_jobs(towns, settings.tests, noise, tau, by_expert=by_expert)
-        sizes.append(len(more))
-        jobs += more
-    done = do(settings, checkpoint, jobs, show)
-    halves = done[: sizes[0]], done[sizes[0] :]
+    """Mean closed-loop score by noise, on `count` scenarios at most of towns that are left out."""
+    by_noise = [test_jobs(towns, count, noise, tau, by_expert=by_expert) for noise in TESTED]
+    done = run([job for jobs in by_noise for job in jobs])
+    halves = done[: len(by_noise[0])], done[len(by_noise[0]) :]
     scores = [[score for driven in half for score in driven.scores] for half in halves]
     if not all(scores):
         failed = [text for driven in done for text in driven.failed]

@@ -1,6 +1,11 @@
-"""One step of imitation: a batch of states, the loss, and the optimiser."""
+"""One step of imitation: a batch of states, the loss, its gradient, and the optimiser.
 
-from collections.abc import Iterable
+The network that is trained reads measurements in units of their own (`UNITS`); CaRL's knows none,
+so that its first layer takes them in when the weights are written (`to_official`).
+"""
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -11,19 +16,14 @@ from torch.nn import functional
 
 from shiftsim.kernels import BoolArray, IntArray
 from shiftsim.planners.learned.carl.network import CarlNetwork, Policy
-from shiftsim.train.gradients import Gradients
-from shiftsim.train.network import (
-    MIRRORED_ACTION,
-    Laid,
-    State,
-    forward,
-    lay_out,
-    leaves,
-    mirrored_measurements,
-)
-from shiftsim.train.pictures import Blocks, blocks_of
-from shiftsim.train.states import States, Values
+from shiftsim.train.folder import Weights
+from shiftsim.train.states import MIRRORED_ACTION, States, Values, mirror_measurements
 
+# a measurement is divided by these: last action, velocity and acceleration of the centre
+# [m/s, m/s^2], steering angle and rate [rad, rad/s], yaw rate and acceleration
+UNITS = np.array([1.0, 1.0, 5.0, 0.5, 1.0, 0.5, 0.1, 0.3, 0.2, 0.5], np.float32)
+_UNITS_IN = "features_extractor.state_linear.0.weight"
+LANES, MICRO = 4, 16  # parts of a batch that are summed for themselves; states computed at once
 BATCH = 64  # states of a step
 RATE, FLOOR, WARM_UP = 1e-3, 0.01, 0.02  # learning rate, its end as a share, share of rising
 DECAY, CLIP = 0.01, 5.0  # of the weights; of the norm of the gradient
@@ -34,6 +34,93 @@ BEGUN = 0.5  # share of the learning rate, where weights are given to begin with
 CERTAINTY = 0.01  # weight of the likelihood, by which the distribution gets its width
 EDGE = 0.01  # labels are kept so far from the ends of [0, 1], where the density may be 0 or inf
 HIDDEN, MIRRORED = 0.5, 0.25  # shares: of last actions not shown, of states in the mirror
+
+
+def to_official(weights: Weights) -> Weights:
+    """Weights of a network that is trained as CaRL's network has them, without units."""
+    units = torch.from_numpy(UNITS).to(weights[_UNITS_IN].device)
+    return {**weights, _UNITS_IN: weights[_UNITS_IN] / units}
+
+
+def from_official(weights: Weights) -> Weights:
+    """The inverse of `to_official`."""
+    units = torch.from_numpy(UNITS).to(weights[_UNITS_IN].device)
+    return {**weights, _UNITS_IN: weights[_UNITS_IN] * units}
+
+
+class BatchGradient(NamedTuple):
+    """Sums over the states of a batch."""
+
+    gradients: list[Tensor]  # of the parameters
+    loss: float
+    numbers: Tensor  # to report
+
+
+class GradientPool:
+    """Computes gradients of batches on a device, on a CPU in parts on several threads.
+
+    The parts are summed in an order that does not depend on the number of threads, so that the same
+    seed gives the same network.
+    """
+
+    def __init__(self, device: str, threads: int) -> None:
+        self._device = device
+        torch.set_num_threads(1)  # sums must not depend on the number of cores
+        self._pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
+
+    def compute(
+        self,
+        parameters: list[Tensor],
+        count: int,
+        loss_of_rows: Callable[[IntArray], tuple[Tensor, Tensor]],
+    ) -> BatchGradient:
+        """Gradient of a batch of so many rows.
+
+        `loss_of_rows` gives the sum of losses over some of them, and of numbers to report.
+        """
+
+        def of_rows(rows: IntArray) -> BatchGradient:
+            loss, numbers = loss_of_rows(rows)
+            found = torch.autograd.grad(loss, parameters, allow_unused=True, materialize_grads=True)
+            return BatchGradient(list(found), float(loss.detach()), numbers.cpu())
+
+        def of_lane(rows: IntArray) -> BatchGradient:  # few at once, which stay in the cache
+            starts = range(0, len(rows), MICRO)
+            return _sum(of_rows(rows[start : start + MICRO]) for start in starts)
+
+        rows = np.arange(count)
+        if self._device != "cpu":
+            return of_rows(rows)
+        lanes = [lane for lane in np.array_split(rows, LANES) if len(lane)]
+        return _sum(self._pool.map(of_lane, lanes))
+
+
+def _sum(parts: Iterable[BatchGradient]) -> BatchGradient:
+    first, *others = parts
+    loss, numbers = first.loss, first.numbers
+    for other in others:
+        for total, gradient in zip(first.gradients, other.gradients, strict=True):
+            total.add_(gradient)
+        loss, numbers = loss + other.loss, numbers + other.numbers
+    return BatchGradient(first.gradients, loss, numbers)
+
+
+def apply_gradient(
+    optimiser: torch.optim.Optimizer,
+    parameters: list[Tensor],
+    found: BatchGradient,
+    count: int,
+    *,
+    clip: float,
+    rate: float,
+) -> None:
+    """One step of an optimiser down the mean gradient of so many states, clipped to a norm."""
+    for parameter, gradient in zip(parameters, found.gradients, strict=True):
+        parameter.grad = gradient / count
+    torch.nn.utils.clip_grad_norm_(parameters, clip)
+    for group in optimiser.param_groups:
+        group["lr"] = rate
+    optimiser.step()
 
 
 class Batch(NamedTuple):
@@ -51,7 +138,7 @@ def draw_batch(states: States, key: Iterable[int], size: int = BATCH) -> Batch:
     indices = states.draw(size, random)
     mirrored, hidden = random.random(size) < MIRRORED, random.random(size) < HIDDEN
     measurements, actions = states.measurements[indices], states.actions[indices]
-    measurements[mirrored] = mirrored_measurements(measurements[mirrored])
+    measurements[mirrored] = mirror_measurements(measurements[mirrored])
     actions[mirrored] *= MIRRORED_ACTION
     measurements[hidden, :2] = 0.0
     return Batch(indices, mirrored, measurements, actions)
@@ -83,7 +170,7 @@ def log_density(alpha: Tensor, beta: Tensor, x: Tensor) -> Tensor:
 
 
 @dataclass
-class Learned:
+class StepResult:
     """What a step came to."""
 
     loss: float  # mean over the batch
@@ -94,7 +181,7 @@ class Learner:
     """A network, its optimiser, and the running mean of its weights, which is what drives."""
 
     def __init__(
-        self, device: str, threads: int, total: int, seed: int, begin: State | None = None
+        self, device: str, threads: int, total: int, seed: int, begin: Weights | None = None
     ) -> None:
         """`total` steps are to be done; the learning rate falls towards their end.
 
@@ -107,54 +194,43 @@ class Learner:
             self.network.load_state_dict(begin)
         self.network.to(device)
         self.mean = {name: value.detach().clone() for name, value in self._parameters.items()}
-        plain = [value for value in self._trained if value.dim() != 2 and value.dim() != 4]
-        heavy = [value for value in self._trained if value.dim() in (2, 4)]
-        groups = [{"params": heavy, "weight_decay": DECAY}, {"params": plain, "weight_decay": 0.0}]
+        trained = self._parameters.items()
+        self._trained = [v for name, v in trained if not name.startswith("value_head")]
+        plain = [value for value in self._trained if value.dim() not in (2, 4)]
+        decayed = [value for value in self._trained if value.dim() in (2, 4)]
+        groups = [
+            {"params": decayed, "weight_decay": DECAY},
+            {"params": plain, "weight_decay": 0.0},
+        ]
         self.optimiser = torch.optim.AdamW(groups, lr=RATE, betas=(0.9, 0.99), fused=True)
-        self._gradients = Gradients(device, threads)
+        self._device, self._pool = device, GradientPool(device, threads)
 
     @property
     def _parameters(self) -> dict[str, Tensor]:
         return dict(self.network.named_parameters())
 
-    @property
-    def _trained(self) -> list[Tensor]:
-        return [v for name, v in self._parameters.items() if not name.startswith("value_head")]
-
-    def learn(self, states: States, batch: Batch) -> Learned:
+    def learn(self, states: States, batch: Batch) -> StepResult:
         """Do one step."""
-        laid = lay_out(self.network)
         count = len(batch.indices)
 
-        def see(rows: IntArray) -> Blocks:
-            rasters = [states.picture(int(index)) for index in batch.indices[rows]]
-            return blocks_of(rasters, batch.mirrored[rows].tolist())
+        def loss_of_rows(rows: IntArray) -> tuple[Tensor, Tensor]:
+            rasters = states.rasters(batch.indices[rows], batch.mirrored[rows].tolist())
+            arrays = (rasters, batch.measurements[rows] / UNITS, batch.actions[rows])
+            pictures, measured, label = (torch.from_numpy(a).to(self._device) for a in arrays)
+            return loss_of(self.network(pictures, measured), label)
 
-        def judge(ends: Laid, rows: IntArray, pictures: Tensor) -> tuple[Tensor, Tensor]:
-            measured = torch.from_numpy(batch.measurements[rows]).to(pictures.device)
-            label = torch.from_numpy(batch.actions[rows]).to(pictures.device)
-            return loss_of(forward(ends, pictures, measured), label)
-
-        gradients, loss, errors = self._gradients.of(leaves(laid), count, see, judge)
-        torch._foreach_div_(gradients, float(count))
-        for group in self.optimiser.param_groups:
-            group["lr"] = self._rate * schedule(self.step / self.total)
-        self.optimiser.zero_grad()
-        torch.autograd.backward(list(laid.values()), gradients)
-        torch.nn.utils.clip_grad_norm_(self._trained, CLIP)
-        self.optimiser.step()
+        found = self._pool.compute(self._trained, count, loss_of_rows)
+        rate = self._rate * schedule(self.step / self.total)
+        apply_gradient(self.optimiser, self._trained, found, count, clip=CLIP, rate=rate)
         self.step += 1
-        self._average()
-        means = (errors / count).tolist()
-        return Learned(loss / count, (means[0], means[1]))
+        drift = 1.0 - min(AVERAGED, (1.0 + self.step) / (10.0 + self.step))
+        for name, value in self._parameters.items():
+            self.mean[name].lerp_(value.detach(), drift)
+        means = (found.numbers / count).tolist()
+        return StepResult(found.loss / count, (means[0], means[1]))
 
-    def _average(self) -> None:
-        keep = min(AVERAGED, (1.0 + self.step) / (10.0 + self.step))
-        means, now = list(self.mean.values()), [self._parameters[name] for name in self.mean]
-        torch._foreach_lerp_(means, [value.detach() for value in now], 1.0 - keep)
-
-    def driving(self) -> State:
-        """The state of the network with the mean weights."""
+    def driving(self) -> Weights:
+        """The network with the mean weights, which drives."""
         return {**self.network.state_dict(), **self.mean}
 
     def state(self) -> dict[str, Any]:

@@ -11,32 +11,32 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from numpy.typing import NDArray
 from torch import Tensor
 
+from shiftsim.env.driving import DrivingEnv, ProcessVectorEnv
 from shiftsim.files import write_text
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.planners.learned.carl.network import CarlNetwork, Policy
-from shiftsim.train.curves import Say, write_table
-from shiftsim.train.gradients import Gradients
-from shiftsim.train.jobs import NOISES, Towns
-from shiftsim.train.keeping import read_state, write_state
-from shiftsim.train.learning import log_density
-from shiftsim.train.network import (
-    Laid,
-    State,
-    features_of,
-    from_official,
-    lay_out,
-    leaves,
-    policy_of,
-    tensor_of,
-    to_official,
-    value_of,
+from shiftsim.train.folder import (
+    OnMessage,
+    Settings,
+    Weights,
+    read_state,
+    write_state,
+    write_table,
 )
-from shiftsim.train.pictures import Blocks, blocks_of, packed, unpacked
-from shiftsim.train.settings import Settings
+from shiftsim.train.jobs import NOISES, Towns
+from shiftsim.train.learning import (
+    UNITS,
+    GradientPool,
+    apply_gradient,
+    from_official,
+    log_density,
+    to_official,
+)
+from shiftsim.train.states import Values, compress_raster, read_raster
 
 ENVS = 8
 TRAINED = "trained.txt"  # tokens that are trained on
@@ -47,14 +47,12 @@ CLIP, VALUE_WEIGHT = 0.1, 0.5
 PERCENT = 100.0  # of the environment's reward
 ALONE = 0.1  # share of the updates in which only the critic learns
 RECENT = 100  # episodes whose mean return tells the best network
-_KEPT_EVERY = 120.0  # s
+_WRITE_EVERY = 120.0  # s
 _EDGE = 1e-7  # actions are kept so far from the ends of [0, 1]
 
-Values = NDArray[np.float32]
 
-
-class Memory(NamedTuple):
-    """What one rollout went through. M steps, those of one environment after another."""
+class RolloutBuffer(NamedTuple):
+    """What was done in all environments for some steps. M steps, the environments in turn."""
 
     pictures: list[bytes]
     measurements: Values  # (M, 10)
@@ -66,7 +64,7 @@ class Memory(NamedTuple):
     advantages: Values  # (M,)
 
 
-class Improved(NamedTuple):
+class UpdateResult(NamedTuple):
     """What an update came to."""
 
     loss: float
@@ -91,10 +89,10 @@ def advantages_of(
     return out
 
 
-def judged(
+def ppo_loss(
     policy: Policy, values: Tensor, part: dict[str, Tensor], *, critic_only: bool
 ) -> tuple[Tensor, Tensor]:
-    """Sum of losses over some steps of a `Memory`, and of the steps that were cut (1,)."""
+    """Sum of losses over some steps of a `RolloutBuffer`, and of the steps that were cut (1,)."""
     x = part["actions"].clamp(_EDGE, 1.0 - _EDGE)
     density = log_density(policy.alpha, policy.beta, x).sum(1)
     ratio = (density - part["density"]).exp()
@@ -110,50 +108,52 @@ def judged(
     return acting + VALUE_WEIGHT * critic, cut
 
 
-def reinforce(settings: Settings, towns: Towns, state: State, device: str, say: Say) -> State:
-    """The official network with the highest mean return, from that of `state` on."""
-    trainer = Trainer(settings, towns, state, device)
-    kept: dict[str, Any] = {"rows": [], "best": state, "highest": -np.inf, "seconds": 0.0}
-    place = settings.out / "ppo.pt"
-    if place.exists():
-        kept = read_state(place)
-        trainer.restore(kept.pop("trainer"))
-    began, noted = monotonic() - kept["seconds"], monotonic()
+def reinforce(
+    settings: Settings, towns: Towns, weights: Weights, device: str, on_message: OnMessage
+) -> Weights:
+    """The official network with the highest mean return, from the one with `weights` on."""
+    trainer = Trainer(settings, towns, weights, device)
+    state: dict[str, Any] = {"rows": [], "best": weights, "highest": -np.inf, "seconds": 0.0}
+    path = settings.out / "ppo.pt"
+    if path.exists():
+        state = read_state(path)
+        trainer.restore(state.pop("trainer"))
+    began, written = monotonic() - state["seconds"], monotonic()
     with trainer:
         while trainer.update < trainer.total:
-            done = trainer.improve()
+            result = trainer.improve()
             recent = trainer.returns[-RECENT:]
             mean = float(np.mean(recent)) if recent else 0.0
-            if len(recent) == RECENT and mean > kept["highest"]:
+            if len(recent) == RECENT and mean > state["highest"]:
                 best = {name: v.clone() for name, v in trainer.network.state_dict().items()}
-                kept |= {"best": to_official(best), "highest": mean}
+                state |= {"best": to_official(best), "highest": mean}
             steps, seconds = trainer.update * ROLLOUT, monotonic() - began
-            kept["rows"].append({"samples": steps, "return": mean, **done._asdict()})
+            state["rows"].append({"samples": steps, "return": mean, **result._asdict()})
             left = seconds / trainer.update * (trainer.total - trainer.update)
-            say(
+            on_message(
                 f"PPO: {steps} of {trainer.total * ROLLOUT} samples  {steps / seconds:.0f} "
-                f"samples/s  return {mean:.1f}  loss {done.loss:.3f}  {left / 60.0:.0f} min left"
+                f"samples/s  return {mean:.1f}  loss {result.loss:.3f}  {left / 60.0:.0f} min left"
             )
-            write_table(settings.out / "ppo.parquet", kept["rows"])
-            if monotonic() - noted > _KEPT_EVERY or trainer.update == trainer.total:
-                noted, kept["seconds"] = monotonic(), seconds
-                write_state(place, kept | {"trainer": trainer.state()})
-    best_of: State = kept["best"]
-    return best_of
+            write_table(settings.out / "ppo.parquet", state["rows"])
+            if monotonic() - written > _WRITE_EVERY or trainer.update == trainer.total:
+                written, state["seconds"] = monotonic(), seconds
+                write_state(path, state | {"trainer": trainer.state()})
+    best_weights: Weights = state["best"]
+    return best_weights
 
 
 class Trainer:
     """PPO of one network on many environments."""
 
-    def __init__(self, settings: Settings, towns: Towns, state: State, device: str) -> None:
-        """`state` is that of an official network; `towns` are those to train in."""
+    def __init__(self, settings: Settings, towns: Towns, weights: Weights, device: str) -> None:
+        """`weights` are those of an official network; `towns` are those to train in."""
         self.network = CarlNetwork()
-        self.network.load_state_dict(from_official(state))
+        self.network.load_state_dict(from_official(weights))
         self.network.to(device)
         self.total = max(1, settings.ppo_samples // ROLLOUT)
         self.update, self.returns = 0, list[float]()
         self._settings, self._device = settings, device
-        self._gradients = Gradients(device, settings.workers)
+        self._pool = GradientPool(device, settings.workers)
         self._optimiser = torch.optim.Adam(self.network.parameters(), lr=RATE, eps=EPSILON)
         tokens = sorted(token for found in towns.trained.values() for token in found)
         write_text(settings.out / TRAINED, "\n".join(tokens) + "\n")
@@ -165,7 +165,7 @@ class Trainer:
         self._envs = (
             SyncVectorEnv(makers, autoreset_mode=mode)
             if self._settings.workers == 1
-            else AsyncVectorEnv(makers, autoreset_mode=mode, context="spawn")
+            else ProcessVectorEnv(makers, autoreset_mode=mode)
         )
         seeds = np.random.default_rng([self._settings.seed, 4, self.update])
         numbers = seeds.integers(2**31, size=ENVS).tolist()
@@ -176,89 +176,82 @@ class Trainer:
     def __exit__(self, *_: object) -> None:
         self._envs.close()
 
-    def improve(self) -> Improved:
+    def improve(self) -> UpdateResult:
         """Drive one rollout, and learn from it."""
         random = np.random.default_rng([self._settings.seed, 5, self.update])
         torch.manual_seed(int(random.integers(2**31)))
-        memory = self._drive(ROLLOUT // ENVS)
-        share = self.update / self.total
-        for group in self._optimiser.param_groups:
-            group["lr"] = RATE * (1.0 - share)
+        buffer = self._drive(ROLLOUT // ENVS)
         loss = cut = 0.0
         for _ in range(EPOCHS):
-            order = random.permutation(len(memory.pictures))
+            order = random.permutation(len(buffer.pictures))
             for first in range(0, len(order), MINIBATCH):
                 rows = order[first : first + MINIBATCH]
-                done, clipped = self._learn(memory, rows, critic_only=share < ALONE)
+                critic_only = self.update / self.total < ALONE
+                done, clipped = self._learn(buffer, rows, critic_only=critic_only)
                 loss, cut = loss + done * len(rows), cut + clipped
         self.update += 1
-        return Improved(loss / EPOCHS / len(order), cut / EPOCHS / len(order))
+        return UpdateResult(loss / EPOCHS / len(order), cut / EPOCHS / len(order))
 
-    def _drive(self, steps: int) -> Memory:
+    def _drive(self, steps: int) -> RolloutBuffer:
         """Act in all environments for so many steps."""
         pictures: list[bytes] = []
         measured, critic = np.zeros((steps, ENVS, 10)), np.zeros((steps, ENVS, 4))
         actions, ended = np.zeros((steps, ENVS, 2)), np.zeros((steps, ENVS), np.bool_)
         density, values, rewards = np.zeros((3, steps, ENVS))
         with torch.no_grad():
-            laid = lay_out(self.network, critic=True)
             for step in range(steps):
                 seen = self._seen
-                policy, value = self._ask(laid, seen)
+                policy, value = self._ask(seen)
                 x = torch.distributions.Beta(policy.alpha, policy.beta).sample()
                 x = x.clamp(_EDGE, 1.0 - _EDGE)
                 density[step] = log_density(policy.alpha, policy.beta, x).sum(1).cpu()
                 actions[step], values[step] = x.cpu(), value.cpu()
-                pictures += [packed(raster) for raster in seen["raster"]]
+                pictures += [compress_raster(raster) for raster in seen["raster"]]
                 measured[step], critic[step] = seen["measurements"], seen["value_measurements"]
                 asked = (2.0 * actions[step] - 1.0).astype(np.float32)
                 self._seen, reward, infraction, is_over, _ = self._envs.step(asked)
                 rewards[step], ended[step] = reward / PERCENT, infraction | is_over
-                self._count(reward, ended[step])
-            last = self._ask(laid, self._seen)[1].cpu().numpy().astype(np.float64)
+                self._sums += reward
+                self.returns += self._sums[ended[step]].tolist()
+                self._sums[ended[step]] = 0.0
+            last = self._ask(self._seen)[1].cpu().numpy().astype(np.float64)
         gains = advantages_of(rewards, values, ended, last)
         numbers = (measured, critic, actions, density, values, gains + values, gains)
         flat = [found.reshape(-1, *found.shape[2:]).astype(np.float32) for found in numbers]
-        return Memory(pictures, *flat)
+        return RolloutBuffer(pictures, *flat)
 
-    def _ask(self, laid: Laid, seen: dict[str, Any]) -> tuple[Policy, Tensor]:
-        blocks = blocks_of(seen["raster"], [False] * ENVS)
-        measured = torch.from_numpy(seen["measurements"]).to(self._device)
-        critic = torch.from_numpy(seen["value_measurements"]).to(self._device)
-        features = features_of(laid, tensor_of(blocks, self._device), measured)
-        return policy_of(laid, features), value_of(laid, features, critic)
+    def _ask(self, seen: dict[str, Any]) -> tuple[Policy, Tensor]:
+        """The policy and what the critic expects (ENVS,)."""
+        arrays = (seen["raster"], seen["measurements"] / UNITS, seen["value_measurements"])
+        pictures, measured, critic = (torch.from_numpy(a).to(self._device) for a in arrays)
+        features = self.network.features_extractor(pictures, measured)
+        return self.network.policy(features), self.network.value(features, critic)[:, 0]
 
-    def _count(self, reward: FloatArray, over: NDArray[np.bool_]) -> None:
-        self._sums += reward
-        self.returns += self._sums[over].tolist()
-        self._sums[over] = 0.0
-
-    def _learn(self, memory: Memory, order: IntArray, *, critic_only: bool) -> tuple[float, float]:
+    def _learn(
+        self, buffer: RolloutBuffer, order: IntArray, *, critic_only: bool
+    ) -> tuple[float, float]:
         names = ("measurements", "critic", "actions", "density", "values", "returns", "advantages")
-        chosen = {name: torch.from_numpy(getattr(memory, name)[order]) for name in names}
+        chosen = {name: torch.from_numpy(getattr(buffer, name)[order]) for name in names}
+        chosen["measurements"] /= torch.from_numpy(UNITS)
         gain = chosen["advantages"]
         chosen["advantages"] = (gain - gain.mean()) / (gain.std() + 1e-8)
 
-        def see(rows: IntArray) -> Blocks:
-            rasters = [unpacked(memory.pictures[index]) for index in order[rows]]
-            return blocks_of(rasters, [False] * len(rows))
+        def loss_of_rows(rows: IntArray) -> tuple[Tensor, Tensor]:
+            rasters = np.stack([read_raster(buffer.pictures[index]) for index in order[rows]])
+            part = {name: value[rows].to(self._device) for name, value in chosen.items()}
+            pictures = torch.from_numpy(rasters).to(self._device)
+            features = self.network.features_extractor(pictures, part["measurements"])
+            policy = self.network.policy(features)
+            read = features.detach() if critic_only else features
+            values = self.network.value(read, part["critic"])[:, 0]
+            return ppo_loss(policy, values, part, critic_only=critic_only)
 
-        def judge(ends: Laid, rows: IntArray, pictures: Tensor) -> tuple[Tensor, Tensor]:
-            part = {name: value[rows].to(pictures.device) for name, value in chosen.items()}
-            features = features_of(ends, pictures, part["measurements"])
-            policy = policy_of(ends, features)
-            seen = features.detach() if critic_only else features
-            values = value_of(ends, seen, part["critic"])
-            return judged(policy, values, part, critic_only=critic_only)
-
-        laid = lay_out(self.network, critic=True)
-        found = self._gradients.of(leaves(laid), len(order), see, judge)
-        torch._foreach_div_(found.gradients, float(len(order)))
-        self._optimiser.zero_grad()
-        torch.autograd.backward(list(laid.values()), found.gradients)
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), CLIP_NORM)
-        self._optimiser.step()
-        return found.loss / len(order), float(found.numbers[0])
+        parameters: list[Tensor] = list(self.network.parameters())
+        count = len(order)
+        found = self._pool.compute(parameters, count, loss_of_rows)
+        rate = RATE * (1.0 - self.update / self.total)
+        apply_gradient(self._optimiser, parameters, found, count, clip=CLIP_NORM, rate=rate)
+        return found.loss / count, float(found.numbers[0])
 
     def state(self) -> dict[str, Any]:
         """All that is needed to go on, with new episodes."""
@@ -278,8 +271,6 @@ class Trainer:
 
 def _make(settings: Settings, number: int) -> gymnasium.Env[Any, Any]:
     """One environment; the noises are dealt out as in imitation."""
-    from shiftsim.env.driving import DrivingEnv
-
     places = (np.arange(ENVS) + 0.5) / ENVS
     noise = list(NOISES)[int(np.searchsorted(np.cumsum(list(NOISES.values())), places[number]))]
     split = str(settings.out / TRAINED)

@@ -7,28 +7,44 @@ every two minutes.
 """
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from time import monotonic
 from typing import Any
 
 from shiftsim.planners.learned.device import resolve_device
+from shiftsim.runs.filter import read_filter_results
 from shiftsim.runs.scenarios import find_split, open_named_store
-from shiftsim.runs.verdicts import read_verdicts
-from shiftsim.train.curves import Say, draw_curves, write_table
-from shiftsim.train.jobs import Towns, collect, divide, mean_scores
-from shiftsim.train.keeping import read_state, write_network, write_state
-from shiftsim.train.learning import BATCH, Learner, draw_batch
-from shiftsim.train.network import State, from_official, to_official
-from shiftsim.train.settings import TAUS, Settings, prepare_folder
+from shiftsim.train.folder import (
+    TAUS,
+    OnMessage,
+    Settings,
+    Weights,
+    draw_curves,
+    prepare_folder,
+    read_state,
+    write_network,
+    write_state,
+    write_table,
+)
+from shiftsim.train.jobs import RunJobs, Towns, collect, divide, mean_scores, run_jobs
+from shiftsim.train.learning import (
+    BATCH,
+    Learner,
+    StepResult,
+    draw_batch,
+    from_official,
+    to_official,
+)
 from shiftsim.train.states import States, read_part, write_part
 
-_KEPT_EVERY, _SAID_EVERY = 120.0, 10.0  # s
-_NOTED_EVERY = 50  # steps
-_NOBODY = "deterministic:base"  # where the network does not drive
+_WRITE_EVERY, _REPORT_EVERY = 120.0, 10.0  # s
+_CURVE_EVERY = 50  # steps
+_NO_DRIVER = "deterministic:base"  # where the network does not drive
 
 
 @dataclass
-class Course:
+class Progress:
     """How far a training is, with all that it has noted."""
 
     tau: float = 0.0
@@ -43,18 +59,18 @@ class Course:
 class Training:
     """One training in its folder."""
 
-    def __init__(self, settings: Settings, say: Say, *, resume: bool = False) -> None:
+    def __init__(self, settings: Settings, on_message: OnMessage, *, resume: bool = False) -> None:
         """Begin, or go on where it was kept last.
 
         Raises:
             ConfigError: The folder holds another training, or there is no such device.
             DataError: The store is not there.
         """
-        self._settings, self._say = settings, say
+        self._settings, self._on_message = settings, on_message
         self.device = resolve_device(settings.device)
         store = open_named_store(settings.store)
-        verdicts = read_verdicts(store.path, store.hash)
-        usable = verdicts.accepted if verdicts else store.tokens
+        filtered = read_filter_results(store.path, store.hash)
+        usable = filtered.accepted if filtered else store.tokens
         tokens = find_split(settings.split, store.path, usable).tokens
         self.towns: Towns = divide(store, tokens, settings.seed)
         prepare_folder(settings, store.hash, resume=resume)
@@ -62,14 +78,14 @@ class Training:
         total = self.steps * settings.rounds
         begin = from_official(self._begin()) if settings.checkpoint else None
         self.learner = Learner(self.device, settings.workers, total, settings.seed, begin)
-        self.course = Course()
+        self.progress = Progress()
         if settings.state.exists():
-            kept = read_state(settings.state)
-            self.course = Course(**kept["course"])
-            self.learner.restore(kept["learner"])
-        self._began = monotonic() - self.course.seconds
+            state = read_state(settings.state)
+            self.progress = Progress(**state["progress"])
+            self.learner.restore(state["learner"])
+        self._began = monotonic() - self.progress.seconds
 
-    def _begin(self) -> State:
+    def _begin(self) -> Weights:
         """The weights to begin with, which are the network that drives first."""
         from shiftsim.planners.learned.checkpoint import load_weights
 
@@ -86,16 +102,16 @@ class Training:
             self._reinforce()
 
     def _imitate(self) -> None:
-        settings, course = self._settings, self.course
-        if not course.tau:
-            course.tau = settings.tau or self._choose_tau()
-            self._keep()
-        while course.round < settings.rounds:
+        settings, progress = self._settings, self.progress
+        if not progress.tau:
+            progress.tau = settings.tau or self._choose_tau()
+            self._write_state()
+        while progress.round < settings.rounds:
             self._collect()
             self._train()
             self._test()
-            course.round, course.done = course.round + 1, 0
-            self._keep()
+            progress.round, progress.done = progress.round + 1, 0
+            self._write_state()
 
     def _reinforce(self) -> None:
         """Go on with PPO from the best network, and test what comes out."""
@@ -105,104 +121,105 @@ class Training:
         settings = self._settings
         state = load_weights(str(settings.best), "carl").state
         write_network(
-            settings.reinforced, reinforce(settings, self.towns, state, self.device, self._say)
+            settings.reinforced,
+            reinforce(settings, self.towns, state, self.device, self._on_message),
         )
         found = self._scores(settings.reinforced, "PPO:")
-        self._say(f"PPO: {_in_words(found)}")
+        self._on_message(f"PPO: {_in_words(found)}")
 
     def _choose_tau(self) -> float:
         """The tau with which PDM-Closed drives best through its labels, with and without noise."""
+        settings, rows = self._settings, self.progress.taus
         for tau in TAUS:
-            show = self._shower(f"tau {tau:g} s")
-            found = mean_scores(self._settings, self.towns, _NOBODY, tau, by_expert=True, show=show)
-            self.course.taus.append({"tau": tau, **found})
-            self._say(f"tau {tau:g} s: {_in_words(found)}")
-        write_table(self._settings.out / "tau.parquet", self.course.taus)
-        best = max(self.course.taus, key=lambda row: sum(row.values()) - row["tau"])
-        return float(best["tau"])
+            run = self._run_jobs(_NO_DRIVER, f"tau {tau:g} s")
+            found = mean_scores(self.towns, settings.tests, tau, run, by_expert=True)
+            rows.append({"tau": tau, **found})
+            self._on_message(f"tau {tau:g} s: {_in_words(found)}")
+        write_table(settings.out / "tau.parquet", rows)
+        return float(max(rows, key=lambda row: sum(row.values()) - row["tau"])["tau"])
 
     def _collect(self) -> None:
-        settings, course = self._settings, self.course
-        folder = settings.part(course.round)
+        settings, progress = self._settings, self.progress
+        folder = settings.part(progress.round)
         if folder.exists():
             return
-        drives = course.round or settings.checkpoint
-        checkpoint = str(settings.network) if drives else _NOBODY
-        show = self._shower(f"{self._where} collecting")
-        number, tau, towns = course.round, course.tau, self.towns
-        states = collect(settings, towns, checkpoint, number, tau, show, self._say)
-        write_part(folder, states)
-        self._keep()
+        drives = progress.round or settings.checkpoint
+        checkpoint = str(settings.network) if drives else _NO_DRIVER
+        run = self._run_jobs(checkpoint, f"{self._where} collecting")
+        number, tau = progress.round, progress.tau
+        write_part(folder, collect(settings, self.towns, number, tau, run, self._on_message))
+        self._write_state()
 
     def _train(self) -> None:
-        settings, course, learner = self._settings, self.course, self.learner
-        parts = [read_part(settings.part(number)) for number in range(course.round + 1)]
+        settings, progress, learner = self._settings, self.progress, self.learner
+        parts = [read_part(settings.part(number)) for number in range(progress.round + 1)]
         states = States(parts)
-        self._say(f"{self._where} training on {len(states)} states")
-        said = kept = monotonic()
-        before, noted = course.done, []
-        while course.done < self.steps:
-            key = (settings.seed, 3, course.round, course.done)
-            noted.append(learner.learn(states, draw_batch(states, key)))
-            course.done += 1
-            if course.done % _NOTED_EVERY == 0 or course.done == self.steps:
-                course.curve.append(_noted(course.round, learner.step, noted))
-                noted = []
-                if monotonic() - kept > _KEPT_EVERY:
-                    self._keep()
-                    kept = monotonic()
-            if monotonic() - said > _SAID_EVERY:
-                rate = (course.done - before) * BATCH / (monotonic() - said)
-                said, before = monotonic(), course.done
+        self._on_message(f"{self._where} training on {len(states)} states")
+        reported = written = monotonic()
+        before, results = progress.done, list[StepResult]()
+        while progress.done < self.steps:
+            key = (settings.seed, 3, progress.round, progress.done)
+            results.append(learner.learn(states, draw_batch(states, key)))
+            progress.done += 1
+            if progress.done % _CURVE_EVERY == 0 or progress.done == self.steps:
+                progress.curve.append(_curve_row(progress.round, learner.step, results))
+                results = []
+                if monotonic() - written > _WRITE_EVERY:
+                    self._write_state()
+                    written = monotonic()
+            if monotonic() - reported > _REPORT_EVERY:
+                rate = (progress.done - before) * BATCH / (monotonic() - reported)
+                reported, before = monotonic(), progress.done
                 self._report(rate)
 
     def _report(self, rate: float) -> None:
         left = (self.learner.total - self.learner.step) * BATCH / rate
-        row = self.course.curve[-1] if self.course.curve else {"loss": float("nan")}
-        self._say(
+        row = self.progress.curve[-1] if self.progress.curve else {"loss": float("nan")}
+        self._on_message(
             f"{self._where} {self.learner.step * BATCH} of {self.learner.total * BATCH} samples  "
             f"{rate:.0f} samples/s  loss {row['loss']:.3f}  {left / 60.0:.0f} min of training left"
         )
 
     def _test(self) -> None:
-        settings, course = self._settings, self.course
+        settings, progress = self._settings, self.progress
         state = to_official(self.learner.driving())
         write_network(settings.network, state)
         found = self._scores(settings.network, self._where)
         seconds = monotonic() - self._began
         samples = self.learner.step * BATCH
-        row = {"round": course.round, "samples": samples, **found, "seconds": seconds}
-        before = max((sum_of(row) for row in course.scores), default=-1.0)
-        course.scores.append(row)
+        row = {"round": progress.round, "samples": samples, **found, "seconds": seconds}
+        before = max((sum_of(row) for row in progress.scores), default=-1.0)
+        progress.scores.append(row)
         if sum_of(row) > before:
             write_network(settings.best, state)
-        self._say(f"{self._where} {_in_words(found)}  after {seconds / 60.0:.0f} min")
-        write_table(settings.out / "scores.parquet", course.scores)
-        write_table(settings.out / "curve.parquet", course.curve)
-        draw_curves(settings.out / "curves.png", course.curve, course.scores)
+        self._on_message(f"{self._where} {_in_words(found)}  after {seconds / 60.0:.0f} min")
+        write_table(settings.out / "scores.parquet", progress.scores)
+        write_table(settings.out / "curve.parquet", progress.curve)
+        draw_curves(settings.out / "curves.png", progress.curve, progress.scores)
 
     def _scores(self, network: Path, where: str) -> dict[str, float]:
-        settings, tau, show = self._settings, self.course.tau, self._shower(f"{where} testing")
-        return mean_scores(settings, self.towns, str(network), tau, by_expert=False, show=show)
+        run, count = self._run_jobs(str(network), f"{where} testing"), self._settings.tests
+        return mean_scores(self.towns, count, self.progress.tau, run, by_expert=False)
 
-    def _keep(self) -> None:
-        self.course.seconds = monotonic() - self._began
-        kept = {"course": vars(self.course), "learner": self.learner.state()}
-        write_state(self._settings.state, kept)
+    def _write_state(self) -> None:
+        self.progress.seconds = monotonic() - self._began
+        state = {"progress": vars(self.progress), "learner": self.learner.state()}
+        write_state(self._settings.state, state)
 
     @property
     def _where(self) -> str:
-        return f"round {self.course.round + 1} of {self._settings.rounds}:"
+        return f"round {self.progress.round + 1} of {self._settings.rounds}:"
 
-    def _shower(self, what: str) -> Any:
-        said = [monotonic()]
+    def _run_jobs(self, checkpoint: str, what: str) -> RunJobs:
+        """What drives jobs with some weights and says how far it is, now and then."""
+        last = [monotonic()]
 
-        def show(done: int, total: int) -> None:
-            if monotonic() - said[0] > _SAID_EVERY or done == total:
-                said[0] = monotonic()
-                self._say(f"{what} {done} of {total} jobs")
+        def on_progress(done: int, total: int) -> None:
+            if monotonic() - last[0] > _REPORT_EVERY or done == total:
+                last[0] = monotonic()
+                self._on_message(f"{what} {done} of {total} jobs")
 
-        return show
+        return partial(run_jobs, self._settings, checkpoint, on_progress)
 
 
 def sum_of(row: dict[str, Any]) -> float:
@@ -210,14 +227,14 @@ def sum_of(row: dict[str, Any]) -> float:
     return float(row["none"] + row["ou-high"])
 
 
-def _noted(number: int, step: int, noted: list[Any]) -> dict[str, Any]:
-    count = len(noted)
+def _curve_row(number: int, step: int, results: list[StepResult]) -> dict[str, Any]:
+    count = len(results)
     return {
         "round": number,
         "samples": step * BATCH,
-        "loss": sum(one.loss for one in noted) / count,
-        "acceleration_error": sum(one.errors[0] for one in noted) / count,
-        "steering_error": sum(one.errors[1] for one in noted) / count,
+        "loss": sum(one.loss for one in results) / count,
+        "acceleration_error": sum(one.errors[0] for one in results) / count,
+        "steering_error": sum(one.errors[1] for one in results) / count,
     }
 
 

@@ -1,25 +1,61 @@
-"""Labelled states on disk: a folder per round, whole or not there."""
+"""Labelled states: what one holds, a folder per round on disk, and how often each is drawn."""
 
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.planners.learned.carl.planner import MAX_STEERING
 from shiftsim.planners.learned.carl.raster import Raster
-from shiftsim.train.driving import State
-from shiftsim.train.pictures import unpacked
+from shiftsim.planners.learned.carl.view import CHANNELS, SIZE
+from shiftsim.world.state import PACIFICA
 
 _PICTURES, _NUMBERS = "pictures.bin", "states.npz"
-_STEERING = 6  # of the measurements
+_SHAPE = (len(CHANNELS), SIZE, SIZE)
+_CODEC = pa.Codec("zstd", 3)  # most pixels are empty: a raster takes some kilobytes
+_AX, _STEERING, _YAW_ACCEL = 4, 6, 9  # of the measurements
 BRAKING, HARD, TURNING, DISTURBED = -0.25, -0.6, 0.1, 0.03  # actions that count as such
 URGENT = 3.0  # how much more often a state before an infraction is drawn
+MIRRORED_ACTION = np.array([1, -1], np.float32)  # signs in the mirror
+_MIRRORED = np.array([1, -1, 1, -1, 1, -1, -1, -1, -1, -1], np.float32)
 
 Values = NDArray[np.float32]
+
+
+class State(NamedTuple):
+    """A labelled state."""
+
+    picture: bytes  # a compressed raster
+    measurements: Values  # (10,) of `CarlFeatures`
+    action: Values  # (2,) what the expert would do
+    is_urgent: bool = False  # whether the network ended with an infraction soon after
+
+
+def compress_raster(raster: Raster) -> bytes:
+    """A raster (9, 256, 256) in few bytes."""
+    content: bytes = _CODEC.compress(np.ascontiguousarray(raster), asbytes=True)
+    return content
+
+
+def read_raster(content: Any) -> Raster:
+    """The read-only raster (9, 256, 256) of `compress_raster`."""
+    return np.frombuffer(_CODEC.decompress(content, int(np.prod(_SHAPE))), np.uint8).reshape(_SHAPE)
+
+
+def mirror_measurements(measurements: Values) -> Values:
+    """(…, 10) measurements of the ego in the mirror.
+
+    The acceleration of the centre holds the yaw acceleration, with its sign.
+    """
+    out = measurements * _MIRRORED
+    turning = PACIFICA.rear_axle_to_center * measurements[..., _YAW_ACCEL]
+    out[..., _AX] -= np.float32(2.0) * turning.astype(np.float32)
+    return out
 
 
 class Part(NamedTuple):
@@ -83,11 +119,15 @@ class States:
         drawn: IntArray = np.searchsorted(self._total, random.random(count))
         return np.minimum(drawn, len(self) - 1)
 
-    def picture(self, index: int) -> Raster:
-        """The raster of a state."""
-        which = int(np.searchsorted(self._first, index, side="right")) - 1
-        part, row = self._parts[which], index - int(self._first[which])
-        return unpacked(part.pictures[part.ends[row] : part.ends[row + 1]])
+    def rasters(self, indices: IntArray, mirrored: Sequence[bool]) -> NDArray[np.uint8]:
+        """(B, 9, 256, 256) the rasters of some states; rows are left and right."""
+        out = np.empty((len(indices), *_SHAPE), np.uint8)
+        for place, (index, is_mirrored) in enumerate(zip(indices.tolist(), mirrored, strict=True)):
+            number = int(np.searchsorted(self._first, index, side="right")) - 1
+            part, row = self._parts[number], index - int(self._first[number])
+            raster = read_raster(part.pictures[part.ends[row] : part.ends[row + 1]])
+            out[place] = raster[:, ::-1] if is_mirrored else raster
+        return out
 
 
 def importance(measurements: Values, actions: Values, urgent: BoolArray) -> FloatArray:

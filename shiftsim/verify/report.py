@@ -2,14 +2,13 @@
 
 A *case* is one compared quantity of one thing (an array of one run, say). Everything in a reference
 folder is compared, or named: as not covered (counts against `--require-all`) or as informative (a
-label, or a value that by the folder's README need not be compared).
+label, or a value that need not be compared).
 """
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 import shapely
@@ -18,8 +17,8 @@ from numpy.typing import ArrayLike
 from shiftsim.errors import ShiftsimError
 
 ERRORS = (  # what may be raised by content that has not the form of the reference
-    *(ShiftsimError, OSError, BadZipFile, LookupError, ValueError, TypeError, AttributeError),
-    *(ArithmeticError, shapely.errors.ShapelyError),
+    *(ShiftsimError, OSError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError),
+    shapely.errors.ShapelyError,
 )
 
 
@@ -35,15 +34,18 @@ class Quantity:
 
 @dataclass
 class Report:
-    """All comparisons so far."""
+    """All comparisons so far.
 
-    mode: str | None = None  # only runs of this challenge are compared; None for all
-    # tally by quantity, in the order of first appearance
+    Attributes:
+        quantities: Tally by quantity, in the order of first appearance.
+        mismatches: One line per case that differs.
+        not_covered: Count by description of what should be compared and was not.
+        informative: Descriptions of what need not be compared.
+    """
+
     quantities: dict[str, Quantity] = field(default_factory=dict)
-    mismatches: list[str] = field(default_factory=list)  # one line per case that differs
-    # count by description of what should be compared and was not
+    mismatches: list[str] = field(default_factory=list)
     not_covered: dict[str, int] = field(default_factory=dict)
-    # descriptions of what need not be compared
     informative: list[str] = field(default_factory=list)
 
     def compare(

@@ -6,18 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-
 from shiftsim.errors import ConfigError, DataError, beginning
-from shiftsim.files import below, write_text
-from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES
-from shiftsim.report.words import REASONS
+from shiftsim.files import safe_join, write_text
+from shiftsim.metrics import SHORT_NAMES
+from shiftsim.report.words import REASONS, rows_by_task, violations, worst_violation
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
 from shiftsim.view.page import MAX_ROLLOUTS, POLICY, Page, data_element, framed, replay_page
-from shiftsim.view.scene import Shown
+from shiftsim.view.scene import ShownRollout
 
-_FACTORS = [SHORT_NAMES[name] for name in MULTIPLIERS]
 _WRONG = {SHORT_NAMES[name]: reason for name, reason in REASONS.items()}  # in words, in their order
 
 
@@ -71,8 +68,8 @@ class Gallery:
                 if place is not None:
                     planner = f"{task.planner} ({name})" if name else task.planner
                     self._runs[task._replace(planner=planner)] = (run, task)
-        self._scores = {run.path: _by_task(run.scores) for run in runs}
-        self._metrics = {run.path: _by_task(run.metrics) for run in runs}
+        self._scores = {run.path: rows_by_task(run.scores) for run in runs}
+        self._metrics = {run.path: rows_by_task(run.metrics) for run in runs}
         self._tokens: dict[str, list[Task]] = {}
         for task in self._runs:
             self._tokens.setdefault(task.token, []).append(task)
@@ -80,12 +77,12 @@ class Gallery:
     @property
     def tokens(self) -> list[str]:
         """Scenarios with rollouts to show, the lowest score first."""
-        found = [token for token, tasks in self._tokens.items() if self.choice.of(tasks)]
-        return sorted(found, key=lambda token: (self._lowest(token), token))
-
-    def _lowest(self, token: str) -> float:
-        tasks = self.choice.of(self._tokens[token])
-        return min(float(self._results(task)[0].get("cls", 1.0)) for task in tasks)
+        lowest = {
+            token: min(float(self._results(task)[0].get("cls", 1.0)) for task in chosen)
+            for token, tasks in self._tokens.items()
+            if (chosen := self.choice.of(tasks))
+        }
+        return sorted(lowest, key=lambda token: (lowest[token], token))
 
     def _results(self, task: Task) -> tuple[Mapping[str, Any], list[dict[str, Any]]]:
         """The rows of a rollout in `scores.parquet` and `metrics.parquet`; empty where none."""
@@ -111,21 +108,23 @@ class Gallery:
         if not found:
             there = zip(*self._tokens.get(token, []), strict=True)
             names = zip(("planners", "noise", "seeds"), there, strict=False)
-            kept = (f"{n}: {', '.join(map(str, dict.fromkeys(v)))}" for n, v in names)
+            available = (f"{n}: {', '.join(map(str, dict.fromkeys(v)))}" for n, v in names)
             raise ConfigError(
                 f"scenario {token!r} has no stored rollout with {self.choice}",
-                hint="; ".join(kept) or "--save-rollouts all keeps them",
+                hint="; ".join(available) or "--save-rollouts all keeps them",
             )
         return found[:MAX_ROLLOUTS]
 
-    def shown(self, token: str, scenario: Any) -> list[Shown]:
+    def shown(self, token: str, scenario: Any) -> list[ShownRollout]:
         """The rollouts of a page with what is known of them."""
         out = []
         for task in self.tasks(token):
             run, key = self._runs[task]
             score, metrics = self._results(task)
             log = run.rollout(key, scenario)
-            out.append(Shown(task.planner, task.noise, task.seed, log, score.get("cls"), metrics))
+            out.append(
+                ShownRollout(task.planner, task.noise, task.seed, log, score.get("cls"), metrics)
+            )
         return out
 
     def page(self, token: str, *, back: str = "") -> Page:
@@ -139,11 +138,8 @@ class Gallery:
 
     def _row(self, task: Task, index: int) -> dict[str, Any]:
         score, metrics = self._results(task)
-        firsts = {
-            SHORT_NAMES[row["metric"]]: row["first_violation_s"]
-            for row in metrics
-            if row["metric"] in SHORT_NAMES and row["score"] is not None and row["score"] < 1.0
-        }
+        found = violations(metrics)
+        worst = worst_violation(found)
         return {
             "token": task.token,
             "type": score.get("scenario_type", ""),
@@ -152,8 +148,8 @@ class Gallery:
             "noise": task.noise,
             "seed": task.seed,
             "cls": score.get("cls"),
-            "violated": firsts,
-            "at": _moment(firsts),
+            "violated": {one.short: one.time for one in found},
+            "at": worst and worst.time,
             "index": index,
             "page": f"replay/{page_name(task.token)}",
         }
@@ -197,7 +193,7 @@ def write_site(
     The list goes to the folder, at most `limit` pages (0 for all), the lowest scores first, to its
     subfolder `replay`. `above` is as in `list_page`; `on_progress` gets how many of how many pages.
     """
-    pages = below(folder, "replay")
+    pages = safe_join(folder, "replay")
     pages.mkdir(parents=True, exist_ok=True)
     found = [(gallery, token) for gallery in galleries for token in gallery.tokens]
     found = found[:limit] if limit else found
@@ -211,33 +207,35 @@ def write_site(
     return len(found)
 
 
-def _moment(violated: Mapping[str, float | None]) -> float | None:
-    """Where a replay opens: the first violation that multiplies the score, else the first."""
-    known = {short: time for short, time in violated.items() if time is not None}
-    return min(
-        (known[s] for s in _FACTORS if s in known), default=min(known.values(), default=None)
-    )
-
-
 def worst_table(rows: Sequence[Mapping[str, Any]], count: int = 10) -> str:
     """HTML: the scenarios with the lowest scores, each by its worst rollout, and what went wrong.
 
     In words, with links to that moment.
     """
+
+    def key(row: Mapping[str, Any]) -> tuple[Any, ...]:
+        names = (row["noise"] != "none", row["planner"], row["noise"], row["seed"])
+        return (row["cls"] or 0.0, row["token"], *names)
+
     by_page: dict[str, Mapping[str, Any]] = {}
-    for row in sorted((row for row in rows if (row["cls"] or 0.0) < 1.0), key=_lowest_first):
+    for row in sorted((row for row in rows if (row["cls"] or 0.0) < 1.0), key=key):
         by_page.setdefault(row["page"], row)
-    below = list(by_page.values())[:count]
-    if not below:
+    if not by_page:
         return ""
     lines = []
-    for row in below:
+    for row in list(by_page.values())[:count]:
         at = "" if row["at"] is None else f"t={row['at']:.2f}&amp;"
-        link = f'<a href="{row["page"]}#{at}focus={row["index"] + 1}">{_safe(row["token"])}</a>'
+        link = (
+            f'<a href="{row["page"]}#{at}focus={row["index"] + 1}">{html.escape(row["token"])}</a>'
+        )
         score = "–" if row["cls"] is None else f"{100.0 * row['cls']:.2f}"
         noise = row["noise"] if row["noise"] == "none" else f"{row['noise']}, seed {row['seed']}"
-        cells = (_safe(row["type"]), _safe(row["planner"]), _safe(noise), _what(row["violated"]))
-        inner = "".join(f"<td>{cell}</td>" for cell in (link, *cells))
+        times = [
+            (_WRONG[short], row["violated"][short]) for short in _WRONG if short in row["violated"]
+        ]
+        wrong = ", ".join(w if time is None else f"{w} {time:.1f}\u00a0s" for w, time in times)
+        texts = map(html.escape, (row["type"], row["planner"], noise))
+        inner = "".join(f"<td>{cell}</td>" for cell in (link, *texts, wrong))
         lines.append(f'<tr><td class="number">{score}</td>{inner}</tr>')
     names = ("scenario", "type", "planner", "noise", "what went wrong, first time")
     heads = "".join(f"<th>{name}</th>" for name in names)
@@ -246,21 +244,6 @@ def worst_table(rows: Sequence[Mapping[str, Any]], count: int = 10) -> str:
 <div class="wide" tabindex="0" role="region" aria-label="{title}"><table>
 <thead><tr><th class="number" title="closed-loop score (CLS)">score</th>{heads}</tr></thead>
 <tbody>{"".join(lines)}</tbody></table></div></section>"""
-
-
-def _lowest_first(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    key = (row["noise"] != "none", row["planner"], row["noise"], row["seed"])
-    return (row["cls"] or 0.0, row["token"], *key)
-
-
-def _what(violated: Mapping[str, float | None]) -> str:
-    """First violations in words, in the order of the metrics."""
-    known = [(words, violated[short]) for short, words in _WRONG.items() if short in violated]
-    return ", ".join(w if time is None else f"{w} {time:.1f}\u00a0s" for w, time in known)
-
-
-def _safe(text: str) -> str:
-    return html.escape(text)
 
 
 def galleries(runs: Sequence[Run], stores: Sequence[Any], choice: Choice) -> list[Gallery]:
@@ -277,11 +260,3 @@ def _names(runs: Sequence[Run]) -> list[str]:
         return [""]
     traffic = [str(run.manifest["determining"]["traffic"]) for run in runs]
     return traffic if len(set(traffic)) == len(runs) else [run.path.name for run in runs]
-
-
-def _by_task(table: pa.Table) -> dict[Task, list[dict[str, Any]]]:
-    """The rows of each task."""
-    out: dict[Task, list[dict[str, Any]]] = {}
-    for row in table.to_pylist():
-        out.setdefault(Task(*(row[name] for name in Task._fields)), []).append(row)
-    return out

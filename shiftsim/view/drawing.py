@@ -12,8 +12,9 @@ import numpy as np
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.kernels import FloatArray
 from shiftsim.report.palette import AGENTS, ALARM, OTHER_AGENT, RECORDED, Style, dashes
+from shiftsim.report.words import violation_words, violations, worst_violation
 from shiftsim.sim.log import SimulationLog
-from shiftsim.view.scene import Shown, map_lines, violations
+from shiftsim.view.scene import ShownRollout, map_lines
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import PACIFICA, AgentKind, center_poses
 
@@ -68,7 +69,7 @@ def draw_scale(axes: Any, extent: FloatArray) -> None:
     axes.annotate(f"{length} m", (x + length / 2.0, y), fontsize=SMALL, bbox=box, zorder=9, **place)
 
 
-def draw_paths(axes: Any, shown: Sequence[Shown], styles: Mapping[str, Style]) -> None:
+def draw_paths(axes: Any, shown: Sequence[ShownRollout], styles: Mapping[str, Style]) -> None:
     """The recorded driver's path, and those of the rollouts with what a legend says of them."""
     draw_recorded(axes, shown[0].log)
     for number, item in enumerate(shown):
@@ -85,24 +86,15 @@ def draw_recorded(axes: Any, log: SimulationLog) -> None:
     axes.plot(log.expert_ego[:, 0], log.expert_ego[:, 1], label="recorded driver", **dotted)
 
 
-def caption(item: Shown) -> str:
-    """Planner, noise, score, and what cost most of it."""
+def caption(item: ShownRollout) -> str:
+    """Planner, noise, score, and what cost most of it, as "… at-fault collision (NCR) at 4.3 s"."""
     name = item.planner if item.noise == "none" else f"{item.planner}, {item.noise}"
     score = "" if item.cls is None else f": score {100.0 * item.cls:.0f}"
-    found = gravest(item)
-    return f"{name}{score}; {told(found)}" if found else f"{name}{score}"
-
-
-def told(found: Mapping[str, Any]) -> str:
-    """What was violated and when, as "at-fault collision (NCR), pedestrian 17, … at 4.3 s"."""
-    what, comma, more = found["words"].partition(",")
-    return f"{what} ({found['short']}){comma}{more} at {found['t']:.1f} s"
-
-
-def gravest(item: Shown) -> dict[str, Any] | None:
-    """The violation that cost most: the first of a multiplier, else the first."""
-    found = violations(item)
-    return next((one for one in found if one["multiplier"]), found[0] if found else None)
+    worst = worst_violation(violations(item.metrics))
+    if worst is None:
+        return f"{name}{score}"
+    what, comma, more = violation_words(worst.row, item.log.tracks).partition(",")
+    return f"{name}{score}; {what} ({worst.short}){comma}{more} at {worst.time:.1f} s"
 
 
 class Mark(NamedTuple):
@@ -113,21 +105,24 @@ class Mark(NamedTuple):
     label: Any  # its words
 
 
-def draw_violation(axes: Any, item: Shown, style: Style, *, in_short: bool = False) -> Mark | None:
-    """A burst where the gravest violation began, and what it was; `in_short` without numbers."""
-    found = gravest(item)
-    if found is None:
+def draw_violation(
+    axes: Any, item: ShownRollout, style: Style, *, in_short: bool = False
+) -> Mark | None:
+    """A burst where the worst violation began, and what it was; `in_short` without numbers."""
+    worst = worst_violation(violations(item.metrics))
+    if worst is None or worst.time is None:
         return None
     time_us = item.log.time_us
-    row = int(np.searchsorted(time_us, time_us[0] + found["t"] * 1e6 - 1.0))
+    row = int(np.searchsorted(time_us, time_us[0] + worst.time * 1e6 - 1.0))
     place = center_poses(item.log.ego[min(row, len(time_us) - 1), :3])[:2]
     look = {"linestyle": "none", "marker": BURST, "markersize": 11, "markeredgecolor": "white"}
     (burst,) = axes.plot(*place[:, None], color=ALARM, zorder=9, **look)
     box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": style.colour, "lw": 0.9}
     leader = {"arrowstyle": "-", "color": style.colour, "lw": 0.8, "shrinkA": 0, "shrinkB": 4}
     is_right = place[0] > sum(axes.get_xlim()) / 2.0
+    words = violation_words(worst.row, item.log.tracks)
     label = axes.annotate(
-        found["words"].partition(",")[0] if in_short else found["words"],
+        words.partition(",")[0] if in_short else words,
         place,
         xytext=(-6 if in_short and is_right else 6, 12 if in_short else 6),
         ha="right" if in_short and is_right else "left",
@@ -137,11 +132,11 @@ def draw_violation(axes: Any, item: Shown, style: Style, *, in_short: bool = Fal
         arrowprops=leader,
         zorder=10,
     )
-    return Mark(found["t"], burst, label)
+    return Mark(worst.time, burst, label)
 
 
 def draw_boxes(
-    axes: Any, shown: Sequence[Shown], row: int, styles: Mapping[str, Style]
+    axes: Any, shown: Sequence[ShownRollout], row: int, styles: Mapping[str, Style]
 ) -> list[Any]:
     """All that moves, at one sample: the others, and the egos of the rollouts."""
     drawn = draw_others(axes, shown[0].log, row)

@@ -8,8 +8,6 @@ opened, and nothing is added to what the workers do.
 import json
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field
 from http import HTTPStatus
 from threading import Event, Lock, Thread
 from time import monotonic
@@ -17,17 +15,18 @@ from types import TracebackType
 from typing import Any, NamedTuple
 from urllib.parse import parse_qs, urlsplit
 
+import numpy as np
+
 from shiftsim.errors import ShiftsimError
-from shiftsim.metrics import MULTIPLIERS
 from shiftsim.report.palette import planner_styles
-from shiftsim.report.words import REASONS
+from shiftsim.report.words import violations
 from shiftsim.runs.execute import Progress
-from shiftsim.runs.results import OK, TaskResult
 from shiftsim.runs.rollouts import complete_rollout
 from shiftsim.runs.rollouts.columns import decode_rows
+from shiftsim.runs.tables import OK, TaskResult
 from shiftsim.view.local import TOKEN_HEADER, LocalHandler, LocalServer
 from shiftsim.view.page import framed, replay_page
-from shiftsim.view.scene import Shown
+from shiftsim.view.scene import ShownRollout
 from shiftsim.world.scenario import Scenario
 
 _WORST, _FAILURES = 20, 50  # that the page lists
@@ -45,26 +44,19 @@ class _Group(NamedTuple):
     traffic: str
 
 
-@dataclass(slots=True)
-class _Sums:
-    """Scores so far, by recording: scenarios of one recording are not independent."""
+def _statistics(scores: Mapping[str, list[float]]) -> dict[str, Any]:
+    """Mean and 95 % interval x 100 of scores by recording, whose scenarios are not independent.
 
-    counts: dict[str, int] = field(default_factory=lambda: defaultdict(int))
-    totals: dict[str, float] = field(default_factory=lambda: defaultdict(float))
-
-    def add(self, recording: str, score: float) -> None:
-        self.counts[recording] += 1
-        self.totals[recording] += score
-
-    def values(self) -> dict[str, Any]:
-        """Mean and 95 % interval x 100; no interval of fewer than two recordings."""
-        count, clusters = sum(self.counts.values()), len(self.counts)
-        mean = sum(self.totals.values()) / count
-        half = None
-        if clusters > 1:
-            squares = sum((self.totals[r] - n * mean) ** 2 for r, n in self.counts.items())
-            half = 100.0 * _Z95 * (squares * clusters / (clusters - 1)) ** 0.5 / count
-        return {"done": count, "mean": 100.0 * mean, "half": half}
+    There is no interval of fewer than two recordings.
+    """
+    totals = np.array([sum(values) for values in scores.values()])
+    counts = np.array([len(values) for values in scores.values()])
+    mean, clusters = totals.sum() / counts.sum(), len(scores)
+    half = None
+    if clusters > 1:
+        squares = float(np.square(totals - counts * mean).sum())
+        half = 100.0 * _Z95 * (squares * clusters / (clusters - 1)) ** 0.5 / float(counts.sum())
+    return {"done": int(counts.sum()), "mean": 100.0 * float(mean), "half": half}
 
 
 class LiveRun:
@@ -85,7 +77,8 @@ class LiveRun:
         self._state = "running"
         self._progress = Progress(0, total, 0)
         self._first: int | None = None  # tasks that were done before
-        self._sums: dict[_Group, _Sums] = defaultdict(_Sums)
+        # scores by group and recording
+        self._scores: dict[_Group, dict[str, list[float]]] = {}
         # the lowest scores by scenario: the score, the number of the result, the result
         self._worst: dict[str, tuple[float, int, TaskResult]] = {}
         self._number = 0
@@ -110,9 +103,10 @@ class LiveRun:
             return
         score = float(result.scores["cls"])
         group = _Group(result.task.planner, result.task.noise, result.scores["traffic"])
-        self._sums[group].add(result.scores["log_name"], score)
-        known = self._worst.get(result.task.token)
-        if score < (known[0] if known else 1.0):
+        by_recording = self._scores.setdefault(group, defaultdict(list))
+        by_recording[result.scores["log_name"]].append(score)
+        before = self._worst.get(result.task.token)
+        if score < (before[0] if before else 1.0):
             self._worst[result.task.token] = (score, self._number, result)
             if len(self._worst) > _WORST:
                 del self._worst[max(self._worst, key=lambda token: self._worst[token][:2])]
@@ -138,20 +132,14 @@ class LiveRun:
                 "groups": [
                     {
                         **group._asdict(),
-                        **sums.values(),
+                        **_statistics(scores),
                         "failed": self._num_failures[group.planner, group.noise],
                         "colour": self._styles[group.planner].colour,
                     }
-                    for group, sums in sorted(self._sums.items())
+                    for group, scores in sorted(self._scores.items())
                 ],
                 "worst": [
-                    {
-                        **result.task._asdict(),
-                        "score": 100.0 * float(result.scores["cls"]),
-                        "why": _words(violated := _violated(result)),
-                        "at": next(iter(violated.values()), None),
-                        "replay": number if result.rollout else None,
-                    }
+                    _describe(result) | {"replay": number if result.rollout else None}
                     for _, number, result in sorted(self._worst.values(), key=lambda one: one[:2])
                 ],
                 "failures": [
@@ -175,25 +163,23 @@ class LiveRun:
         scenario = self._read(result.task.token)
         log = complete_rollout(decode_rows(result.rollout), scenario, result.task)
         planner, noise, seed, _ = result.task
-        shown = Shown(planner, noise, seed, log, result.scores["cls"], result.metrics)
+        shown = ShownRollout(planner, noise, seed, log, result.scores["cls"], result.metrics)
         return replay_page(scenario, [shown])
 
 
-def _violated(result: TaskResult) -> dict[str, float | None]:
-    """First times [s] of the violations that cost most, the earliest first; None where it has none.
+def _describe(result: TaskResult) -> dict[str, Any]:
+    """A finished rollout as JSON values, with the violations that cost most, the earliest first.
 
-    That is what made the score 0, else all that lowered it.
+    That is those of multipliers, else all.
     """
-    rows = {row["metric"]: row for row in result.metrics if row["metric"] in REASONS}
-    below = {name: row for name, row in rows.items() if row["score"] is None or row["score"] < 1.0}
-    costly = {name: row for name, row in below.items() if name in MULTIPLIERS} or below
-    times = {name: row["first_violation_s"] for name, row in costly.items()}
-    return dict(sorted(times.items(), key=lambda item: (item[1] is None, item[1] or 0.0)))
-
-
-def _words(violated: Mapping[str, float | None]) -> str:
-    parts = ((REASONS[name], seconds) for name, seconds in violated.items())
-    return ", ".join(words if at is None else f"{words} {at:.1f} s" for words, at in parts)
+    found = violations(result.metrics)
+    costly = [one for one in found if one.is_multiplier] or found
+    return {
+        **result.task._asdict(),
+        "score": 100.0 * float(result.scores["cls"]),
+        "why": ", ".join(map(str, costly)),
+        "at": costly[0].time if costly else None,
+    }
 
 
 class LiveServer(LocalServer):
@@ -206,8 +192,8 @@ class LiveServer(LocalServer):
     def __init__(self, run: LiveRun) -> None:
         """Bind to a free port of the loopback interface."""
         self.run = run
-        self.asked = 0.0  # when the page asked last
-        self.told = Event()  # that the run has ended
+        self.last_request = 0.0  # when the page asked last
+        self.end_was_shown = Event()  # that the run has ended
         super().__init__(_Handler)
 
     def __enter__(self) -> "LiveServer":
@@ -224,8 +210,8 @@ class LiveServer(LocalServer):
         """Let an open page see the end, and stop answering; the page keeps what it shows."""
         interrupted = kind is not None and issubclass(kind, KeyboardInterrupt)
         self.run.end("interrupted" if interrupted else "stopped" if kind else "finished")
-        if monotonic() - self.asked < _PATIENCE:
-            self.told.wait(_PATIENCE)
+        if monotonic() - self.last_request < _PATIENCE:
+            self.end_was_shown.wait(_PATIENCE)
         self.shutdown()
         self.server_close()
 
@@ -244,23 +230,21 @@ class _Handler(LocalHandler):
             self.answer(live_page(run.title), "text/html")
         elif url.path == "/state":
             values = run.values()
-            self.server.asked = monotonic()
+            self.server.last_request = monotonic()
             self.answer(json.dumps(values), "application/json")
             if values["state"] != "running":
-                self.server.told.set()
+                self.server.end_was_shown.set()
         elif url.path.startswith("/replay/"):
             self._replay(url.path.removeprefix("/replay/"))
         else:
             self.refuse(HTTPStatus.NOT_FOUND, "no such page")
 
     def _replay(self, number: str) -> None:
-        page = None
-        with suppress(ValueError):
-            try:
-                page = self.server.run.replay(int(number))
-            except (ShiftsimError, OSError) as error:
-                self.refuse(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
-                return
+        try:
+            page = self.server.run.replay(int(number)) if number.isdecimal() else None
+        except (ShiftsimError, OSError) as error:
+            self.refuse(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
+            return
         if page is None:
             self.refuse(HTTPStatus.NOT_FOUND, "no longer one of the worst")
         else:

@@ -48,9 +48,9 @@ def pack(fields: Mapping[str, Quantised | np.ndarray]) -> str:
 def _planes(field: Quantised) -> bytes:
     missing = np.isnan(field.values)
     scaled = np.rint(np.where(missing, 0.0, field.values) / field.step)
-    whole = np.clip(scaled, -_LARGEST, _LARGEST).astype(np.int64)
-    whole[missing] = MISSING
-    if len(whole) > 1:
-        whole[1:] -= whole[:-1].copy()
-    wrapped = (whole & 0xFFFFFFFF).astype("<u4")
+    steps = np.clip(scaled, -_LARGEST, _LARGEST).astype(np.int64)
+    steps[missing] = MISSING
+    if len(steps) > 1:
+        steps[1:] -= steps[:-1].copy()
+    wrapped = (steps & 0xFFFFFFFF).astype("<u4")
     return wrapped.reshape(-1, 1).view(np.uint8).T.tobytes()

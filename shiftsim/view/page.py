@@ -10,7 +10,7 @@ from typing import Any
 from shiftsim.files import write_text
 from shiftsim.sim.log import SimulationLog
 from shiftsim.view.pack import pack
-from shiftsim.view.scene import Replay, Shown, describe_scene, rollout_fields, scene_fields
+from shiftsim.view.scene import Replay, ShownRollout, describe_scene, rollout_fields, scene_fields
 from shiftsim.world.scenario import Scenario, require_scenario
 
 _HERE = Path(__file__).parent
@@ -52,20 +52,20 @@ def show(scenario: Scenario, **logs: SimulationLog) -> Page:
 
     Example:
         ```python
-        scenario = shiftsim.open_store("demo")["03b23c"]
+        scenario = shiftsim.open_store("demo")["01f13e"]
         logs = {name: shiftsim.simulate(scenario, name) for name in ("idm", "log-future")}
         shiftsim.show(scenario, **logs).save("replay.html")
         ```
     """
     require_scenario("show", scenario)
     shown = [
-        Shown(name.replace("_", "-"), "some" if log.noise.any() else "none", 0, log)
+        ShownRollout(name.replace("_", "-"), "some" if log.noise.any() else "none", 0, log)
         for name, log in logs.items()
     ]
     return replay_page(scenario, shown)
 
 
-def replay_page(scenario: Scenario, shown: Sequence[Shown], *, back: str = "") -> Page:
+def replay_page(scenario: Scenario, shown: Sequence[ShownRollout], *, back: str = "") -> Page:
     """One self-contained HTML page of one to six rollouts; `back` is the address of the list.
 
     Raises:

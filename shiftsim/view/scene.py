@@ -12,9 +12,9 @@ import numpy as np
 import shapely
 
 from shiftsim.kernels import FloatArray
-from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES
+from shiftsim.metrics import SHORT_NAMES
 from shiftsim.report.palette import planner_styles
-from shiftsim.report.words import REASONS, violation_words
+from shiftsim.report.words import REASONS, violation_words, violations
 from shiftsim.sim.log import SimulationLog
 from shiftsim.view.pack import Quantised
 from shiftsim.world.layers import Layer
@@ -33,7 +33,7 @@ _TOLERANCE = 0.05  # m, of simplified map lines
 
 
 @dataclass(frozen=True)
-class Shown:
+class ShownRollout:
     """One rollout in a replay."""
 
     planner: str  # its planner
@@ -49,7 +49,7 @@ class Replay:
     """A scenario and the rollouts of it that are shown together."""
 
     scenario: Scenario
-    shown: Sequence[Shown]
+    shown: Sequence[ShownRollout]
 
     @cached_property
     def box(self) -> FloatArray:
@@ -138,7 +138,7 @@ def describe_scene(replay: Replay) -> dict[str, Any]:
                 "cls": item.cls,
                 "colour": styles[item.planner].colour,
                 "marker": styles[item.planner].marker,
-                "violations": violations(item),
+                "violations": describe_violations(item),
                 "scores": _scores(item.metrics),
                 "degraded": int(item.log.degraded.sum()),
                 "tracks": _track_names(item.log.tracks) if own else None,
@@ -187,28 +187,24 @@ def _track_names(tracks: Tracks) -> list[str]:
     return [tracks.tokens[i] for i in _used(tracks)]
 
 
-def violations(item: Shown) -> list[dict[str, Any]]:
-    """First violations of scored metrics, by time; `words` say what happened."""
-    out = [
+def describe_violations(item: ShownRollout) -> list[dict[str, Any]]:
+    """First violations of scored metrics as JSON values, by time; `words` say what happened."""
+    return [
         {
-            "metric": row["metric"],
-            "short": SHORT_NAMES[row["metric"]],
-            "multiplier": row["metric"] in MULTIPLIERS,
-            "t": row["first_violation_s"],
-            "value": _finite(row["first_violation_value"]),
-            "threshold": _finite(row["threshold"]),
-            "unit": row["unit"],
-            "partner": row["partner_token"],
-            "score": row["score"],
-            "words": violation_words(row, item.log.tracks),
+            "metric": one.row["metric"],
+            "short": one.short,
+            "multiplier": one.is_multiplier,
+            "t": one.time,
+            "value": _finite(one.row["first_violation_value"]),
+            "threshold": _finite(one.row["threshold"]),
+            "unit": one.row["unit"],
+            "partner": one.row["partner_token"],
+            "score": one.row["score"],
+            "words": violation_words(one.row, item.log.tracks),
         }
-        for row in item.metrics
-        if row["metric"] in SHORT_NAMES
-        and row["first_violation_s"] is not None
-        and row["score"] is not None
-        and row["score"] < 1.0
+        for one in violations(item.metrics)
+        if one.time is not None
     ]
-    return sorted(out, key=lambda found: found["t"])
 
 
 def _scores(metrics: Iterable[Mapping[str, Any]]) -> dict[str, float]:
@@ -262,8 +258,8 @@ def _rings(polygons: list[shapely.Polygon], box: FloatArray) -> list[FloatArray]
     if not polygons:
         return []
     clipped = shapely.clip_by_rect(np.array(polygons, object), *box)
-    whole = shapely.union_all(shapely.make_valid(clipped), grid_size=_MAP_STEP)
-    parts = shapely.get_parts(shapely.simplify(whole, _TOLERANCE))
+    union = shapely.union_all(shapely.make_valid(clipped), grid_size=_MAP_STEP)
+    parts = shapely.get_parts(shapely.simplify(union, _TOLERANCE))
     return [
         shapely.get_coordinates(ring)
         for part in parts
@@ -274,10 +270,10 @@ def _rings(polygons: list[shapely.Polygon], box: FloatArray) -> list[FloatArray]
 
 def _lines(lines: list[FloatArray], box: FloatArray) -> list[FloatArray]:
     """Lines inside the box, each once: neighbouring lanes share a boundary."""
-    made = [shapely.LineString(line) for line in lines if len(line) > 1]
-    if not made:
+    strings = [shapely.LineString(line) for line in lines if len(line) > 1]
+    if not strings:
         return []
-    clipped = shapely.clip_by_rect(np.array(made, object), *box)
+    clipped = shapely.clip_by_rect(np.array(strings, object), *box)
     parts = shapely.get_parts(shapely.simplify(clipped, _TOLERANCE))
     found = {part.normalize().wkb: part for part in parts if part.geom_type == "LineString"}
     return [coords for part in found.values() if len(coords := shapely.get_coordinates(part)) > 1]

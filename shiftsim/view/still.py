@@ -29,7 +29,7 @@ from shiftsim.view.drawing import (
     draw_violation,
     spread_labels,
 )
-from shiftsim.view.scene import Shown
+from shiftsim.view.scene import ShownRollout
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 
@@ -40,13 +40,15 @@ _FPS = 10
 _KEY = "dotted: the recorded driver; red mark: where most of the score was lost"
 _FILM_DPI = 100
 _LARGEST = 6.0  # inches, of a single scene
+_EDITED = "#7b2fbf"  # as in replays
+_EDIT_WIDTH = 110  # characters of the words below the picture of an edit
 _WIDTH = 7.2  # inches, of a grid: the text of a paper in two columns
 
 
 def save_figure(
     path: Path,
     scenario: Scenario,
-    shown: Sequence[Shown],
+    shown: Sequence[ShownRollout],
     *,
     at: Sequence[float] = (0.0,),
     in_grid: bool = False,
@@ -73,7 +75,7 @@ def save_figure(
         save_picture(still(scenario, shown, at=at[0]), path)
 
 
-def still(scenario: Scenario, shown: Sequence[Shown], *, at: float) -> Any:
+def still(scenario: Scenario, shown: Sequence[ShownRollout], *, at: float) -> Any:
     """A matplotlib figure of the moment `at` seconds from the start.
 
     Raises:
@@ -86,7 +88,9 @@ def still(scenario: Scenario, shown: Sequence[Shown], *, at: float) -> Any:
     return figure
 
 
-def _scene(scenario: Scenario, shown: Sequence[Shown], at: float) -> tuple[Any, Any, list[Mark]]:
+def _scene(
+    scenario: Scenario, shown: Sequence[ShownRollout], at: float
+) -> tuple[Any, Any, list[Mark]]:
     """Figure and axes with all that does not move, and the marks of violations."""
     extent = _extent_of(scenario, shown)
     figure, ((axes,),) = panels(1, 1, extent)
@@ -102,7 +106,7 @@ def _scene(scenario: Scenario, shown: Sequence[Shown], at: float) -> tuple[Any, 
     return figure, axes, marks
 
 
-def grid(scenario: Scenario, shown: Sequence[Shown], *, at: Sequence[float]) -> Any:
+def grid(scenario: Scenario, shown: Sequence[ShownRollout], *, at: Sequence[float]) -> Any:
     """A matplotlib figure with a row per rollout and a column per moment [s from the start].
 
     Raises:
@@ -161,6 +165,43 @@ def draw_start(axes: Any, scenario: Scenario, extent: FloatArray) -> None:
     draw_scale(axes, extent)
 
 
+def before_and_after(recorded: Scenario, edited: Scenario) -> Any:
+    """A matplotlib figure: both at the first iteration, tracks of the edit outlined.
+
+    Raises:
+        MissingExtraError: matplotlib is missing.
+    """
+    points = [recorded.expert[:, :2], edited.expert[:, :2]]
+    changed = _edited_tracks(edited)
+    if len(changed):
+        points.append(edited.tracks.poses[edited.iteration_rows[0], changed, :2])
+    extent = extent_of_points(np.concatenate(points))
+    words = edited.script.words if edited.script else ()
+    lines = [part for line in words for part in wrap(line, _EDIT_WIDTH)]
+    figure, (both,) = panels(1, 2, extent)
+    for scenario, axes in zip((recorded, edited), both, strict=True):
+        draw_start(axes, scenario, extent)
+        axes.set_title(
+            f"{scenario.token}  {scenario.scenario_type}".replace("$", r"\$"), fontsize=9
+        )
+    tracks, row = edited.tracks, int(edited.iteration_rows[0])
+    x, y = tracks.poses[row, changed, 0], tracks.poses[row, changed, 1]
+    ring = {"s": 90, "facecolors": "none", "edgecolors": _EDITED, "linewidths": 1.4, "zorder": 8}
+    both[1].scatter(x, y, label="edited", **ring)
+    figure.supxlabel("\n".join(lines), fontsize=8)
+    add_legend(figure, both[1])
+    return figure
+
+
+def _edited_tracks(edited: Scenario) -> np.ndarray:
+    """Indices of the tracks that an edit made or changed and that are there at the start."""
+    script, row = edited.script, int(edited.iteration_rows[0])
+    names = set(script.tokens) if script else set()
+    there = edited.tracks.valid[row]
+    found = [name in names for name in edited.tracks.tokens]
+    return np.flatnonzero(there & np.array(found, np.bool_))
+
+
 def svg_of(figure: Any) -> str:
     """A figure as the text of an SVG element."""
     out = StringIO()
@@ -175,7 +216,7 @@ def _sample_at(time_us: IntArray, at: float) -> int:
     return int(np.argmin(np.abs(times - at)))
 
 
-def _extent_of(scenario: Scenario, shown: Sequence[Shown]) -> FloatArray:
+def _extent_of(scenario: Scenario, shown: Sequence[ShownRollout]) -> FloatArray:
     paths = [scenario.expert[:, :2], *(item.log.ego[:, :2] for item in shown)]
     return extent_of_points(np.concatenate(paths))
 
@@ -194,14 +235,14 @@ def panels(rows: int, columns: int, extent: FloatArray) -> tuple[Any, Any]:
     height = width * sides[1] / sides[0]
     size = (width * columns + 0.4, (height + 0.1) * rows + 0.5)
     figure = new_figure(layout="compressed", figsize=size)
-    made = figure.subplots(rows, columns, squeeze=False)
-    for axes in made.flat:
+    grid_of_axes = figure.subplots(rows, columns, squeeze=False)
+    for axes in grid_of_axes.flat:
         axes.set_xlim(extent[0], extent[2])
         axes.set_ylim(extent[1], extent[3])
         axes.set_aspect("equal")
         axes.set_xticks([])
         axes.set_yticks([])
-    return figure, made
+    return figure, grid_of_axes
 
 
 def _width(columns: int, extent: FloatArray) -> float:
@@ -243,7 +284,7 @@ def _heading(axes: Any, scenario: Scenario, time: float) -> None:
     axes.set_title(f"{_words(scenario)}  {time:.1f} s", fontsize=SMALL + 1)
 
 
-def _film(path: Path, scenario: Scenario, shown: Sequence[Shown]) -> None:
+def _film(path: Path, scenario: Scenario, shown: Sequence[ShownRollout]) -> None:
     """All samples, one after the other; a violation is marked from its first moment on."""
     figure, axes, marks = _scene(scenario, shown, 0.0)
     from matplotlib.animation import FFMpegWriter, PillowWriter

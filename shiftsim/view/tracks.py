@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.data.deepplan.recording import Converted
-from shiftsim.data.tracks.columns import KINDS
-from shiftsim.data.tracks.convert import Looked
-from shiftsim.data.tracks.reading import TrackTable
+from shiftsim.data.readers.codes import KINDS
+from shiftsim.data.readers.tracks.inspection import Inspection
+from shiftsim.data.readers.tracks.table import TrackTable
+from shiftsim.data.store.reading import open_store
 from shiftsim.kernels import FloatArray
 from shiftsim.report.palette import AGENTS, OTHER_AGENT, RECORDED, new_figure, save_picture
 from shiftsim.world.map import VectorMap
@@ -18,38 +18,48 @@ _ROAD, _LINE = "#dcdcd8", "#b8b8b2"
 _MARGIN = 0.05  # of the extent
 _MAX_POINTS = 200_000
 _MAX_EGOS = 40
+Egos = dict[str, list[FloatArray]]  # poses (R, 3) of every scenario, by ego
 
 
-def save_tracks_picture(path: Path, looked: Looked, made: Converted | None) -> None:
-    """Draw map, tracks and, if scenarios were made, their egos.
+def save_tracks_picture(path: Path, inspection: Inspection, store: Path | None) -> None:
+    """Draw map, tracks and, if a store has scenarios of them, their egos.
 
     Where the tracks are far from the map, or hardly seen beside it, both are also drawn alone.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
     """
-    road, table = looked.road, looked.table
+    road, table = inspection.road, inspection.table
+    egos = {} if store is None else _read_egos(store, f"{road.name}_{table.name}")
     bounds = road.edges.polygons.bounds
-    whole = np.concatenate([bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)])
-    own = np.concatenate([*np.percentile(table.xy[:: _step(table)], (0.1, 99.9), axis=0)])
-    inside = (own[:2] >= whole[:2] - 100.0).all() and (own[2:] <= whole[2:] + 100.0).all()
-    alone = not inside or (own[2:] - own[:2]).max() < 0.2 * (whole[2:] - whole[:2]).max()
-    both = np.concatenate([np.minimum(whole[:2], own[:2]), np.maximum(whole[2:], own[2:])])
-    shown = [both if inside else whole, *([own] if alone else [])]
+    map_box = np.concatenate([bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)])
+    track_box = np.concatenate([*np.percentile(table.xy[:: _step(table)], (0.1, 99.9), axis=0)])
+    inside = (track_box[:2] >= map_box[:2] - 100.0).all() and (
+        track_box[2:] <= map_box[2:] + 100.0
+    ).all()
+    alone = (
+        not inside
+        or (track_box[2:] - track_box[:2]).max() < 0.2 * (map_box[2:] - map_box[:2]).max()
+    )
+    both = np.concatenate(
+        [np.minimum(map_box[:2], track_box[:2]), np.maximum(map_box[2:], track_box[2:])]
+    )
+    shown = [both if inside else map_box, *([track_box] if alone else [])]
     width = 7.0 if alone else 9.0
     tall = max(float((box[3] - box[1]) / max(box[2] - box[0], 1e-9)) for box in shown)
     height = width * min(max(tall, 0.3), 1.2) + 1.6
     figure = new_figure(figsize=(width * len(shown), height))
     panels = figure.subplots(1, len(shown), squeeze=False)[0]
-    _panel(panels[0], looked, made, shown[0])
+    _panel(panels[0], inspection, egos, shown[0])
     panels[0].set_title("map and tracks" if inside else "the map: the tracks are elsewhere")
     if alone:
-        _panel(panels[1], looked, made, own)
+        _panel(panels[1], inspection, egos, track_box)
         panels[1].set_title("where the tracks are")
     words = [f"{road.name}, {table.name}: {len(table.track_ids)} objects"]
-    if made is not None:
-        words.append(f"{len(made.windows)} scenarios, {len(made.egos)} egos")
-    words += [doubt.what for doubt in (*looked.doubts.found, *looked.doubts.notes)]
+    if egos:
+        words.append(f"{sum(map(len, egos.values()))} scenarios, {len(egos)} egos")
+    diagnostics = inspection.diagnostics
+    words += [finding.what for finding in (*diagnostics.errors, *diagnostics.warnings)]
     handles, labels = panels[-1].get_legend_handles_labels()
     look = {"loc": "outside lower center", "ncols": 5, "fontsize": 8, "frameon": False}
     for sample in figure.legend(handles, labels, **look).get_lines():
@@ -59,13 +69,12 @@ def save_tracks_picture(path: Path, looked: Looked, made: Converted | None) -> N
     save_picture(figure, path)
 
 
-def _panel(axes: Any, looked: Looked, made: Converted | None, extent: FloatArray) -> None:
+def _panel(axes: Any, inspection: Inspection, egos: Egos, extent: FloatArray) -> None:
     low, high = extent[:2], extent[2:]
     pad = _MARGIN * max(float((high - low).max()), 10.0)
-    _draw_road(axes, looked.road, np.concatenate([low - pad, high + pad]))
-    _draw_tracks(axes, looked.table)
-    if made is not None:
-        _draw_egos(axes, made)
+    _draw_road(axes, inspection.road, np.concatenate([low - pad, high + pad]))
+    _draw_tracks(axes, inspection.table)
+    _draw_egos(axes, egos)
     axes.set_xlim(low[0] - pad, high[0] + pad)
     axes.set_ylim(low[1] - pad, high[1] + pad)
     axes.set_aspect("equal")
@@ -119,16 +128,26 @@ def _step(table: TrackTable) -> int:
     return max(1, len(table.xy) // _MAX_POINTS)
 
 
-def _draw_egos(axes: Any, made: Converted) -> None:
-    for number, ego in enumerate(made.egos):
-        x, y = ego.states[:, 0], ego.states[:, 1]
+def _read_egos(store: Path, log_name: str) -> Egos:
+    opened, egos = open_store(store), Egos()
+    for token in opened.tokens:
+        window = opened.window(token)
+        if window.log_name == log_name:
+            egos.setdefault(window.ego, []).append(opened.read(token).ego[:, :3])
+    return egos
+
+
+def _draw_egos(axes: Any, egos: Egos) -> None:
+    for number, (name, paths) in enumerate(egos.items()):
+        path = np.concatenate(paths)
+        x, y = path[:, 0], path[:, 1]
         label = "egos, from dot to arrow" if not number else None
         axes.plot(x, y, color=RECORDED, linewidth=1.3, zorder=4, label=label)
         if number < _MAX_EGOS:
             axes.plot(x[0], y[0], "o", color=RECORDED, markersize=4, zorder=5)
-            heading = ego.states[-1, 2]
+            heading = path[-1, 2]
             to = x[-1] + 6.0 * np.cos(heading), y[-1] + 6.0 * np.sin(heading)
             style = {"arrowstyle": "-|>", "color": RECORDED}
             axes.annotate("", xy=to, xytext=(x[-1], y[-1]), arrowprops=style, zorder=5)
-            name = {"xytext": (4, 3), "textcoords": "offset points", "fontsize": 6}
-            axes.annotate(ego.name, (x[0], y[0]), color=RECORDED, zorder=6, **name)
+            text: dict[str, Any] = {"xytext": (4, 3), "textcoords": "offset points", "fontsize": 6}
+            axes.annotate(name, (x[0], y[0]), color=RECORDED, zorder=6, **text)

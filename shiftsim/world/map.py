@@ -75,7 +75,7 @@ class VectorMap:
 
     Example:
         ```python
-        road = shiftsim.open_store("demo")["03b23c"].map
+        road = shiftsim.open_store("demo")["01f13e"].map
         for edge in road.block_edges.at(0):  # the lanes of the first roadblock
             print(road.baselines.at(edge)[:, :2], road.speed_limits[edge], road.outgoing.at(edge))
         ```

@@ -28,6 +28,13 @@ class Range(NamedTuple):
         with np.errstate(invalid="ignore"):
             return (values >= self.low) & (values <= self.high)
 
+    def outside(self, values: NDArray[Any], *, may_be_nan: bool = False) -> NDArray[np.int64]:
+        """(n, D) indices of the values of an array of D axes that are not in the range."""
+        if not values.size or (values.min() >= self.low and values.max() <= self.high):
+            return np.zeros((0, values.ndim), np.int64)  # quick, and not taken where there is a NaN
+        good = self.holds(values)
+        return np.argwhere(~(good | np.isnan(values) if may_be_nan else good))
+
     def __str__(self) -> str:
         return f"{self.low:g} … {self.high:g} {self.unit}".rstrip()
 
@@ -58,12 +65,7 @@ def require(
     array = np.atleast_1d(values)
     if array.dtype == object:  # an integer of any size
         array = np.array([min(max(value, -_ANY), _ANY) for value in array.flat], np.float64)
-    if not array.size or (array.min() >= allowed.low and array.max() <= allowed.high):
-        return  # quick, and not taken where there is a NaN
-    good = allowed.holds(array)
-    if may_be_nan:
-        good |= np.isnan(array)
-    bad = np.argwhere(~good)
+    bad = allowed.outside(array, may_be_nan=may_be_nan)
     if not len(bad):
         return
     value = array[tuple(bad[0])]
@@ -164,9 +166,10 @@ STORE: Table = {
     **_same("steering_rate_radps, yaw_rate_radps, yaw_accel_radps2", -1e8, 1e8, "rad/s, rad/s²"),
     **_same("length_m, width_m", 1e-9, 1e6, "m"),
     "time_us": _TIME,
-    **_same("light_status", -1, 3),
-    **_same("kinds", 0, 6),
-    **_same("first_row, last_row, iteration_rows", 0, _COUNT, "rows"),
+    **_same("status", 0, 3),
+    **_same("kind", 0, 6),
+    **_same("row, first_row, last_row, iteration_rows", 0, _COUNT, "rows"),
+    **_same("track, light", 0, _COUNT),
     **_same("row_step", 1, 1e6, "rows"),
     **_same("goal_pose", -1e9, 1e9, "m, rad"),
     **_same("duration_s", 0, 1e6, "s"),

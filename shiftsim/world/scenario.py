@@ -5,14 +5,16 @@ before the first iteration feed the history a planner sees, rows after the last 
 and learned targets that look into the recorded future.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from shiftsim.errors import ConfigError
 from shiftsim.kernels import FloatArray, IntArray, readonly
+from shiftsim.world.events import RolloutEvents
 from shiftsim.world.map import VectorMap
-from shiftsim.world.script import Script
 from shiftsim.world.state import Tracks, TrafficLights
 
 FULL_DURATION = "15 s"  # class of the scenarios of nuPlan's and DeepPlan's benchmarks
@@ -56,7 +58,7 @@ class Scenario:
 
     Example:
         ```python
-        scenario = shiftsim.open_store("demo")["03b23c"]
+        scenario = shiftsim.open_store("demo")["01f13e"]
         print(scenario.num_iterations, scenario.expert[:, :2], scenario.route)
         ```
     """
@@ -76,7 +78,7 @@ class Scenario:
     mission_goal: FloatArray | None
     mapping: tuple[float, float, float]
     is_short: bool = False
-    script: Script | None = None
+    script: RolloutEvents | None = None
 
     def __post_init__(self) -> None:
         for name in ("time_us", "ego", "iteration_rows", "mission_goal"):
@@ -112,27 +114,8 @@ class Scenario:
         """(T, 11) recorded ego states at the iterations."""
         return self.ego[self.iteration_rows]
 
-    def edited(self, name: str = "edited", **tables: object) -> "Scenario":
-        """This scenario with something changed, as one `[[edit]]` of `edits.toml` would.
-
-        Args:
-            name: Ends the token of the new scenario.
-            tables: What to change, as in the file: `spawn`, `remove`, `walk`, … (docs/edits.md).
-
-        Raises:
-            ConfigError: A table is wrong, or cannot be applied.
-
-        Example:
-            ```python
-            scenario = shiftsim.open_store("demo")["03b23c"]
-            place = {"ahead_m": 30.0, "left_m": -3.0}
-            parked = scenario.edited(spawn={"at": place, "behavior": "stopped"})
-            print(parked.token, parked.script.words)
-            ```
-        """
-        from shiftsim.world.edits.apply import edit_scenario
-
-        return edit_scenario(self, name, **tables)
+    # edited(name="edited", **tables): this scenario changed; attached by shiftsim.edits
+    edited: ClassVar[Callable[..., "Scenario"]]
 
 
 def scenario_of_rows(

@@ -99,7 +99,7 @@ class Tracks:
 
     Example:
         ```python
-        tracks = shiftsim.open_store("demo")["03b23c"].tracks
+        tracks = shiftsim.open_store("demo")["01f13e"].tracks
         there = tracks.valid[0]
         print(tracks, tracks.poses[0, there, :2], tracks.kinds[there])
         ```
@@ -252,7 +252,7 @@ class EgoState:
 
     Example:
         ```python
-        scenario = shiftsim.open_store("demo")["03b23c"]
+        scenario = shiftsim.open_store("demo")["01f13e"]
         state = shiftsim.EgoState(0, scenario.ego[0])
         print(state.pose, state.speed, state.steering_angle)
         ```

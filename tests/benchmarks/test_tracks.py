@@ -9,12 +9,12 @@ import pytest
 from shiftsim import benchmarks
 from shiftsim.benchmarks import TRACKS, known_sets, load_track, published
 from shiftsim.data.store.statistics import PUBLISHED_SCENARIOS
+from shiftsim.edits.sampling import GRADES, KINDS
 from shiftsim.errors import ConfigError
 from shiftsim.metrics import PROFILES
 from shiftsim.report.groups import token_digest
 from shiftsim.sim.noise import NOISE_NAMES, SIGMA_BY_LEVEL, parse_noise
 from shiftsim.sim.traffic import traffic_name
-from shiftsim.world.edits.sampling import GRADES, KINDS
 
 
 @pytest.mark.parametrize("name", TRACKS)

@@ -13,7 +13,7 @@ from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import simulate
 from shiftsim.view.build import Gallery, page_name, write_site
 from shiftsim.view.page import embedded, replay_page
-from shiftsim.view.scene import Shown
+from shiftsim.view.scene import ShownRollout
 from shiftsim.world.state import AgentKind
 
 SIZES = [(1440, 900), (800, 600)]
@@ -338,7 +338,9 @@ def test_hostile_texts_stay_texts(page, tmp_path):
         "score": 0.0,
     }
     file = tmp_path / "hostile.html"
-    file.write_text(replay_page(scenario, [Shown(HOSTILE, HOSTILE, 0, log, 0.0, [row])]), "utf-8")
+    file.write_text(
+        replay_page(scenario, [ShownRollout(HOSTILE, HOSTILE, 0, log, 0.0, [row])]), "utf-8"
+    )
 
     page.open(file.as_uri())
     page.press("v")

@@ -7,7 +7,7 @@ from stores import write_toy_store
 
 import shiftsim
 from shiftsim.cli import main
-from shiftsim.report.about import citation
+from shiftsim.report.build import citation
 
 pytest.importorskip("matplotlib")
 SIZES = [(1440, 900), (800, 600)]

@@ -104,7 +104,7 @@ def test_flags_win_over_the_settings_file(place):
         (("report", "runs/absent"), 1, "no run folder", "runs/good"),
         (("explain", "runs/good", "beef"), 1, "no scenario 'beef'", "did you mean"),
         (("check", "absent"), 2, "absent", ""),
-        (("verify", "."), 2, "not recognised", "known kinds"),
+        (("verify", "."), 1, "without --experiment", "pytest tests/parity --reference DIR"),
         (("jump",), 1, "No such command", "--help"),
     ],
 )

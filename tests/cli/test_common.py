@@ -33,7 +33,7 @@ def test_the_options_are_those_of_before():
         --controller --thresholds --planner-arg --metric --checkpoint --device --batch-size
         --isolate --planner-python --strict --out --workers --timeout --resume --retry-failed
         --shard --executor --scheduler --save-rollouts
-        --bundle --allow-partial --config --dry-run --live --quiet --json --debug"""
+        --bundle --allow-partial --config --dry-run --live --quiet --json"""
     assert flags == words.split()
 
 

@@ -9,12 +9,13 @@ import gc
 import json
 import os
 import signal
-import socket
+import subprocess
 import sys
 import tempfile
 import time
 import traceback
 from functools import cache
+from types import SimpleNamespace
 
 MODES = ("count", "before", "after", "eio", "eio on", "full")
 PATIENCE = 120.0  # s
@@ -64,18 +65,18 @@ class Forked:
     Fresh interpreters, as runs start them, would take most of the time.
     """
 
-    def __init__(self, shim: ctypes.CDLL, theirs: socket.socket) -> None:
-        from shiftsim.runs import workers
+    def __init__(self, shim: ctypes.CDLL, socket: int) -> None:
+        from shiftsim import processes
 
         parent = os.getpid()
         self.pid = os.fork()
         if self.pid == 0:
             shim.shim_arm(b"", MODES.index("count"), 0)
             os.setpgid(0, 0)
-            code, handle = 1, os.dup2(theirs.fileno(), 3)
+            code, handle = 1, os.dup2(socket, 3)
             os.closerange(4, os.sysconf("SC_OPEN_MAX"))  # else no end of a socket is the last one
             try:
-                workers.serve(parent, handle)
+                processes.serve(parent, handle)
                 code = 0
             finally:
                 os._exit(code)
@@ -88,9 +89,13 @@ class Forked:
 
 
 def work(shim: ctypes.CDLL, asked: dict, calls: int) -> int:
-    from shiftsim.runs import workers
+    from shiftsim import processes
 
-    workers._start = lambda theirs: Forked(shim, theirs)
+    fake = SimpleNamespace(**vars(subprocess))
+    fake.Popen = lambda words, **options: (
+        Forked(shim, int(words[-1])) if "-P" in words else subprocess.Popen(words, **options)
+    )
+    processes.subprocess = fake
     shim.shim_arm(os.fsencode(asked["root"]), MODES.index(asked["mode"]), asked["at"])
     code = command(asked["words"])
     with os.fdopen(calls, "wb") as file:

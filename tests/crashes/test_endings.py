@@ -21,7 +21,7 @@ import pytest
 from stores import write_toy_store
 
 import shiftsim
-from shiftsim.runs.verdicts import VERDICTS
+from shiftsim.runs.filter import RESULTS as VERDICTS
 
 HERE = Path(__file__).parent
 KILLS = ("before", "after")  # half of a write arrives, where it dies after the call

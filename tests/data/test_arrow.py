@@ -6,7 +6,7 @@ import sys
 import pytest
 
 pytest.importorskip("pandas")
-STORE = "import sys, shiftsim.data.store.schema, pyarrow as pa, numpy as np\n"
+STORE = "import sys, shiftsim.data.store.tables, pyarrow as pa, numpy as np\n"
 
 
 def run(code):

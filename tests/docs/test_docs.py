@@ -37,15 +37,15 @@ from track_files import table_of, write_tracks
 
 import shiftsim
 from shiftsim.benchmarks import load_track
-from shiftsim.data.demo import store as synthetic
-from shiftsim.data.dsc3d.recording import open_site
+from shiftsim.data.readers.dsc3d import open_site
 from shiftsim.data.store import map as store_map
 from shiftsim.data.store import schema
+from shiftsim.data.synthetic import store as synthetic
 from shiftsim.metrics import MULTIPLIERS, PROFILES, SHORT_NAMES, WEIGHTS
 from shiftsim.planners.registry import PLANNERS
 from shiftsim.report.words import LONG
 from shiftsim.runs import config
-from shiftsim.runs.results import TABLES
+from shiftsim.runs.tables import TABLES
 
 DOCS = REPOSITORY / "docs"
 BLOCKS = [block for page in PAGES for block in read_blocks(page)]
@@ -55,7 +55,7 @@ NEEDS = {  # of extras and of the dependency group `docs`
     **dict.fromkeys(("README", "learned_planners"), ("torch", "safetensors")),
     "nuplan_results": ("msgpack",),
     "training": ("gymnasium", "torch", "safetensors"),
-    "run_folder": ("duckdb", "pandas", "polars"),
+    **dict.fromkeys(("run_folder", "store_format"), ("duckdb", "pandas", "polars")),
     **dict.fromkeys(("quickstart", "seeing", "state_drift"), ("matplotlib",)),
 }
 UNITS = {
@@ -90,15 +90,14 @@ def material(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The demo store, recordings, logs, tables and maps that the pages speak of."""
     folder = tmp_path_factory.mktemp("material")
     synthetic.write_demo(folder / "towns")
-    synthetic.convert_demo(folder / "towns", folder / "shiftsim-data" / "demo")
+    synthetic.demo_store(folder / "shiftsim-data" / "demo")
     (folder / "dsc3d").mkdir()
     (folder / "towns" / "junction").rename(folder / "dsc3d" / "sindelfingen")
+    _write_tracks(folder, folder / "towns" / "parking")
     shutil.rmtree(folder / "towns")
-    _write_tracks(folder, folder / "dsc3d" / "sindelfingen")
     golden = REPOSITORY / "tests" / "golden" / "nuplan_format"
     for name in ("logs", "maps"):
         shutil.copytree(golden / name, folder / "nuplan" / name)
-    shutil.copytree(REPOSITORY / "shiftsim" / "verify" / "reference", folder / "reference")
     _write_results(folder, golden.parent)
     if importlib.util.find_spec("torch"):
         from checkpoint_files import state_of, write_published
@@ -286,7 +285,9 @@ def _described(table: pa.Schema) -> list[list[str]]:
     out = []
     for column in table:
         is_list = pa.types.is_list(column.type)
-        name = TYPES[column.type.value_type if is_list else column.type]
+        kind = column.type.value_type if is_list else column.type
+        is_row = pa.types.is_fixed_size_list(kind)
+        name = f"{kind.list_size} {TYPES[kind.value_type]}" if is_row else TYPES[kind]
         out.append([column.name, f"list of {name}" if is_list else name, _unit(column.name)])
     return out
 
@@ -294,6 +295,7 @@ def _described(table: pa.Schema) -> list[list[str]]:
 STORE_TABLES = {
     "### scenarios.parquet": schema.SCENARIOS,
     "### frames.parquet": schema.FRAMES,
+    "### lights.parquet": schema.LIGHTS,
     "### tracks.parquet": schema.TRACKS,
     "### ego-NAME.parquet": schema.EGO,
 }
@@ -313,14 +315,14 @@ def test_column_tables_are_those_of_the_files(page: Path, heading: str, table: p
 
 
 def test_verdicts_of_the_filter_are_described() -> None:
-    from shiftsim.runs.verdicts import SCHEMA
+    from shiftsim.runs.filter import SCHEMA
 
     rows = table_below(DOCS / "store_format.md", "### filter/verdicts.parquet")
     assert [row[:3] for row in rows] == _described(SCHEMA)
 
 
 def test_columns_of_a_map_are_those_of_the_file() -> None:
-    rows = table_below(DOCS / "store_format.md", "### maps/CITY.parquet")
+    rows = table_below(DOCS / "store_format.md", "### maps/CITY.arrow")
     found = [
         ["".join(parts), kind]
         for columns, kind, *_ in rows

@@ -8,7 +8,7 @@ from places import REPOSITORY
 
 SOURCES = [
     path
-    for folder in ("shiftsim", "planners", "metrics", "data", "benchmarks")
+    for folder in ("shiftsim", "planners", "metrics", "data", "benchmarks", "tests/parity")
     for path in sorted((REPOSITORY / folder).rglob("*.py"))
 ]
 RULES = (REPOSITORY / "docs" / "nuplan_rules.md").read_text("utf-8")

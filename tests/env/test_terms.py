@@ -162,7 +162,7 @@ def test_a_collision_counts_once_and_only_while_the_ego_moves():
     assert np.flatnonzero(hits).tolist() == [29]
     standing = cruise_scenario(speed=0.0, tracks=approaching())
     episodes = list(replay(standing))
-    assert episodes[-1].course.touched.all()
+    assert episodes[-1].state.touched.all()
     assert not any(e.terms.collision for e in replay(standing))
     inside = cruise_scenario(tracks=parked(12.0))  # touched before the ego could do anything
     assert not any(e.terms.collision for e in replay(inside))

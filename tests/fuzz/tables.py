@@ -75,7 +75,11 @@ def read_track_table(folder: Path) -> Any:
     """As `shiftsim convert tracks` does it."""
     from fuzz.targets import read_store
 
-    from shiftsim.data.tracks.convert import convert_tracks, look_at, tracks_config
+    from shiftsim.data.readers.tracks.inspection import (
+        convert_tracks,
+        inspect_tracks,
+        tracks_config,
+    )
     from shiftsim.errors import ConfigError, ConversionError
     from shiftsim.files import read_toml
 
@@ -88,8 +92,8 @@ def read_track_table(folder: Path) -> Any:
     short = tracks_config(window_s=4.0, overlap_s=1.0, history_s=1.0)
     words = read_toml(said) if said.exists() else {}
     try:
-        looked = look_at(tracks, folder / "road.xodr", said=words, config=short)
-        convert_tracks(looked, folder / "store", config=short)
+        inspection = inspect_tracks(tracks, folder / "road.xodr", overrides=words, config=short)
+        convert_tracks(inspection, folder / "store", config=short)
     except ConfigError as error:  # the command names the file
         raise ConfigError(f"{tracks}: {error.message}", error.hint) from error
     except ConversionError as error:  # as it does with what it doubts
@@ -110,9 +114,9 @@ def write_results(folder: Path) -> None:
 
 def read_results(folder: Path) -> Any:
     """As `shiftsim verify --experiment` does it; what is found there is compared, not used."""
-    from shiftsim.verify.nuplan.experiment import _read
-    from shiftsim.verify.nuplan.simulation_log import read_simulation_log
+    from shiftsim.verify.experiment import _read
     from shiftsim.verify.report import Report
+    from shiftsim.verify.simulation_log import read_simulation_log
 
     report = Report()
     _read(folder, "scores", "scenario", report)

@@ -17,12 +17,13 @@ import open_data_files
 import opendrive_xml
 from fuzz.tables import read_results, read_track_table, write_results, write_track_tables
 from places import GOLDEN
+from recordings import require_plausible
 from stores import write_toy_store
 
-from shiftsim.data.store.plausible import require_plausible, require_sound
+from shiftsim.data.store.map import require_sound
 from shiftsim.errors import DataError
 from shiftsim.planners.table import shipped_file
-from shiftsim.runs.results import _RANGES as RUN_COLUMNS
+from shiftsim.runs.tables import _RANGES as RUN_COLUMNS
 from shiftsim.world.map import LAYERS, VectorMap
 from shiftsim.world.ranges import (
     CHECKPOINT,
@@ -144,7 +145,7 @@ def _outside(found: np.ndarray, where: str, field: str) -> Iterator[str]:
 
 
 def _implausible_scenario(scene: Scenario, where: str) -> Iterator[str]:
-    require_plausible(scene, "ego", Path(where))
+    require_plausible(scene)
     names = ("duration_s", "offset_s", "subsample_ratio")
     values = dict(zip(names, scene.mapping, strict=True)) | {"goal_pose": scene.mission_goal}
     yield from implausible(values, f"{where}.mapping")
@@ -203,8 +204,8 @@ def _roads(folder: Path) -> None:
 
 
 def _read_opendrive(folder: Path) -> Any:
-    from shiftsim.data.opendrive.map import build_road_map
-    from shiftsim.data.opendrive.reading import read_opendrive
+    from shiftsim.data.maps.opendrive.map import build_road_map
+    from shiftsim.data.maps.opendrive.reading import read_opendrive
 
     od = read_opendrive(folder / "map.xodr")
     road = build_road_map(od, name="x")[0]
@@ -259,9 +260,9 @@ def _sites(folder: Path) -> None:
 
 
 def _read_site(folder: Path) -> Any:
-    from shiftsim.data.deepplan.convert import convert_dsc3d
-    from shiftsim.data.deepplan.windows import ConversionConfig
-    from shiftsim.data.dsc3d.recording import open_site, read_recording
+    from shiftsim.data.readers.annotations import read_recording
+    from shiftsim.data.readers.dsc3d import convert_dsc3d, open_site
+    from shiftsim.data.readers.windows import ConversionConfig
 
     site = open_site(folder)
     recordings = [read_recording(site, name) for name in site.recordings]
@@ -284,14 +285,18 @@ def _py123d(folder: Path) -> None:
 
 
 def _read_scenes(name: str, folder: Path) -> Any:
-    from shiftsim.data.open_data.av2 import Av2Reader
-    from shiftsim.data.open_data.commonroad import CommonRoadReader
-    from shiftsim.data.open_data.py123d import Py123dReader
-    from shiftsim.data.open_data.scenes import convert_scene
+    from shiftsim.data.readers.av2 import Av2Reader
+    from shiftsim.data.readers.commonroad import CommonRoadReader
+    from shiftsim.data.readers.py123d import Py123dReader
+    from shiftsim.data.readers.scenarios import convert_recording
 
-    reader = {"av2": Av2Reader, "commonroad": CommonRoadReader, "py123d": Py123dReader}[name]()
-    made = [convert_scene(reader.read(path)) for path in reader.find(folder)]
-    return [(one.road, one.converted.egos, one.converted.windows) for one in made]
+    reader = {"av2": Av2Reader, "commonroad": CommonRoadReader, "py123d": Py123dReader}[name](
+        folder
+    )
+    sources = [reader.read(name) for name in reader.recordings()]
+    converted = [convert_recording(source) for source in sources]
+    roads = [source.map.road for source in sources]
+    return roads, [(one.egos, one.windows) for one in converted]
 
 
 def _stores(folder: Path) -> None:
@@ -325,7 +330,8 @@ def _read_run(folder: Path) -> Any:
     from shiftsim.data.store.reading import ScenarioStore
     from shiftsim.report.scores import score_table
     from shiftsim.runs.manifest import state_of
-    from shiftsim.runs.results import open_run, stored_results
+    from shiftsim.runs.results import open_run
+    from shiftsim.runs.tables import stored_results
 
     run = open_run(folder)
     state_of(folder)
@@ -367,9 +373,9 @@ def _read_checkpoint(folder: Path) -> Any:
         checked_state,
         find_checkpoint,
         needed_args,
+        network_module,
         open_checkpoint,
     )
-    from shiftsim.planners.learned.match import network_module
 
     found = open_checkpoint(find_checkpoint(str(folder)))
     if len(found.state) < 10:  # of no planner

@@ -18,7 +18,7 @@ from fuzz.server import CORPUS, run_case
 from fuzz.targets import TARGETS, Target
 from worlds import cruise_scenario, straight_road
 
-from shiftsim.data.opendrive.records import Lane, Speed
+from shiftsim.data.maps.opendrive.records import Lane, Speed
 from shiftsim.errors import DataError
 
 SERVER = Path(__file__).with_name("server.py")

@@ -10,7 +10,14 @@ from worlds import join_tracks
 
 from shiftsim.geometry.boxes import BEHIND, boxes_to_corners
 from shiftsim.metrics import collision
-from shiftsim.metrics.collision import COLLISION_TYPES, Contacts, classify, collide, judge, set_box
+from shiftsim.metrics.collision import (
+    COLLISION_TYPES,
+    Contacts,
+    classify,
+    collide,
+    evaluate,
+    set_box,
+)
 from shiftsim.metrics.result import NUPLAN, Collision, Thresholds, Violation
 from shiftsim.world.state import PACIFICA, VY, AgentKind, Tracks
 
@@ -212,7 +219,7 @@ COSTS = [
 def test_every_group_of_kinds_has_its_own_allowance(
     collisions: list[Collision], thresholds: Thresholds, score: float
 ) -> None:
-    part = judge(tuple(collisions), thresholds)
+    part = evaluate(tuple(collisions), thresholds)
     assert part.row.score == pytest.approx(score, abs=1e-12)
     total = sum(c.at_fault for c in collisions)
     assert part.row.value == total
@@ -222,7 +229,7 @@ def test_every_group_of_kinds_has_its_own_allowance(
 def test_the_violation_and_the_statistics_are_those_of_the_blamed_contacts() -> None:
     free = hits(AgentKind.VEHICLE, 9.0, at_fault=False)
     blamed = hits(AgentKind.BICYCLE, 2.0, 4.0, 9.0) + hits(AgentKind.BARRIER, 3.0)
-    part = judge((*free, *blamed), NUPLAN)
+    part = evaluate((*free, *blamed), NUPLAN)
     assert part.row.violation == Violation(5, 500, f"{AgentKind.BICYCLE}-0", 2.0)
     name = "number_of_at_fault_collisions_with_{}".format
     energy = "{}_collision_energy_with_{}".format

@@ -9,7 +9,7 @@ from shiftsim.metrics.comfort import (
     BOUNDED_SIGNALS,
     ComfortSignals,
     comfort_signals,
-    judge,
+    evaluate,
     within_bounds,
 )
 from shiftsim.metrics.result import DEEPPLAN, NUPLAN, Violation
@@ -101,7 +101,7 @@ def test_a_signal_must_stay_strictly_within_both_bounds(metric: str, side: int) 
         values = np.zeros(10)
         values[[4, 6]] = value, 0.1 * bound
         signals = constant_signals(**{BOUNDED_SIGNALS[metric]: values})
-        parts, comfortable = judge(signals, times(10), NUPLAN)
+        parts, comfortable = evaluate(signals, times(10), NUPLAN)
         row = {part.row.metric: part.row for part in parts}[metric]
         violation = Violation(4, 400_000, None, value) if broken else None
         assert (row.value, row.threshold, row.violation) == (value, bound, violation)
@@ -115,14 +115,15 @@ def test_the_earliest_of_all_violations_is_that_of_comfort() -> None:
     late, early = np.zeros(10), np.zeros(10)
     late[7:], early[2] = 9.0, -9.0
     signals = constant_signals(mag_jerk=late, lon_jerk=early, yaw_rate=late)
-    _, comfortable = judge(signals, times(10), NUPLAN)
+    _, comfortable = evaluate(signals, times(10), NUPLAN)
+    assert comfortable.row.threshold == 0.0
     assert comfortable.row.violation == Violation(2, 200_000, None, -9.0)
     assert comfortable.row.value == 3.0
 
 
 def test_the_value_of_a_signal_is_the_one_nearest_to_a_bound() -> None:
     values = np.array([0.0, 2.0, -3.0, 1.0])
-    parts, _ = judge(constant_signals(4, lon_accel=values), times(4), NUPLAN)
+    parts, _ = evaluate(constant_signals(4, lon_accel=values), times(4), NUPLAN)
     part = parts[2]
     assert (part.row.value, part.row.threshold) == (2.0, 2.40)
     assert [s.value for s in part.statistics] == [2.0, -3.0, 0.0, 2.0, 1.0]
@@ -139,7 +140,7 @@ def test_the_ninetieth_percentile_is_the_observation_of_an_even_rank_on_ties(
     count: int, rank: int, rng: np.random.Generator
 ) -> None:
     values = rng.permutation(np.arange(count)) / 1000.0
-    parts, _ = judge(constant_signals(count, yaw_rate=values), times(count), NUPLAN)
+    parts, _ = evaluate(constant_signals(count, yaw_rate=values), times(count), NUPLAN)
     assert parts[5].statistics[3].value == rank / 1000.0
 
 

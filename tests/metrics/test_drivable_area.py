@@ -12,12 +12,13 @@ import shapely
 from hypothesis import given
 from strategies import seeds
 
-from shiftsim.data.demo.scenes import demo_sites
-from shiftsim.data.opendrive.map import build_road_map
-from shiftsim.data.opendrive.reading import read_opendrive
+from shiftsim.data.maps.opendrive.map import build_road_map
+from shiftsim.data.maps.opendrive.reading import read_opendrive
+from shiftsim.data.synthetic.recordings import generate_town
+from shiftsim.data.synthetic.store import DEMO_TOWNS
 from shiftsim.errors import MapError
 from shiftsim.geometry.boxes import boxes_to_corners
-from shiftsim.metrics.drivable_area import DrivableArea, judge, measure
+from shiftsim.metrics.drivable_area import DrivableArea, evaluate, measure
 from shiftsim.metrics.result import NUPLAN, PROFILES, Violation
 from shiftsim.metrics.route import EdgeLists, corner_routes, empty_lists
 from shiftsim.world.layers import Layer, make_layer
@@ -89,7 +90,7 @@ def test_corners_on_all_sides_of_a_wide_area_find_it_again(count: int) -> None:
 def test_a_corner_at_the_tolerance_is_too_far(far: float, score: float) -> None:
     distances = np.zeros((3, 4))
     distances[1, 2], distances[2, 0] = far, 0.1
-    compliance, corners = judge(DrivableArea(distances > 0.0, distances), TIMES, NUPLAN)
+    compliance, corners = evaluate(DrivableArea(distances > 0.0, distances), TIMES, NUPLAN)
     assert (compliance.row.score, compliance.row.value) == (score, far)
     assert compliance.row.violation == (
         Violation(1, int(TIMES[1]), None, far) if score == 0.0 else None
@@ -102,7 +103,9 @@ def test_a_corner_at_the_tolerance_is_too_far(far: float, score: float) -> None:
 
 
 def test_distances_of_corners_that_are_not_outside_do_not_count() -> None:
-    part, corners = judge(DrivableArea(np.zeros((3, 4), np.bool_), np.ones((3, 4))), TIMES, NUPLAN)
+    part, corners = evaluate(
+        DrivableArea(np.zeros((3, 4), np.bool_), np.ones((3, 4))), TIMES, NUPLAN
+    )
     assert part.row.score == 1.0
     assert corners.statistics[0].value == 1.0
 
@@ -234,8 +237,9 @@ def check_files(paths: list[Path], count: int) -> int:
 
 @pytest.mark.slow
 def test_ten_thousand_boxes_in_the_towns_of_the_demo_agree_with_shapely(tmp_path):
-    for site in demo_sites():
-        (tmp_path / f"{site.name}.xodr").write_text(site.town().network.xml(), "utf-8")
+    for town in DEMO_TOWNS:
+        xml = generate_town(town)[0].network.xml()
+        (tmp_path / f"{town.name}.xodr").write_text(xml, "utf-8")
     check_files(sorted(tmp_path.glob("*.xodr")), 10_000)
 
 

@@ -9,7 +9,7 @@ from rollouts import boxes, rollout, states_of, straight_poses
 from worlds import straight_road
 
 from shiftsim.errors import ConfigError, DataError, MapError
-from shiftsim.metrics import MetricRow, compute_metrics, judge, load_metric, measure
+from shiftsim.metrics import MetricRow, compute_metrics, evaluate, load_metric, measure
 from shiftsim.world.build import BlockSpec, EdgeSpec, build_map
 
 LOG = rollout(states_of(straight_poses(20), 10.0))
@@ -73,7 +73,7 @@ def test_arrays_of_different_length_are_refused() -> None:
 
 def test_an_unknown_profile_names_the_nearest() -> None:
     with pytest.raises(ConfigError, match="threshold profile 'deeplan' unknown") as error:
-        judge(measure(LOG, straight_road()), "deeplan")
+        evaluate(measure(LOG, straight_road()), "deeplan")
     assert "deepplan" in error.value.hint
 
 

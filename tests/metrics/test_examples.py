@@ -5,7 +5,7 @@ import pytest
 from rollouts import boxes, rollout, states_of, straight_poses
 from worlds import join_tracks, straight_road
 
-from shiftsim.metrics import MetricResult, MetricRow, compute_metrics, judge, measure
+from shiftsim.metrics import MetricResult, MetricRow, compute_metrics, evaluate, measure
 from shiftsim.metrics.result import Thresholds
 from shiftsim.world.state import VX, AgentKind, Tracks
 
@@ -93,8 +93,8 @@ def test_time_to_collision_of_a_standing_lead(
     measured = measure(rollout(states_of(poses, 10.0), tracks=lead), ROAD)
     np.testing.assert_allclose(measured.ttc.values, ttc, rtol=0, atol=1e-12)
     metric = "time_to_collision_within_bound"
-    assert judge(measured, "nuplan").scores[metric] == nuplan
-    assert judge(measured, "deepplan").scores[metric] == deepplan
+    assert evaluate(measured, "nuplan").scores[metric] == nuplan
+    assert evaluate(measured, "deepplan").scores[metric] == deepplan
 
 
 def test_a_stopped_ego_never_violates_the_time_to_collision() -> None:
@@ -115,10 +115,10 @@ def test_drivable_area_tolerates_corners_up_to_the_threshold(
 ) -> None:
     y = -(1.75 + out - 2.297 / 2)  # the right corners are `out` beyond the road's edge
     measured = measure(rollout(states_of(straight_poses(K, y=y), 10.0)), ROAD)
-    assert judge(measured, "nuplan").scores["drivable_area_compliance"] == nuplan
-    assert judge(measured, "deepplan").scores["drivable_area_compliance"] == deepplan
+    assert evaluate(measured, "nuplan").scores["drivable_area_compliance"] == nuplan
+    assert evaluate(measured, "deepplan").scores["drivable_area_compliance"] == deepplan
     np.testing.assert_allclose(measured.drivable.distances.max(), out, rtol=0, atol=1e-9)
-    assert not judge(measured).series["corners_in_drivable_area"].values.any()
+    assert not evaluate(measured).series["corners_in_drivable_area"].values.any()
 
 
 @pytest.mark.parametrize(("speed", "expected"), [(1.5, 1.0), (5.0, 0.5), (8.0, 0.0)])

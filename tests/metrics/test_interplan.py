@@ -24,9 +24,9 @@ from shiftsim.metrics.interplan import (
 )
 from shiftsim.metrics.route import EdgeLists
 from shiftsim.sim.log import as_recorded
+from shiftsim.world.events import RolloutEvents
 from shiftsim.world.layers import make_lists
 from shiftsim.world.map import NONE
-from shiftsim.world.script import Script
 
 PERFECT = dict.fromkeys((*MULTIPLIERS, *WEIGHTS, "lane_changes_to_goal"), 1.0)
 
@@ -218,7 +218,7 @@ def test_an_obstacle_is_passed_where_the_progress_is_as_far(beyond, passed):
         row._replace(value=needed + beyond if row.metric == interplan.PROGRESS else -1.0)
         for row in result.rows
     )
-    script = Script("a", "b", "c", (), (), np.zeros(0, np.int64), sorts="stopped_vehicle")
+    script = RolloutEvents("a", "b", "c", (), (), np.zeros(0, np.int64), sorts="stopped_vehicle")
     script = replace(script, obstacles=place)
     found = add_interplan(replace(result, rows=rows), log, road, script)
     lane, sorts = found.rows[-2:]
@@ -241,7 +241,7 @@ def test_an_ego_that_does_not_get_to_the_lane_of_the_goal_scores_less():
     aside = log.ego.copy()
     aside[:, 1] = 3.5
     log, road = replace(log, ego=aside), straight_road()
-    script = Script("a", "b", "c", (), (), np.zeros(0, np.int64))
+    script = RolloutEvents("a", "b", "c", (), (), np.zeros(0, np.int64))
     found = add_interplan(compute_metrics(log, road), log, road, script)
     assert found.rows[-1].score == 0.0
     assert [s.value for s in found.statistics[-2:]] == [1.0, 0.0]

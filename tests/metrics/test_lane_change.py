@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from strategies import seeds
 
-from shiftsim.metrics.lane_change import NAME, LaneChanges, judge, lane_changes
+from shiftsim.metrics.lane_change import NAME, LaneChanges, evaluate, lane_changes
 from shiftsim.metrics.result import NUPLAN
 from shiftsim.metrics.route import EdgeLists
 from shiftsim.world.layers import make_lists
@@ -117,7 +117,7 @@ def changes_of(*rows: tuple[int, int, bool]) -> LaneChanges:
 
 
 def test_durations_and_the_share_that_failed_are_reported() -> None:
-    part = judge(changes_of((3, 8, True), (10, 21, False), (30, 38, False)), TIMES, NUPLAN)
+    part = evaluate(changes_of((3, 8, True), (10, 21, False), (30, 38, False)), TIMES, NUPLAN)
     assert part.row.value == pytest.approx(1.0 / 3.0)
     assert {s.name: pytest.approx(s.value) for s in part.statistics} == {
         f"number_of_{NAME}": 3.0,
@@ -131,10 +131,10 @@ def test_durations_and_the_share_that_failed_are_reported() -> None:
 @pytest.mark.parametrize(("failed", "within"), [(3, 1.0), (4, 0.0)])
 def test_a_failed_share_of_three_tenths_still_passes(failed: int, within: float) -> None:
     rows = [(n, n + 1, n < failed) for n in range(10)]
-    assert judge(changes_of(*rows), TIMES, NUPLAN).statistics[-1].value == within
+    assert evaluate(changes_of(*rows), TIMES, NUPLAN).statistics[-1].value == within
 
 
 def test_no_change_at_all_passes_without_durations() -> None:
-    part = judge(changes_of(), TIMES, NUPLAN)
+    part = evaluate(changes_of(), TIMES, NUPLAN)
     assert part.row.value == 0.0
     assert [s.value for s in part.statistics] == [0.0, 1.0]

@@ -10,7 +10,7 @@ from strategies import seeds
 
 from shiftsim.errors import MapError
 from shiftsim.metrics import progress
-from shiftsim.metrics.progress import Progress, expert_chain, judge, judge_direction, windowed
+from shiftsim.metrics.progress import Progress, evaluate, evaluate_direction, expert_chain, windowed
 from shiftsim.metrics.result import NUPLAN, Thresholds, Violation
 from shiftsim.metrics.route import EdgeLists
 from shiftsim.world.layers import make_layer, make_polylines
@@ -170,7 +170,7 @@ RATIOS = [
 def test_the_ratio_counts_little_progress_as_the_least(
     ego: float, expert: float, ratio: float
 ) -> None:
-    along, making = judge(Progress(np.array([0.0, ego]), np.array([0.0, expert]), True), NUPLAN)
+    along, making = evaluate(Progress(np.array([0.0, ego]), np.array([0.0, expert]), True), NUPLAN)
     assert along.row.score == along.row.value == pytest.approx(ratio, abs=1e-12)
     assert [s.value for s in along.statistics] == pytest.approx([expert, ego, ratio])
     assert along.series is not None
@@ -181,12 +181,12 @@ def test_the_ratio_counts_little_progress_as_the_least(
 @pytest.mark.parametrize(("ego", "score"), [(2.0, 1.0), (1.99, 0.0)])
 def test_a_fifth_of_the_expert_is_progress(ego: float, score: float) -> None:
     own = Thresholds("x", score_progress=0.1)
-    _, making = judge(Progress(np.array([ego]), np.array([10.0]), True), own)
+    _, making = evaluate(Progress(np.array([ego]), np.array([10.0]), True), own)
     assert making.row.score == score
 
 
 def test_without_a_route_the_ratio_is_one_and_the_ego_has_no_statistic() -> None:
-    along, making = judge(Progress(np.array([-9.0]), np.array([0.0]), False), NUPLAN)
+    along, making = evaluate(Progress(np.array([-9.0]), np.array([0.0]), False), NUPLAN)
     assert along.row.score == making.row.score == 1.0
     assert [s.name.split("_")[0] for s in along.statistics] == ["expert", "ego"]
     assert "ratio" in along.statistics[1].name
@@ -213,7 +213,7 @@ def test_the_window_has_one_sample_more_than_steps(
 def test_going_back_by_a_bound_breaks_it(back: float, score: float) -> None:
     values = np.zeros(30)
     values[12] = -back
-    part = judge_direction(values, TIMES, NUPLAN)
+    part = evaluate_direction(values, TIMES, NUPLAN)
     assert part.row.score == part.statistics[0].value == score
     assert part.row.value == back
     assert part.statistics[1].value == -back

@@ -10,7 +10,7 @@ from strategies import seeds
 from shiftsim.errors import MapError
 from shiftsim.metrics.result import NUPLAN, Thresholds, Violation
 from shiftsim.metrics.route import EdgeLists
-from shiftsim.metrics.speed_limit import NAME, judge, overspeed
+from shiftsim.metrics.speed_limit import NAME, evaluate, overspeed
 from shiftsim.world.layers import make_lists, make_polygons
 
 LANES, EDGES = 4, 8
@@ -68,7 +68,7 @@ def test_the_first_connector_without_neighbours_is_named() -> None:
 
 def test_two_violations_are_told_apart_and_weighed_by_their_time() -> None:
     over = np.array([0.0, 1.0, 3.0, 0.0, 0.0, 0.0, 0.5, 0.5, 0.5, 0.0, 0.0])
-    part = judge(over, TIMES, NUPLAN)
+    part = evaluate(over, TIMES, NUPLAN)
     assert part.row.violation == Violation(1, int(TIMES[1]), None, 1.0)
     assert part.row.value == 3.0
     assert part.row.score == pytest.approx(1.0 - 5.5 * 0.1 / (2.23 * 1.0), abs=1e-9)
@@ -89,11 +89,11 @@ def test_a_violation_that_lasts_to_the_end_ends_at_the_last_sample(
     last: tuple[float, ...], mean: float
 ) -> None:
     over = np.array([0.0] * 8 + list(last))
-    assert judge(over, TIMES, NUPLAN).statistics[-1].value == pytest.approx(mean, nan_ok=True)
+    assert evaluate(over, TIMES, NUPLAN).statistics[-1].value == pytest.approx(mean, nan_ok=True)
 
 
 def test_a_violation_from_the_start_is_one() -> None:
-    part = judge(np.array([2.0, 2.0, *[0.0] * 9]), TIMES, NUPLAN)
+    part = evaluate(np.array([2.0, 2.0, *[0.0] * 9]), TIMES, NUPLAN)
     assert part.statistics[1].value == 1.0
     assert part.row.violation == Violation(0, int(TIMES[0]), None, 2.0)
 
@@ -101,25 +101,25 @@ def test_a_violation_from_the_start_is_one() -> None:
 @pytest.mark.parametrize(("allowed", "score"), [(2.0, 0.5), (1.0, 0.0), (0.0, 0.0), (4.0, 0.75)])
 def test_the_loss_is_relative_to_the_allowed_excess(allowed: float, score: float) -> None:
     over = np.array([0.0, *[1.0] * 10])
-    part = judge(over, TIMES, Thresholds("x", max_overspeed=allowed))
+    part = evaluate(over, TIMES, Thresholds("x", max_overspeed=allowed))
     assert part.row.score == pytest.approx(score, abs=1e-9)
     assert part.row.threshold == allowed
 
 
 def test_without_any_allowance_the_smallest_counts() -> None:
     over = np.array([1e-4, *[0.0] * 10])
-    part = judge(over, TIMES, Thresholds("x", max_overspeed=0.0))
+    part = evaluate(over, TIMES, Thresholds("x", max_overspeed=0.0))
     assert part.row.score == pytest.approx(1.0 - 1e-5 / 1e-3, abs=1e-9)
 
 
 def test_a_rollout_without_duration_loses_nothing() -> None:
-    part = judge(np.array([3.0]), TIMES[:1], NUPLAN)
+    part = evaluate(np.array([3.0]), TIMES[:1], NUPLAN)
     assert part.row.score == 1.0
     assert part.row.violation is not None
 
 
 def test_no_violation_has_no_statistics_but_the_verdict() -> None:
-    part = judge(np.zeros(11), TIMES, NUPLAN)
+    part = evaluate(np.zeros(11), TIMES, NUPLAN)
     assert part.row[:3] == (NAME, 1.0, 0.0)
     assert part.row.violation is None
     assert [s.value for s in part.statistics] == [1.0]

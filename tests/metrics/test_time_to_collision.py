@@ -14,7 +14,7 @@ from worlds import join_tracks
 from shiftsim.geometry.boxes import BEHIND, boxes_to_corners
 from shiftsim.metrics import collision
 from shiftsim.metrics.result import NUPLAN, Collision, Violation
-from shiftsim.metrics.time_to_collision import TimeToCollision, judge, time_to_collision
+from shiftsim.metrics.time_to_collision import TimeToCollision, evaluate, time_to_collision
 from shiftsim.world.layers import make_layer
 from shiftsim.world.state import PACIFICA, AgentKind, Tracks
 
@@ -146,7 +146,7 @@ def test_at_an_at_fault_collision_the_time_is_zero_and_the_partner_the_first_tha
     assert ttc.partners.tolist() == [0, 0, 2, 0, 1]
     np.testing.assert_allclose(ttc.values[[2, 4]], 0.0)
     assert (ttc.values[[0, 1, 3]] > 1.0).all()
-    assert judge(ttc, TIMES, NUPLAN).row.violation == Violation(2, int(TIMES[2]), "c", 0.0)
+    assert evaluate(ttc, TIMES, NUPLAN).row.violation == Violation(2, int(TIMES[2]), "c", 0.0)
 
 
 def test_a_track_at_exactly_the_angle_is_not_behind() -> None:
@@ -170,7 +170,7 @@ def test_static_objects_do_not_move() -> None:
 def test_the_bound_must_be_exceeded(lowest: float, score: float) -> None:
     values = np.array([np.inf, 2.0, lowest, 1.5, lowest])
     ttc = TimeToCollision(values, np.array([-1, 1, -1, 0, 0]), ("a", "b"))
-    part = judge(ttc, TIMES, NUPLAN)
+    part = evaluate(ttc, TIMES, NUPLAN)
     assert part.row.score == score
     assert part.row.value == lowest
     assert [s.value for s in part.statistics] == [lowest, score]
@@ -180,4 +180,4 @@ def test_the_bound_must_be_exceeded(lowest: float, score: float) -> None:
 
 def test_the_partner_of_the_first_violation_is_named() -> None:
     ttc = TimeToCollision(np.array([3.0, 0.5, 0.4]), np.array([1, 0, 1]), ("a", "b"))
-    assert judge(ttc, TIMES, NUPLAN).row.violation == Violation(1, int(TIMES[1]), "a", 0.5)
+    assert evaluate(ttc, TIMES, NUPLAN).row.violation == Violation(1, int(TIMES[1]), "a", 0.5)

@@ -7,7 +7,7 @@ import pytest
 
 from shiftsim.kernels import readonly
 from shiftsim.planners.basic.constant_velocity import ConstantVelocity
-from shiftsim.planners.original import Original
+from shiftsim.planners.prototype import PlannerPrototype
 
 
 class Holder(ConstantVelocity):
@@ -22,7 +22,7 @@ class Holder(ConstantVelocity):
 
 
 def test_a_copy_has_a_state_of_its_own_and_shares_what_nobody_can_write():
-    original = Original(Holder)
+    original = PlannerPrototype(Holder)
     first = original.copy()
     first.seen.append(2)
     first.scratch[0] = 7.0
@@ -42,7 +42,7 @@ def test_networks_are_shared():
 
     Net.__qualname__ = Net.__name__
     globals()["Net"] = Net
-    original = Original(Net)
+    original = PlannerPrototype(Net)
     copied = original.copy()
     assert copied.network is original.planner.network
     assert copied.steps is not original.planner.steps
@@ -63,7 +63,7 @@ def test_what_cannot_be_pickled_is_made_again():
         made.append(Locked())
         return made[-1]
 
-    original = Original(make)
+    original = PlannerPrototype(make)
     assert original.copy() is made[1]
     assert original.copy() is made[2]
 
@@ -81,7 +81,7 @@ class Team(ConstantVelocity):
 
 
 def test_a_batch_planner_is_forked():
-    original = Original(Team)
+    original = PlannerPrototype(Team)
     assert original.planner.forks == 0
     copied = original.copy()
     assert original.planner.forks == 1
@@ -89,7 +89,7 @@ def test_a_batch_planner_is_forked():
 
 
 def test_a_copy_is_closed_when_it_has_driven():
-    original = Original(Holder)
+    original = PlannerPrototype(Holder)
     copied = original.copy()
     original.release(copied)
     assert copied.closed == [True]

@@ -80,7 +80,6 @@ def test_a_planner_may_be_named_by_its_file(own_module, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("import shiftsim\nshiftsim.run('idm')", "starts a run while it is imported"),
         ("x = 1\nlanes = {}\nlanes['no']", r"KeyError: 'no' \(.*own_planner_module.py:3\)"),
         ("def f(:", "SyntaxError: invalid syntax"),
         (OWN.replace("self.values =", "len(gain);"), r"cannot be made: TypeError: .*module.py:6\)"),

@@ -8,7 +8,7 @@ from shiftsim.report.build import write_report
 from shiftsim.report.groups import read_groups
 from shiftsim.report.palette import planner_styles
 from shiftsim.report.words import LONG
-from shiftsim.train import curves
+from shiftsim.train import folder
 
 pytest.importorskip("matplotlib")
 
@@ -148,9 +148,9 @@ def test_fonts_of_a_pdf_are_truetype_as_papers_ask_for(groups, tmp_path):
 
 def test_the_curve_of_a_training_is_drawn_in_the_colours_of_all_pictures(tmp_path, monkeypatch):
     kept = []
-    monkeypatch.setattr(curves, "save_picture", lambda figure, path: kept.append(figure))
+    monkeypatch.setattr(folder, "save_picture", lambda figure, path: kept.append(figure))
     rows = [{"samples": 1e5 * i, "acceleration_error": 0.2, "steering_error": 0.1} for i in (1, 2)]
-    curves.draw_curves(tmp_path / "a.png", rows, [{"samples": 1e5, "none": 0.9, "ou-high": 0.7}])
+    folder.draw_curves(tmp_path / "a.png", rows, [{"samples": 1e5, "none": 0.9, "ou-high": 0.7}])
     (figure,) = kept
     looks = [(line.get_color(), line.get_linestyle()) for line in figure.axes[1].lines]
     colour = planner_styles(["carl"])["carl"].colour

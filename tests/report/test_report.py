@@ -16,7 +16,7 @@ from shiftsim.report.scores import (
     summary,
     worst_rollouts,
 )
-from shiftsim.report.writers import FORMATS, render
+from shiftsim.report.tables import FORMATS, render
 
 
 def test_the_score_is_the_plain_mean_of_the_scenarios(clean_run):

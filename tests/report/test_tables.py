@@ -4,15 +4,13 @@ import csv
 import io
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from made_runs import METRICS, random_scores, write_run
 
 from shiftsim.benchmarks import known_sets, published
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES, WEIGHTS
-from shiftsim.report.about import CITED, runs_table
-from shiftsim.report.build import TABLES, Options, make_tables, write_report
+from shiftsim.report.build import CITED, TABLES, Options, make_tables, runs_table, write_report
 from shiftsim.report.details import (
     edited_scores,
     planner_comparison,
@@ -22,11 +20,17 @@ from shiftsim.report.details import (
 from shiftsim.report.groups import KnownSet, read_groups, token_digest
 from shiftsim.report.paper import noise_robustness, published_semantic, semantic_shift
 from shiftsim.report.scores import score_table, scores, summary
-from shiftsim.report.tables import Number, Table, shown
+from shiftsim.report.tables import (
+    FORMATS,
+    Number,
+    Table,
+    latex_escape,
+    markdown_escape,
+    render,
+    shown,
+)
 from shiftsim.report.words import LONG
-from shiftsim.report.writers import FORMATS, latex_escape, markdown_escape, render
 from shiftsim.runs.diff import diff_lines, diff_runs
-from shiftsim.runs.results import open_run
 
 TOKENS = ("t0", "t1", "t2", "t3")
 
@@ -221,7 +225,7 @@ def test_degraded_steps_are_counted(tmp_path):
 def test_published_rows_stand_beside_own_ones_of_the_same_cities(tmp_path):
     cities = ("Sindelfingen", "Berlin", "München", "Stuttgart")
     run = write_run(tmp_path / "a", planners=("pdm-closed",), cities=cities)
-    (table,) = semantic_shift(read_groups([run]), published(), beside=True)
+    (table,) = semantic_shift(read_groups([run]), published(), with_published=True)
     own = cells(table, "NR", "pdm-closed")
     theirs = cells(table, "NR", "PDM-Closed (published)")
     assert table.header[4:8] == ("SIFI", "MUC", "STR", "BER")
@@ -231,7 +235,9 @@ def test_published_rows_stand_beside_own_ones_of_the_same_cities(tmp_path):
 
 
 def test_published_rows_stand_alone_where_the_cities_are_others(tmp_path):
-    tables = semantic_shift(read_groups([write_run(tmp_path / "a")]), published(), beside=True)
+    tables = semantic_shift(
+        read_groups([write_run(tmp_path / "a")]), published(), with_published=True
+    )
     assert [t.name for t in tables] == ["semantic-shift_made-up", "semantic-shift_published"]
     assert cells(tables[1], "R", "CaRL (published)")["SFO"] == "87.67"
 
@@ -460,15 +466,6 @@ def test_a_rollout_of_unknown_duration_withholds_every_class(tmp_path):
     table = scores(read_groups([run]))
     assert cells(table, "made-up, 8 s")["CLS"] == "– (2/3 done)"
     assert cells(table, "made-up, 15 s")["CLS"] == "– (1/2 done)"
-
-
-def test_runs_without_durations_are_read_as_before(tmp_path):
-    run = write_run(tmp_path / "a")
-    path = run.path / "scores.parquet"
-    pq.write_table(pq.read_table(path).drop_columns(["duration_class"]), path)
-    old = open_run(run.path)
-    assert old.scores["duration_class"].null_count == 4
-    assert score_table([old]) == score_table([write_run(tmp_path / "b")])
 
 
 def test_a_diff_of_different_durations_gives_no_mean(tmp_path):

@@ -6,12 +6,12 @@ from stores import write_toy_store
 from worlds import cruise_scenario
 
 from shiftsim.data.store.reading import ScenarioStore
+from shiftsim.edits.sampling import GRADES, HARDEST, KINDS, sample_edits
 from shiftsim.planners.basic.log_future import LogFuture
-from shiftsim.runs.edits.avoidable import Braking, grade, hits, is_avoidable
-from shiftsim.runs.edits.edited import EditedStore, make_edits
+from shiftsim.runs.avoidable import Braking, grade, hits, is_avoidable
+from shiftsim.runs.edited import EditedStore, make_edits
 from shiftsim.runs.scenarios import open_named_store
 from shiftsim.sim.loop import simulate
-from shiftsim.world.edits.sampling import GRADES, HARDEST, KINDS, sample_edits
 from shiftsim.world.state import VX, X
 
 SPEED = 10.0  # m/s

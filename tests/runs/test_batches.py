@@ -53,7 +53,7 @@ def test_the_scenarios_of_a_batch_share_their_passes(toy, tmp_path):
 
 def test_the_batch_size_does_not_matter_to_planners_that_know_no_batches(toy, tmp_path):
     values = {"planners": ["constant-velocity"], "store": str(toy), "workers": 1}
-    folders = [prepare(make_config({**values, "batch_size": size})).determining for size in (1, 16)]
+    folders = [prepare(make_config({**values, "batch_size": size})).fingerprint for size in (1, 16)]
     assert folders[0] == folders[1]
 
 

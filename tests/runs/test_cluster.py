@@ -116,7 +116,7 @@ def test_what_a_killed_worker_was_doing_is_done_by_another(cluster, toy, tmp_pat
 
 
 def test_a_scheduler_that_is_not_there_is_named(toy, tmp_path, monkeypatch):
-    monkeypatch.setattr("shiftsim.runs.cluster._CONNECT", 0.5)
+    monkeypatch.setattr("shiftsim.runs.workers._CONNECT", 0.5)
     config = settings(toy, tmp_path / "run", executor="dask", scheduler="tcp://127.0.0.1:9")
     with pytest.raises(ConfigError, match=r"no dask scheduler answers at 'tcp://127\.0\.0\.1:9'"):
         execute(prepare(config))

@@ -31,7 +31,7 @@ def test_settings_survive_as_plain_values():
         ({**GOOD, "seeds": [True]}, "must be a list of int", ""),
         ({**GOOD, "seeds": [-1]}, "from 0 on", ""),
         ({**GOOD, "limit": "3"}, "limit is '3'; it must be int", ""),
-        ({**GOOD, "limit": -3}, "cannot be negative", ""),
+        ({**GOOD, "limit": -3}, "must be within 0", ""),
         ({**GOOD, "allow_partial": 1}, "must be bool", ""),
         ({**GOOD, "save_rollouts": "al"}, "save_rollouts 'al' unknown", "did you mean 'all'?"),
         ({**GOOD, "planner_args": {"idn": {}}}, "'idn' unknown", "did you mean 'idm'?"),

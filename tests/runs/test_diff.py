@@ -70,8 +70,8 @@ def test_scores_that_differ_without_another_step_are_explained(runs, traffic, no
 def test_a_damaged_rollout_is_named(runs, monkeypatch):
     def damaged(run, task):
         rows = whole(run, task)
-        at = rows.schema.get_field_index("plan_steps")
-        long = pa.array([[7] * 100] * len(rows), rows["plan_steps"].type)
+        at = rows.schema.get_field_index("plan_dx_m")
+        long = pa.array([[7] * 100] * len(rows), rows["plan_dx_m"].type)
         return rows.set_column(at, rows.schema.field(at), long)
 
     whole = Run.rollout_rows
@@ -145,7 +145,7 @@ def test_the_quantity_that_differs_is_named(runs, toy, field, row, quantity):
     if field == "plans":
         log = replace(log, plans=np.zeros((len(log.time_us), 2, 3)))
     values = np.array(getattr(log, field))
-    step = 2e-3 if field == "plans" else 1e-9  # plans are stored in millimetres
+    step = 2.0 / 1024.0 if field == "plans" else 1e-9  # plans are rounded
     values[row].reshape(-1)[1] += step
     tables = [rollout_rows(one, with_tracks=True) for one in (log, replace(log, **{field: values}))]
     found = find_departure(*tables)

@@ -7,11 +7,12 @@ from commands import call
 
 import shiftsim
 from shiftsim.benchmarks import published
+from shiftsim.data.nuplan.filter import read_yaml
+from shiftsim.edits.interplan.codes import import_names
 from shiftsim.errors import ConfigError
-from shiftsim.report.data_tables import benchmark_comparison, own_statistics
+from shiftsim.report.dataset import benchmark_comparison, own_statistics
 from shiftsim.report.groups import read_groups
-from shiftsim.runs.edits.edited import EditedStore, edits_text, make_edits
-from shiftsim.runs.edits.interplan.codes import import_names
+from shiftsim.runs.edited import EditedStore, edits_text, make_edits
 from shiftsim.runs.scenarios import open_run_store
 
 EDITS = """
@@ -210,7 +211,7 @@ def test_interplans_files_are_imported(tmp_path):
     (tmp_path / "mods.yaml").write_text(MODIFICATIONS)
     done = call(tmp_path, "edits", "import", "names.yaml", "mods.yaml", "-o", "out.toml")
     assert done.returncode == 0, done.stderr
-    table = import_names(tmp_path / "names.yaml", tmp_path / "mods.yaml")
+    table = import_names(*(read_yaml(tmp_path / name) for name in ("names.yaml", "mods.yaml")))
     first, second = make_edits(table, "x").edits
     assert (first.name, first.tokens, first.window_s) == ("s0", ("a000000000000000",), 30.0)
     assert list(first.details["special_scenario"]) == ["0"]

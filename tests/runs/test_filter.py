@@ -17,8 +17,17 @@ import shiftsim
 from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.runs.filter import FilterConfig, filter_store, judge_scenario
-from shiftsim.runs.verdicts import AREA, COLLISION, OFF_ROUTE, STANDING, VERDICTS, read_verdicts
+from shiftsim.runs.filter import (
+    AREA,
+    COLLISION,
+    OFF_ROUTE,
+    RESULTS,
+    STANDING,
+    FilterConfig,
+    filter_store,
+    judge_scenario,
+    read_filter_results,
+)
 from shiftsim.world.state import AgentKind, Y
 
 
@@ -90,7 +99,7 @@ def test_verdicts_are_beside_the_scenarios_which_stay_as_they_were(store):
     assert open_store(store).hash == before
     assert found.counts()[STANDING] == found.counts()["dropped"] > 0
     assert check_store(store) == []
-    assert read_verdicts(store, before).rows == found.rows
+    assert read_filter_results(store, before).rows == found.rows
 
 
 def test_a_second_filter_has_nothing_to_do_unless_the_settings_changed(store):
@@ -106,7 +115,7 @@ def test_a_second_filter_has_nothing_to_do_unless_the_settings_changed(store):
 
 def test_a_killed_filter_goes_on_where_it_stopped(store):
     whole = filter_store(store, workers=1).path.read_bytes()
-    (store / VERDICTS).unlink()
+    (store / RESULTS).unlink()
 
     class Stop(Exception):
         pass
@@ -117,7 +126,7 @@ def test_a_killed_filter_goes_on_where_it_stopped(store):
 
     with pytest.raises(Stop):
         filter_store(store, workers=1, on_progress=stop_at_three)
-    assert not (store / VERDICTS).exists()
+    assert not (store / RESULTS).exists()
     unfinished = store / "filter/unfinished.sqlite"
     assert unfinished.exists()
     calls = []
@@ -194,8 +203,8 @@ def test_a_killed_command_goes_on_with_other_workers_to_the_same_bytes(tmp_path)
     assert kept
     counts = json.loads(done.stdout)["counts"]
     assert (counts["accepted"] + counts["dropped"], counts["failed"]) == (40, 0)
-    resumed = (store / VERDICTS).read_bytes()
-    (store / VERDICTS).unlink()
+    resumed = (store / RESULTS).read_bytes()
+    (store / RESULTS).unlink()
     alone = filter_store(store, workers=1)
     assert alone.path.read_bytes() == resumed
     assert [row["token"] for row in alone.rows] == list(open_store(store).tokens)

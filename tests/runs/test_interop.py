@@ -64,7 +64,7 @@ def test_other_readers_open_rollouts(clean_run, reader):
     else:
         table = module.read_parquet(path)
     assert [float(x) for x in table["x_m"].to_numpy()] == expected["x_m"].to_pylist()
-    assert len(table["plan_steps"][0]) == len(expected["plan_steps"][0])
+    assert len(table["plan_dx_m"][0]) == len(expected["plan_dx_m"][0])
 
 
 def test_grouping_with_arrow_gives_the_same_means(clean_run):

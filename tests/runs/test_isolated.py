@@ -1,7 +1,7 @@
 """Planners in processes of their own: the same scores, and their ends cost one task."""
 
-import io
 import sys
+from multiprocessing import Pipe
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +55,7 @@ def test_whatever_happens_there_is_the_planner_s_error_and_costs_one_task(toy, t
     run = drive(toy, tmp_path / "run", "drivers:Odd", planner_args=arguments, isolate=True)
     tasks = {odd[task["token"]]: task for task in run.tasks.to_pylist()}
     assert {what: task["error"] for what, task in tasks.items()} == {
-        "exits": "the process of planner 'drivers:Odd' ended with code 7",
+        "exits": "the process of planner 'drivers:Odd' ended with exit code 7",
         "raises": "KeyError: 'lane'",
         "leaves": "SystemExit: 3",
         "none": "iteration 3: plan() returned NoneType, not a Trajectory or a Command",
@@ -64,12 +64,12 @@ def test_whatever_happens_there_is_the_planner_s_error_and_costs_one_task(toy, t
 
 
 def sent(value, **classes):
-    stream = io.BytesIO()
-    stub.write(stream, value)
-    stream.seek(0)
-    found = stub.read(stream, classes)
-    assert stream.read() == b""
-    return found
+    ours, theirs = Pipe()
+    with ours, theirs:
+        stub.write(ours, value)
+        found = stub.read(theirs, classes)
+        assert not theirs.poll()
+        return found
 
 
 def test_what_is_sent_arrives_bit_by_bit_and_read_only():

@@ -1,7 +1,6 @@
 """A planner that leaves the process, wherever it does, costs a task or is refused; never a run."""
 
 import asyncio
-import subprocess
 import sys
 
 import pytest
@@ -58,37 +57,10 @@ def test_a_planner_that_leaves_fails_its_task(toy, tmp_path, error, method):
     assert type(error).__name__ in row["error"]
 
 
-FORKS = """
-import os
-from shiftsim.planners.basic.constant_velocity import ConstantVelocity
-
-class Mine(ConstantVelocity):
-    def reset(self, scene):
-        super().reset(scene)
-        child = os.fork()
-        if child == 0:
-            os._exit(7)
-        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
-        if scene.token == "0001cafe":
-            os._exit(0)
-"""
-
-
-def test_a_planner_that_exits_at_once_fails_its_task_and_its_children_may(toy, tmp_path):
-    (tmp_path / "forks.py").write_text(FORKS)
-    words = ["-p", "forks:Mine", "-s", toy, "--workers", "1", "--out", "run", "--quiet"]
-    command = [sys.executable, "-m", "shiftsim", "run", *map(str, words)]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 3, done.stderr
-    assert "SystemExit: os._exit(0)" in done.stdout + done.stderr
-    counts = shiftsim.open_run(tmp_path / "run").manifest["counts"]
-    assert (counts["ok"], counts["failed"]) == (3, 1)
-
-
 @pytest.mark.parametrize(
     ("place", "code", "text"),
     [
-        (0, 1, "it leaves with SystemExit: 0"),
+        (0, 1, "cannot be imported (SystemExit: 0"),
         (1, 1, "cannot be made: SystemExit: 0"),
         (2, 0, "results: run"),
     ],

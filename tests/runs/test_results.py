@@ -1,10 +1,7 @@
 """What a run folder holds can be read back, and scored again."""
 
-import shutil
-
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 import shiftsim
@@ -13,7 +10,6 @@ from shiftsim.errors import ConfigError, DataError
 from shiftsim.planners.registry import load_planner
 from shiftsim.runs.config import make_config
 from shiftsim.runs.derive import rescore
-from shiftsim.runs.results import open_run
 from shiftsim.runs.rollouts import Task, complete_rollout
 from shiftsim.runs.rollouts.columns import STATES, decode_rows, encode_rows, rollout_rows
 from shiftsim.runs.task import score_rollout
@@ -124,17 +120,6 @@ def test_rescoring_needs_stored_rollouts(toy, tmp_path):
     )
     with pytest.raises(DataError, match="holds no rollouts for 1 of 1 tasks"):
         rescore(run, thresholds="deepplan", out=str(tmp_path / "again"))
-
-
-@pytest.mark.parametrize("column", ["rollout_row", "rollout_rows"])
-def test_a_rollout_without_a_place_is_named(clean_run, tmp_path, column):
-    shutil.copytree(clean_run.path, tmp_path / "run")
-    file = tmp_path / "run" / "tasks.parquet"
-    tasks = pq.read_table(file)
-    at = tasks.column_names.index(column)
-    pq.write_table(tasks.set_column(at, column, pa.nulls(len(tasks), tasks[column].type)), file)
-    with pytest.raises(DataError, match=r"tasks\.parquet.*is empty where 'rollout' is 'part-"):
-        open_run(tmp_path / "run").rollout_rows(KEY)
 
 
 def test_the_manifest_says_what_the_run_depended_on(clean_run, toy):

@@ -17,8 +17,9 @@ from shiftsim.runs.execute import execute
 from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.journal import Journal
 from shiftsim.runs.prepare import prepare
-from shiftsim.runs.results import JOURNAL, TaskResult
+from shiftsim.runs.results import JOURNAL
 from shiftsim.runs.rollouts import Task
+from shiftsim.runs.tables import TaskResult
 from shiftsim.runs.task import Batch
 from shiftsim.runs.workers import Outcome
 
@@ -102,14 +103,6 @@ def test_what_a_power_failure_took_is_made_again(stopped, toy, undisturbed, cut)
     assert content(run) == content(undisturbed)
     for task in undisturbed.rollout_places:
         assert run.rollout_rows(task)["x_m"] == undisturbed.rollout_rows(task)["x_m"]
-
-
-def test_an_unfinished_run_of_an_earlier_version_is_not_gone_on_with(stopped, toy):
-    (stopped / "unfinished.jsonl").write_text("{}")
-    for resume in (False, True):
-        with pytest.raises(ConfigError, match="of an earlier version") as caught:
-            prepare(settings(toy, stopped, resume=resume, **NOISY))
-        assert "run again" in caught.value.hint
 
 
 def test_halves_of_files_that_a_killed_process_leaves_do_no_harm(stopped, toy, undisturbed):
@@ -259,30 +252,6 @@ def test_a_full_disk_keeps_what_is_finished(toy, tmp_path, undisturbed, monkeypa
     assert content(run) == content(undisturbed)
 
 
-@pytest.mark.parametrize(
-    ("kept", "free", "message"),
-    [
-        ("all", 500e3, r"12 tasks need about 0\.0 GB, '.*' has 0\.0 GB free"),
-        ("none", 50e3, "12 tasks need about"),
-        ("none", 500e3, ""),
-        ("all", 2e6, ""),
-    ],
-)
-def test_a_run_that_the_disk_cannot_hold_is_refused(
-    toy, tmp_path, monkeypatch, kept, free, message
-):
-    usage = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=free))
-    config = settings(toy, tmp_path / "not" / "yet" / "run", save_rollouts=kept, **NOISY)
-    if not message:
-        prepare(config)
-        return
-    with pytest.raises(ConfigError, match=message) as caught:
-        prepare(config)
-    assert ("--save-rollouts failed" in caught.value.hint) == (kept == "all")
-    assert not (tmp_path / "not").exists()
-
-
 def test_a_result_that_does_not_fit_on_the_disk_is_taken_back(tmp_path):
     writer = RunWriter(tmp_path / "run", {"format": 3})
     writer.add(TaskResult(Task("p", "none", 0, "a"), "ok", rollout=b"some bytes of a rollout"))
@@ -324,9 +293,9 @@ def test_an_output_that_cannot_be_written_is_one_error(toy, tmp_path):
 
 
 def test_a_worker_that_died_is_told_from_one_that_was_late():
-    from shiftsim.runs.execute import ended
+    from shiftsim.runs.execute import results_of
 
     task = Task("p", "none", 0, "a")
-    (died,) = ended(Outcome(Batch((task,)), None, "worker process killed by SIGKILL"))
-    (late,) = ended(Outcome(Batch((task,)), None, "took longer than 2 s", is_late=True))
+    (died,) = results_of(Outcome(Batch((task,)), None, "worker process killed by SIGKILL"))
+    (late,) = results_of(Outcome(Batch((task,)), None, "took longer than 2 s", is_late=True))
     assert (died.status, late.status) == ("failed", "timeout")

@@ -14,24 +14,24 @@ from hypothesis import strategies as st
 
 from shiftsim.errors import DataError
 from shiftsim.runs.folder import RunWriter
-from shiftsim.runs.results import TaskResult
+from shiftsim.runs.results import FORMAT_VERSION
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.rollouts import files as rollout_files
 from shiftsim.runs.rollouts.columns import (
-    STATES,
     TRACKS,
     encode_rows,
+    rollout_rows,
     stored_plans,
     stored_tracks,
-    track_columns,
 )
 from shiftsim.runs.rollouts.files import PartWriter, Place, RolloutReader, without_key
-from shiftsim.sim.log import pack_plans, unpack_plans
+from shiftsim.runs.tables import TaskResult
+from shiftsim.sim.log import SimulationLog
+from shiftsim.world.state import Tracks, TrafficLights
 
-TRACK_WIDTHS = {"track_poses": 3, "track_velocities": 2, "track_sizes": 2}
-FLOATS = pa.list_(pa.field("item", pa.float64(), nullable=False))
+TRACK_WIDTHS = {"poses": 3, "velocities": 2, "sizes": 2}
 MANIFEST = {
-    "format": 4,
+    "format": FORMAT_VERSION,
     "state": "finished",
     **{"split": "s", "store": "s", "config": {"planners": []}, "counts": {}},
     "determining": {
@@ -42,39 +42,29 @@ MANIFEST = {
 }
 
 
+def tracks_of(valid, numbers):
+    """Tracks that are there where valid (K, N), with poses, velocities and sizes."""
+    tokens = tuple(f"track {number}" for number in range(valid.shape[1]))
+    return Tracks(valid, *numbers, np.zeros(valid.shape[1], np.int64), tokens)
+
+
+def log_of(ego, plans, tracks):
+    """A log of nothing but these."""
+    count = len(ego)
+    pairs, zeros = np.zeros((count, 2)), np.zeros(count)
+    lights, whole = TrafficLights.empty(count), np.arange(count)
+    rest = pairs, pairs, plans, zeros, zeros.astype(np.bool_)
+    return SimulationLog("", whole, ego, tracks, lights, whole, ego, (), *rest)
+
+
 def made_up(length, *, value=0.0, tracks=None):
     """A rollout of so many samples, with so many tracks."""
-    columns = []
-    for field in STATES:
-        if pa.types.is_list(field.type):
-            items = pa.array([value] * 54).cast(field.type.value_type)
-            columns.append(pa.array([items] * length, field.type))
-        else:
-            columns.append(pa.array([value] * length).cast(field.type))
-    if tracks is None:
-        return pa.RecordBatch.from_arrays(columns, schema=STATES)
     rng = np.random.default_rng(length)
-    valid = rng.random((length, tracks)) < 0.7
+    valid = rng.random((length, tracks or 0)) < 0.7
     numbers = (rng.normal(value, 1.0, (*valid.shape, width)) for width in TRACK_WIDTHS.values())
-    columns += track_columns(valid, numbers)
-    return pa.RecordBatch.from_arrays(columns, schema=pa.schema([*STATES, *TRACKS]))
-
-
-def as_before(rows, plans):
-    """A rollout as older versions stored it: with plans (K, P, 3), or as the last one if None."""
-    columns = {name: rows[name] for name in STATES.names}
-    if plans is not None:
-        columns["planning_seconds"] = columns["planning_seconds"].cast(pa.float64())
-        columns.pop("plan_steps")
-        columns["plan_poses"] = pa.array(list(plans.reshape(len(rows), -1)), FLOATS)
-    if "track_valid" in rows.schema.names:
-        columns["track_valid"] = rows["track_valid"]
-        tracks = stored_tracks(rows)
-        for name in TRACK_WIDTHS:
-            values = tracks[name.removeprefix("track_")].reshape(len(rows), -1)
-            columns[name] = pa.array(list(values), FLOATS)
-    fields = [pa.field(name, column.type, nullable=False) for name, column in columns.items()]
-    return pa.RecordBatch.from_arrays(list(columns.values()), schema=pa.schema(fields))
+    plans = rng.normal(value, 1.0, (length, 18, 3))
+    log = log_of(np.full((length, 11), value), plans, tracks_of(valid, numbers))
+    return rollout_rows(log, with_tracks=tracks is not None)
 
 
 def key(number):
@@ -230,77 +220,65 @@ def test_the_rollouts_of_a_scenario_lie_together(tmp_path):
     ]
 
 
-@pytest.mark.parametrize("poses", [11, 18])
-@pytest.mark.parametrize("tracks", [None, 0, 2])
-def test_rollouts_of_versions_before_are_read_and_kept_beside_new_ones(tmp_path, poses, tracks):
-    rows = made_up(5, tracks=tracks)
-    plans = np.linspace(0.0, 30.0, 5 * poses * 3).reshape(5, poses, 3)
-    plans[3, 4:] = np.nan
-    writer = PartWriter(tmp_path)
-    old = writer.add(key(0), as_before(rows, plans))
-    writer.close()
-    assert "plan_poses" in pq.read_schema(old.file).names
-    found = without_key(RolloutReader().read(old))
-    assert found.schema == rows.schema
-    assert found.drop_columns(["plan_steps"]).equals(rows.drop_columns(["plan_steps"]))
-    expected = np.full((5, 18, 3), np.nan)
-    expected[:, :poses] = plans
-    np.testing.assert_allclose(stored_plans(found), expected, rtol=0.0, atol=0.501e-3)
-    both = [writer.add(key(1), found), writer.add(key(2), rows)]
-    writer.close()
-    reader = RolloutReader()
-    assert without_key(reader.read(both[0])).equals(found)
-    assert without_key(reader.read(both[1])).equals(rows)
-
-
-def test_tracks_of_the_version_before_are_read(tmp_path):
-    rows = made_up(5, tracks=3)
-    writer = PartWriter(tmp_path)
-    old = writer.add(key(0), as_before(rows, None))
-    writer.close()
-    assert {*TRACK_WIDTHS, "plan_steps"} <= {*pq.read_schema(old.file).names}
-    assert without_key(RolloutReader().read(old)).equals(rows)
-
-
 @given(st.integers(1, 6), st.integers(0, 5), st.integers(0, 2**32))
 def test_tracks_come_back_bit_by_bit(length, tracks, seed):
     rng = np.random.default_rng(seed)
     valid = rng.random((length, tracks)) < rng.choice([0.0, 0.5, 1.0])
     bits = [rng.integers(0, 2**64, (*valid.shape, w), np.uint64) for w in TRACK_WIDTHS.values()]
-    columns = track_columns(valid, (values.view(np.float64) for values in bits))
-    found = stored_tracks(pa.RecordBatch.from_arrays(columns, schema=TRACKS))
+    given_tracks = tracks_of(valid, [values.view(np.float64) for values in bits])
+    log = log_of(np.zeros((length, 11)), np.full((length, 18, 3), np.nan), given_tracks)
+    found = stored_tracks(rollout_rows(log, with_tracks=True), given_tracks.tokens)
     assert np.array_equal(found["valid"], valid)
     for name, values in zip(TRACK_WIDTHS, bits, strict=True):
-        stored = found[name.removeprefix("track_")]
-        assert stored.shape == values.shape
-        assert np.array_equal(stored[valid].view(np.uint64), values[valid])
-        assert np.isnan(stored[~valid]).all()
+        assert found[name].shape == values.shape
+        assert np.array_equal(found[name][valid].view(np.uint64), values[valid])
+        assert np.isnan(found[name][~valid]).all()
 
 
-@pytest.mark.parametrize("name", [name for name in TRACKS.names if name != "track_valid"])
+@pytest.mark.parametrize("name", TRACKS.names[1:])
 def test_a_rollout_that_lacks_boxes_is_refused(name):
     rows = made_up(5, tracks=2)
     at = rows.schema.get_field_index(name)
     lacking = pa.array([rows[name][0].as_py()[:1], *[[]] * 4], rows[name].type)
-    with pytest.raises(ValueError, match=f"'{name}' has 1 of"):
-        stored_tracks(rows.set_column(at, rows.schema.field(at), lacking))
+    spoilt = rows.set_column(at, rows.schema.field(at), lacking)
+    with pytest.raises(ValueError, match=f"the lists of '{name}' are too short"):
+        stored_tracks(spoilt, ["track 0", "track 1"])
+
+
+def test_tracks_of_another_scenario_are_refused():
+    with pytest.raises(ValueError, match="tracks that the scenario has not"):
+        stored_tracks(made_up(5, tracks=2), ["track 0"])
 
 
 @given(
     st.lists(st.integers(0, 18), min_size=1, max_size=6),
     st.floats(-1e5, 1e5),
-    st.floats(-1.9e5, 1.9e5),
+    st.floats(-1.0e4, 1.0e4),
 )
-def test_plans_are_rounded_and_nothing_else(lengths, place, size):
+def test_plans_are_offsets_in_single_precision(lengths, place, size):
     ego = np.full((len(lengths), 11), place)
     plans = place + size * np.sin(np.arange(len(lengths) * 54.0)).reshape(-1, 18, 3)
-    plans[..., 2] = np.sin(plans[..., 2]) * 3.2 + place
     for plan, length in zip(plans, lengths, strict=True):
         plan[length:] = np.nan
-    back = unpack_plans(*pack_plans(plans, ego), ego)
-    np.testing.assert_array_equal(np.isnan(back), np.isnan(plans))
-    away = np.abs(np.nan_to_num(back - plans))
-    assert away[..., :2].max() < 0.5001e-3
-    assert away[..., 2].max() < 0.5001e-4
-    again = unpack_plans(*pack_plans(back, ego), ego)
-    np.testing.assert_array_equal(again, back)
+    log = log_of(ego, plans, Tracks.empty(len(ego)))
+    back = stored_plans(rollout_rows(log, with_tracks=False))
+    offsets = (plans - ego[:, None, :3]).astype(np.float32)
+    np.testing.assert_array_equal(back, ego[:, None, :3] + offsets.astype(np.float64))
+
+
+def test_pandas_polars_and_duckdb_read_rollouts_as_they_are(tmp_path):
+    duckdb, pandas, polars = map(pytest.importorskip, ("duckdb", "pandas", "polars"))
+    writer = PartWriter(tmp_path)
+    rows = [made_up(4, value=2.0, tracks=3), made_up(6, value=5.0, tracks=3)]
+    for number, each in enumerate(rows):
+        place = writer.add(key(number), each)
+    writer.close()
+    found = pandas.read_parquet(place.file)
+    assert found.x_m.tolist() == [2.0] * 4 + [5.0] * 6
+    second = found[found.token == "0001"]
+    assert [list(one) for one in second.track_x_m] == rows[1]["track_x_m"].to_pylist()
+    query = f"select unnest(track_tokens) as track, unnest(track_x_m) from '{place.file}'"
+    boxes = sum(len(one) for each in rows for one in each["track_x_m"].to_pylist())
+    assert len(duckdb.sql(query).fetchall()) == boxes
+    columns = ["track_tokens", "track_x_m"]
+    assert polars.read_parquet(place.file, columns=columns).explode(columns).height == boxes

@@ -145,7 +145,7 @@ def test_a_run_says_where_its_data_was_made_up(toy, capsys, monkeypatch):
     main_of = prepare.prepare
     for generator in ({}, {"name": "towns", "seed": 1, "towns": 300}):
         monkeypatch.setattr(
-            prepare, "prepare", lambda config, g=generator: replace(main_of(config), generator=g)
+            prepare, "prepare", lambda config, g=generator: replace(main_of(config), provenance=g)
         )
         with pytest.raises(SystemExit):
             main(["run", *words])

@@ -74,7 +74,7 @@ def test_missing_shards_are_named(shards, tmp_path):
 
 
 def test_a_shard_given_twice_is_named(shards, tmp_path):
-    with pytest.raises(ConfigError, match="are both shard 1/3"):
+    with pytest.raises(ConfigError, match="shard 1/3 is there twice"):
         merge_runs([*shards, shards[0]], out=str(tmp_path / "merged"))
 
 

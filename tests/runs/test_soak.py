@@ -17,8 +17,8 @@ import shiftsim
 from shiftsim.data.store.reading import _OPEN_FILES
 
 PLANNERS = ("constant-velocity", "idm", "log-future", "pdm-closed")
-# a worker keeps as many open: frames and tracks of recordings, and egos
-FILES = 3 * _OPEN_FILES
+# a worker keeps as many open: frames, lights and tracks of recordings, and egos
+FILES = 4 * _OPEN_FILES
 WORKERS = int(os.environ.get("SOAK_WORKERS", "2"))
 
 

@@ -3,8 +3,13 @@
 import pytest
 
 from shiftsim.errors import ConfigError
-from shiftsim.runs.filter import choose_scenarios, write_split
-from shiftsim.runs.scenarios import find_split, read_split, token_hash
+from shiftsim.runs.scenarios import (
+    choose_scenarios,
+    find_split,
+    read_split,
+    token_hash,
+    write_split,
+)
 
 TOKENS = ("a1", "b2", "c3")
 

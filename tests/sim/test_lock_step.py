@@ -255,7 +255,7 @@ class Fails(ConstantVelocity):
         return super().plan(observation)
 
 
-class Broken(LogReplay):
+class ConversionFailure(LogReplay):
     """Fails in the sixth step."""
 
     def step(self, iteration, ego, tracks, row):
@@ -265,7 +265,7 @@ class Broken(LogReplay):
 
 def test_planners_without_a_network_and_traffic_that_fails_end_their_own_rollout_only():
     scenes = [scene(number) for number in range(3)]
-    models = [LogReplay(), Broken(), LogReplay()]
+    models = [LogReplay(), ConversionFailure(), LogReplay()]
     planners = [ConstantVelocity(), ConstantVelocity(), Fails()]
     rollouts = [Rollout(s, p, traffic=t) for s, p, t in zip(scenes, planners, models, strict=True)]
     first, second, third = simulate_together(rollouts)

@@ -12,7 +12,7 @@ from shiftsim.sim import loop
 from shiftsim.sim.dynamics.bicycle import command_and_step
 from shiftsim.sim.loop import DEFAULT, Rollout, simulate, simulate_together
 from shiftsim.sim.noise import NoiseModel
-from shiftsim.world.script import Finish, Script
+from shiftsim.world.events import RolloutEvents, TerminationCondition
 from shiftsim.world.state import NUM_STATE, VX, Command, Trajectory, X
 
 
@@ -136,7 +136,7 @@ def test_an_unknown_controller_is_refused():
         simulate(cruise_scenario(), Recorder(), controller="ilqr")
 
 
-class Broken(Recorder):
+class ConversionFailure(Recorder):
     """Returns a plan that ends before the next step."""
 
     def plan(self, observation):
@@ -145,7 +145,7 @@ class Broken(Recorder):
 
 def test_a_plan_that_ends_before_the_next_step_is_refused():
     with pytest.raises(InvalidTrajectoryError):
-        simulate(cruise_scenario(), Broken())
+        simulate(cruise_scenario(), ConversionFailure())
 
 
 def test_registered_planners_drive(rng):
@@ -300,7 +300,7 @@ def test_only_the_first_plan_is_doubted(strange):
 
     rollout = Rollout(cruise_scenario(iterations=5), Elsewhere())
     loop.drive(rollout)
-    assert ("42 m away" in rollout.doubt) == (strange == 0)
+    assert ("42 m away" in rollout.warning) == (strange == 0)
 
 
 def test_a_doubt_is_told_where_the_user_calls():
@@ -317,8 +317,8 @@ def test_a_doubt_is_told_where_the_user_calls():
 
 @pytest.mark.parametrize(("progress", "samples"), [(20.0, 12), (20.5, 13), (500.0, 19)])
 def test_a_rollout_ends_one_sample_after_the_ego_has_reached_the_finish(progress, samples):
-    finish = Finish(np.array([[0.0, 0.0], [600.0, 0.0]]), progress)
-    script = Script("a", "b", "c", (), (), np.zeros(0, np.int64), finish=finish)
+    finish = TerminationCondition(np.array([[0.0, 0.0], [600.0, 0.0]]), progress)
+    script = RolloutEvents("a", "b", "c", (), (), np.zeros(0, np.int64), termination=finish)
     scenario = replace(cruise_scenario(iterations=20), script=script)
     log = simulate(scenario, Recorder(), controller="perfect")
     assert len(log.ego) == samples  # 0.8 m each, from 11.461 m on

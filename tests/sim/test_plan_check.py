@@ -1,8 +1,9 @@
+import re
+
 import numpy as np
 import pytest
 
-from shiftsim.errors import InvalidTrajectoryError
-from shiftsim.sim.plan_check import validate_plan
+from shiftsim.sim.plan_check import find_fault
 from shiftsim.world.state import NUM_STATE, Command, Trajectory
 
 NOW, NEXT = 1_600_000_000_000_000, 1_600_000_000_100_000
@@ -23,7 +24,7 @@ def trajectory(times_us, relative=True) -> Trajectory:
     ],
 )
 def test_plans_that_cover_the_next_step_are_accepted(plan):
-    validate_plan(plan, NOW, NEXT)
+    assert find_fault(plan, NOW, NEXT) is None
 
 
 @pytest.mark.parametrize(
@@ -46,13 +47,12 @@ def test_plans_that_cover_the_next_step_are_accepted(plan):
     ],
 )
 def test_a_plan_that_cannot_be_executed_says_why(plan, message):
-    with pytest.raises(InvalidTrajectoryError, match=message) as caught:
-        validate_plan(plan, NOW, NEXT)
-    assert caught.value.hint
+    fault = find_fault(plan, NOW, NEXT)
+    assert re.search(message, fault.message)
+    assert fault.hint
 
 
 def test_a_value_that_is_not_finite_is_named_with_its_column_and_row():
     plan = trajectory([0, 100_000, 200_000])
     plan.states[1, 2] = np.nan
-    with pytest.raises(InvalidTrajectoryError, match="heading of state 1 is nan"):
-        validate_plan(plan, NOW, NEXT)
+    assert "heading of state 1 is nan" in find_fault(plan, NOW, NEXT).message

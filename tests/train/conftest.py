@@ -15,7 +15,7 @@ SMALL = {
 @pytest.fixture
 def small(toy, tmp_path):
     """Makes the settings of a training that takes seconds."""
-    from shiftsim.train.settings import Settings
+    from shiftsim.train.folder import Settings
 
     def make(name="out", **changes):
         return Settings(store=str(toy), out=tmp_path / name, **(SMALL | changes))
@@ -26,8 +26,8 @@ def small(toy, tmp_path):
 @pytest.fixture(scope="session")
 def trained(toy, tmp_path_factory):
     """Such a training, done, and what it said."""
+    from shiftsim.train.folder import Settings
     from shiftsim.train.recipe import Training
-    from shiftsim.train.settings import Settings
 
     settings = Settings(store=str(toy), out=tmp_path_factory.mktemp("trained") / "out", **SMALL)
     lines = []

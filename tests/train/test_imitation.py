@@ -10,20 +10,31 @@ from shiftsim.planners.learned.carl.network import CarlNetwork, Policy
 from shiftsim.planners.learned.carl.planner import MAX_STEERING, command_of, measure
 from shiftsim.sim.loop import Setting, simulate
 from shiftsim.sim.planner import observe_log, scene_info
-from shiftsim.train import network as fast
-from shiftsim.train.expert import Expert, encode, hold
+from shiftsim.train.driving import Expert, brake_at_stand, encode_action
 from shiftsim.train.learning import (
     BATCH,
     LATE,
     MIRRORED,
+    UNITS,
     Learner,
     draw_batch,
+    from_official,
     log_density,
     loss_of,
     schedule,
+    to_official,
 )
-from shiftsim.train.pictures import blocks_of, packed, unpacked
-from shiftsim.train.states import State, States, importance, read_part, write_part
+from shiftsim.train.states import (
+    MIRRORED_ACTION,
+    State,
+    States,
+    compress_raster,
+    importance,
+    mirror_measurements,
+    read_part,
+    read_raster,
+    write_part,
+)
 
 
 @pytest.mark.parametrize(
@@ -39,13 +50,13 @@ from shiftsim.train.states import State, States, importance, read_part, write_pa
     ],
 )
 def test_a_label_asks_for_the_acceleration_and_the_angle_after_tau(command, steering, action):
-    assert encode(*command, steering, 0.3) == pytest.approx(np.float32(action), abs=1e-7)
+    assert encode_action(*command, steering, 0.3) == pytest.approx(np.float32(action), abs=1e-7)
 
 
 def test_with_a_tau_of_one_step_a_label_is_the_command_of_the_tracker():
     ego = np.zeros(11)
     ego[3], ego[7] = 5.0, 0.02
-    found = command_of(encode(-0.7, 0.11, ego[7], 0.1), ego)
+    found = command_of(encode_action(-0.7, 0.11, ego[7], 0.1), ego)
     assert found.acceleration == pytest.approx(-0.7, rel=1e-5)
     assert found.steering_rate == pytest.approx(0.11, rel=1e-4)
 
@@ -56,7 +67,7 @@ def test_with_a_tau_of_one_step_a_label_is_the_command_of_the_tracker():
 )
 def test_who_is_to_stand_is_taught_to_brake(throttle, speed, held):
     action = np.array([throttle, 0.1], np.float32)
-    np.testing.assert_allclose(hold(action, speed), [held, 0.1], rtol=1e-6)
+    np.testing.assert_allclose(brake_at_stand(action, speed), [held, 0.1], rtol=1e-6)
 
 
 def test_the_expert_does_what_pdm_closed_and_the_tracker_do():
@@ -80,61 +91,44 @@ def rasters(random, count):
 
 
 def measurements(random, count):
-    return (random.normal(size=(count, 10)) * fast.UNITS).astype(np.float32)
+    return (random.normal(size=(count, 10)) * UNITS).astype(np.float32)
 
 
 def test_a_raster_is_kept_without_loss(rng):
     (raster,) = rasters(rng, 1)
-    assert np.array_equal(unpacked(packed(raster)), raster)
+    assert np.array_equal(read_raster(compress_raster(raster)), raster)
 
 
-def test_the_fast_network_is_that_of_the_planner(rng):
-    torch.manual_seed(0)
+def test_units_are_taken_into_the_first_layer_and_out_of_it(rng):
     network, official = CarlNetwork(), CarlNetwork()
-    official.load_state_dict(fast.to_official(network.state_dict()))
-    pictures, measured = rasters(rng, 8), torch.from_numpy(measurements(rng, 8))
+    official.load_state_dict(to_official(network.state_dict()))
+    pictures, measured = torch.from_numpy(rasters(rng, 2)), measurements(rng, 2)
     with torch.no_grad():
-        slow = official(torch.from_numpy(pictures), measured).action
-        laid = fast.lay_out(network)
-        found = fast.forward(laid, fast.tensor_of(blocks_of(pictures, [False] * 8)), measured)
-    assert found.action.numpy() == pytest.approx(slow.numpy(), abs=0.01)
-    assert slow.std(0).min() > 0.01
-
-
-def test_units_are_taken_in_and_out():
-    state = CarlNetwork().state_dict()
-    there = fast.from_official(fast.to_official(state))
-    for name, value in state.items():
-        assert torch.allclose(there[name], value)
+        wanted = network(pictures, torch.from_numpy(measured / UNITS)).action
+        found = official(pictures, torch.from_numpy(measured)).action
+    assert found.numpy() == pytest.approx(wanted.numpy(), abs=1e-5)
+    restored = from_official(official.state_dict())
+    for name, value in network.state_dict().items():
+        assert torch.allclose(restored[name], value)
 
 
 def test_a_mirrored_raster_is_that_of_the_mirrored_world(rng):
     frame = np.array([0.0, 0.0, 1.0, 0.0])
     left, right = np.zeros((2, 9, 256, 256), np.uint8)
     for raster, sign in ((left, 1.0), (right, -1.0)):
-        scratch = np.zeros((4, 2), np.int64)
         box = (10.3, sign * 7.21, sign * 0.4, 4.6, 2.1)
-        draw_box(raster[view.VEHICLES], frame, box, scratch)
-    mirrored, straight = blocks_of([left], [True]), blocks_of([right], [False])
+        view.draw_box(raster[view.VEHICLES], frame, *box, 200)
     # the corners of a box are cut to whole pixels, of which some lie one aside
-    assert (mirrored != straight).sum() <= 8
-    assert (mirrored != 0).sum() > 40
-    assert np.array_equal(blocks_of([left[:, ::-1].copy()], [False]), mirrored)
-
-
-def draw_box(raster, frame, box, ring):
-    from shiftsim.planners.learned.carl.raster import make_crossings
-
-    scratch = view.Scratch(ring, make_crossings(256, 4), np.zeros(1, bool), np.zeros(1, bool))
-    view.draw_box(raster, frame, *box, 200, scratch)
+    assert (left[:, ::-1] != right).sum() <= 8
+    assert (right != 0).sum() > 40
 
 
 def test_mirrored_measurements_are_those_of_the_mirrored_ego(rng):
     ego = rng.normal(size=11)
     mirrored = ego * [1, -1, -1, 1, -1, 1, -1, -1, -1, -1, -1]
     action = np.float32([0.3, 0.2])
-    found = fast.mirrored_measurements(measure(ego, action))
-    other = measure(mirrored, action * fast.MIRRORED_ACTION)
+    found = mirror_measurements(measure(ego, action))
+    other = measure(mirrored, action * MIRRORED_ACTION)
     assert found == pytest.approx(other, abs=1e-5)
 
 
@@ -184,7 +178,12 @@ def test_the_learning_rate_rises_and_falls():
 @pytest.fixture
 def states(tmp_path, rng):
     found = [
-        State(packed(raster), measured, rng.uniform(-1, 1, 2).astype(np.float32), number % 5 == 0)
+        State(
+            compress_raster(raster),
+            measured,
+            rng.uniform(-1, 1, 2).astype(np.float32),
+            number % 5 == 0,
+        )
         for number, (raster, measured) in enumerate(
             zip(rasters(rng, 24), measurements(rng, 24), strict=True)
         )
@@ -193,7 +192,9 @@ def states(tmp_path, rng):
     write_part(tmp_path / "round-01", found[10:])
     made = States([read_part(tmp_path / f"round-0{number}") for number in range(2)])
     for index, state in enumerate(found):
-        assert np.array_equal(made.picture(index), unpacked(state.picture))
+        raster = read_raster(state.picture)
+        both = made.rasters(np.array([index, index]), [False, True])
+        assert np.array_equal(both, [raster, raster[:, ::-1]])
         assert np.array_equal(made.actions[index], state.action)
     return made
 
@@ -212,7 +213,7 @@ def test_rare_states_are_drawn_more_often(states):
 def test_a_batch_hides_last_actions_and_mirrors_with_the_sign_of_steering(states):
     batch = draw_batch(states, (1, 2), size=4000)
     plain = states.actions[batch.indices]
-    flipped = np.where(batch.mirrored[:, None], fast.MIRRORED_ACTION, np.float32([1, 1]))
+    flipped = np.where(batch.mirrored[:, None], MIRRORED_ACTION, np.float32([1, 1]))
     assert np.array_equal(batch.actions, plain * flipped)
     assert batch.mirrored.mean() == pytest.approx(MIRRORED, abs=0.05)
     hidden = (batch.measurements[:, :2] == 0.0).all(axis=1)

@@ -6,10 +6,9 @@ import torch
 
 from shiftsim.data.store.reading import open_store
 from shiftsim.planners.learned.carl.network import CarlNetwork, Policy
-from shiftsim.train import network as fast
 from shiftsim.train import ppo
 from shiftsim.train.jobs import divide
-from shiftsim.train.pictures import blocks_of
+from shiftsim.train.learning import to_official
 from shiftsim.train.recipe import Training
 
 
@@ -37,7 +36,7 @@ def test_the_loss_is_that_of_ppo(part):
     policy, told = part
     told["density"] = told["density"] - torch.log(torch.tensor([2.0, 1.05]))  # ratios 2 and 1.05
     values = torch.tensor([0.4, 0.05])
-    loss, cut = ppo.judged(policy, values, told, critic_only=False)
+    loss, cut = ppo.ppo_loss(policy, values, told, critic_only=False)
     acting = -(min(2.0, 1.1) * 1.0 + min(1.05 * -1.0, 1.05 * -1.0))
     critic = 0.5 * (max(0.6**2, 0.9**2) + 0.05**2)  # the first one is cut at 0.1
     assert float(loss) == pytest.approx(acting + 0.5 * critic, rel=1e-5)
@@ -46,25 +45,9 @@ def test_the_loss_is_that_of_ppo(part):
 
 def test_alone_the_critic_learns_without_being_cut(part):
     policy, told = part
-    loss, cut = ppo.judged(policy, torch.tensor([0.4, 0.0]), told, critic_only=True)
+    loss, cut = ppo.ppo_loss(policy, torch.tensor([0.4, 0.0]), told, critic_only=True)
     assert float(loss) == pytest.approx(0.5 * 0.5 * 0.6**2)
     assert cut.tolist() == [0.0]
-
-
-def test_the_fast_critic_is_that_of_the_network():
-    torch.manual_seed(0)
-    network, official = CarlNetwork(), CarlNetwork()
-    official.load_state_dict(fast.to_official(network.state_dict()))
-    pictures, measured = np.zeros((2, 9, 256, 256), np.uint8), torch.randn(2, 10)
-    pictures[0, 0, 100:150, 20:200] = 255
-    critic = torch.rand(2, 4)
-    with torch.no_grad():
-        features = official.features_extractor(torch.from_numpy(pictures), measured)
-        laid = fast.lay_out(network, critic=True)
-        blocks = fast.tensor_of(blocks_of(pictures, [False] * 2))
-        found = fast.value_of(laid, fast.features_of(laid, blocks, measured), critic)
-        wanted = official.value(features, critic)[:, 0]
-    assert found.numpy() == pytest.approx(wanted.numpy(), abs=0.01)
 
 
 @pytest.fixture
@@ -92,7 +75,7 @@ def test_the_critic_learns_first(short, small, toy):
     settings.out.mkdir()
     store = open_store(toy)
     towns = divide(store, store.tokens, 0)
-    state = fast.to_official(CarlNetwork().state_dict())
+    state = to_official(CarlNetwork().state_dict())
     trainer = ppo.Trainer(settings, towns, state, "cpu")
     before = {name: value.clone() for name, value in trainer.network.state_dict().items()}
     with trainer:
@@ -111,7 +94,7 @@ def test_it_learns_to_drive_along_a_road(small, toy, monkeypatch):
     store = open_store(toy)
     towns = divide(store, store.tokens, 0)
     torch.manual_seed(0)
-    state = fast.to_official(CarlNetwork().state_dict())
+    state = to_official(CarlNetwork().state_dict())
     trainer = ppo.Trainer(settings, towns, state, "cpu")
     with trainer:
         while trainer.update < trainer.total:

@@ -14,10 +14,10 @@ import shiftsim
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import CheckpointError, ConfigError
 from shiftsim.train import recipe
-from shiftsim.train.driving import Driver, Job, Start, Student
+from shiftsim.train.driving import Driver, Job, PolicyPlanner, Start
+from shiftsim.train.folder import Settings
 from shiftsim.train.jobs import divide
 from shiftsim.train.recipe import Training
-from shiftsim.train.settings import Settings
 
 
 def curve_of(settings):
@@ -40,8 +40,8 @@ def test_the_same_seed_gives_the_same_curve_and_network(small, trained):
 
 def test_a_training_that_was_ended_goes_on_as_if_it_had_not(small, trained, monkeypatch):
     whole, ended = trained[0], small()
-    monkeypatch.setattr(recipe, "_KEPT_EVERY", 0.0)
-    monkeypatch.setattr(recipe, "_NOTED_EVERY", 1)
+    monkeypatch.setattr(recipe, "_WRITE_EVERY", 0.0)
+    monkeypatch.setattr(recipe, "_CURVE_EVERY", 1)
     learn, steps = recipe.Learner.learn, []
 
     def stopping(learner, *batch):
@@ -77,7 +77,7 @@ def test_what_comes_out_drives_and_says_how_it_came(trained, toy, tmp_path):
 
 def test_with_weights_to_begin_with_the_network_drives_at_once(small, trained, monkeypatch):
     asked = []
-    monkeypatch.setattr(recipe, "collect", lambda *job: asked.append(job[2]) or [])
+    monkeypatch.setattr(recipe, "collect", lambda *job: asked.append(job[4].args[1]) or [])
     monkeypatch.setattr(recipe, "write_part", lambda folder, states: None)
     settings = small("more", checkpoint=str(trained[0].best))
     training = Training(settings, print)
@@ -87,7 +87,7 @@ def test_with_weights_to_begin_with_the_network_drives_at_once(small, trained, m
 
 
 def test_what_comes_before_an_infraction_of_the_network_is_urgent(toy, monkeypatch):
-    def veering(student, features):
+    def veering(policy, features):
         return [np.ones(2, np.float32) for _ in features]
 
     def urgent(expert_steps):
@@ -96,7 +96,7 @@ def test_what_comes_before_an_infraction_of_the_network_is_urgent(toy, monkeypat
 
     tokens = open_store(toy).tokens
     driver = Driver(str(toy), "deterministic:base")
-    monkeypatch.setattr(Student, "infer", veering)
+    monkeypatch.setattr(PolicyPlanner, "infer", veering)
     assert 0 < sum(urgent(0)) <= 2 * 15
     assert not any(urgent(-1))
 

@@ -13,11 +13,10 @@ from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import ConfigError
 from shiftsim.sim.traffic.constant_velocity import ConstantVelocity
-from shiftsim.sim.traffic.learned.model import LearnedTraffic
-from shiftsim.sim.traffic.learned.network import load_weights
-from shiftsim.train.traffic.labels import labels_of
+from shiftsim.sim.traffic.learned.model import LearnedTraffic, load_weights
 from shiftsim.train.traffic.realism import compare
 from shiftsim.train.traffic.recipe import TrafficSettings, train_traffic
+from shiftsim.train.traffic.states import compute_labels
 from shiftsim.world.state import AgentKind, Tracks
 
 SMALL = {"seed": 3, "rounds": 2, "scenarios": 2, "epochs": 1, "tests": 2}
@@ -66,7 +65,7 @@ def recorded(poses):
 
 
 def label(tracks, pose, speed, closing=(np.inf, 0.0)):
-    found = labels_of(tracks, 20, np.array([pose]), np.array([speed]), np.array([closing]))
+    found = compute_labels(tracks, 20, np.array([pose]), np.array([speed]), np.array([closing]))
     assert found.known.all()
     return float(found.accelerations[0]), float(found.curvatures[0])
 

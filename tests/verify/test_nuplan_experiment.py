@@ -8,20 +8,19 @@ import struct
 from pathlib import Path
 
 import msgpack
-import numpy as np
 import places
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from commands import call
+from parity_cases import open_scenes
 
 from shiftsim.errors import DataError, MissingExtraError
-from shiftsim.verify import verify
-from shiftsim.verify.files import read_file
-from shiftsim.verify.nuplan import simulation_log
-from shiftsim.verify.nuplan.experiment import _compare_means
-from shiftsim.verify.nuplan.simulation_log import find_simulation_logs, read_simulation_log
+from shiftsim.verify import simulation_log
+from shiftsim.verify.experiment import _compare_means, verify_experiment
 from shiftsim.verify.report import Report
+from shiftsim.verify.simulation_log import find_simulation_logs, read_simulation_log
+from shiftsim.verify.tables import read_table
 
 pytestmark = pytest.mark.golden
 GOLDEN = places.GOLDEN / "nuplan_experiment"
@@ -44,8 +43,8 @@ def log_of(folder: Path) -> Path:
     return next(folder.rglob("*.msgpack.xz"))
 
 
-def compare(folder: Path, scenes: Path, **options) -> Report:
-    return verify(folder, scenes=scenes, **options)
+def compare(folder: Path, scenes: Path) -> Report:
+    return verify_experiment(folder, open_scenes(scenes).by_token)
 
 
 def keep(folder: Path, *tokens: str) -> None:
@@ -132,7 +131,7 @@ def test_a_changed_mean_is_named(folder, row):
     for column in ("score", "ego_is_comfortable", "num_scenarios"):
         change(path, column, row, 1e-6)
     report = Report()
-    _compare_means(read_file(path, report))
+    _compare_means(read_table(path, report))
     name = pq.read_table(path)["scenario"][row].as_py()
     assert sorted(line.split(": ")[1] for line in report.mismatches) == [
         f"{name} SimplePlanner {column}"
@@ -289,11 +288,8 @@ def test_a_run_that_failed_in_nuplan_is_named(folder, nuplan_reference):
 
 
 def test_what_is_missing_is_said_with_a_remedy(folder, nuplan_reference, monkeypatch):
-    with pytest.raises(DataError, match="nothing says where the scenarios are") as caught:
-        verify(folder)
-    assert "--store" in caught.value.hint
     with pytest.raises(DataError, match="no results of nuPlan"):
-        verify(nuplan_reference, kind="experiment")
+        compare(nuplan_reference, nuplan_reference)
     other = folder.rename(folder.with_name("other"))
     inner = next(other.iterdir()).rename(other / "mine") / "simple_planner"
     for path in inner.glob("aggregator_metric/*"):
@@ -323,12 +319,3 @@ def test_the_command_compares_with_the_scenarios_of_a_store(nuplan_reference, fo
     found = call(tmp_path, "verify", "--experiment", folder, "--store", store)
     assert found.returncode == 1
     assert f"MISMATCH metric ego_jerk: NR {LOGGED} SimplePlanner max_ego_jerk" in found.stdout
-
-
-def test_the_reference_folders_are_equal(shared):
-    report = verify(shared / "reference" / "nuplan_experiment")
-    assert report.mismatches == []
-    assert report.not_covered == {}
-    assert report.quantities["ego x"].cases == 8
-    assert report.quantities["idm plan x"].cases == 598
-    assert np.isfinite(report.quantities["objects x"].max_error)

@@ -12,8 +12,8 @@ from shiftsim.data.store.reading import open_store
 from shiftsim.runs.config import make_config
 from shiftsim.runs.execute import Progress, execute
 from shiftsim.runs.prepare import prepare
-from shiftsim.runs.results import FAILED, OK, TaskResult
 from shiftsim.runs.rollouts import Task
+from shiftsim.runs.tables import FAILED, OK, TaskResult
 from shiftsim.view.live import LiveRun, LiveServer
 
 
@@ -114,7 +114,7 @@ def test_only_this_machine_is_answered(server):
 def test_the_page_hears_of_the_end_and_then_nothing_is_answered(server):
     with LiveServer(run_of(ended(0, 0.5))) as other:
         assert json.loads(ask(other, "/state")[1])["state"] == "running"
-        other.told.wait = lambda seconds: None  # nobody asks again here
+        other.end_was_shown.wait = lambda seconds: None  # nobody asks again here
     assert other.run.values()["state"] == "finished"
     with pytest.raises(OSError, match=r"refused|reset"):
         ask(other, "/state")

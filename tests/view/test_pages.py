@@ -15,7 +15,7 @@ from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import simulate
 from shiftsim.view.build import Choice, Gallery, list_page, page_name, worst_table, write_site
 from shiftsim.view.page import MAX_ROLLOUTS, embedded, fill, json_text, replay_page
-from shiftsim.view.scene import Shown
+from shiftsim.view.scene import ShownRollout
 from shiftsim.view.still import save_figure
 from shiftsim.world.state import AgentKind
 
@@ -32,7 +32,7 @@ def scenario():
 
 def shown(scenario, **settings):
     log = simulate(scenario, load_planner("constant-velocity"), **settings)
-    return Shown("constant-velocity", settings.get("noise", "none"), 0, log, 0.5)
+    return ShownRollout("constant-velocity", settings.get("noise", "none"), 0, log, 0.5)
 
 
 def test_a_page_holds_the_rollout_to_a_centimetre(scenario):

@@ -8,8 +8,7 @@ from stores import write_toy_store
 from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.tables import REVIEW
 from shiftsim.view.local import HOST, TOKEN_HEADER
-from shiftsim.view.review.server import MAX_BODY
-from shiftsim.view.review.service import ReviewService
+from shiftsim.view.review import MAX_BODY, ReviewService
 
 FIRST = "0000cafe"
 
@@ -226,7 +225,7 @@ def test_a_full_disk_is_reported_and_what_was_kept_stays(server, store, monkeypa
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("shiftsim.view.review.service.write_reviews", full)
+    monkeypatch.setattr("shiftsim.view.review.write_reviews", full)
     status, text = ask(server, "POST", "/api/review", review(decision="reject"))
     listing = json.loads(ask(server, "GET", "/api/scenarios")[1])
 

@@ -12,7 +12,7 @@ from worlds import cruise_scenario, standing_tracks
 from shiftsim.planners.registry import load_planner
 from shiftsim.report.palette import ALARM, RECORDED, planner_styles
 from shiftsim.sim.loop import simulate
-from shiftsim.view.scene import Shown
+from shiftsim.view.scene import ShownRollout
 from shiftsim.view.still import grid, overview, save_figure, still
 from shiftsim.world.state import AgentKind
 
@@ -46,7 +46,7 @@ def shown(scenario):
         for noise in ("none", "ou-high"):
             log = simulate(scenario, load_planner("constant-velocity"), noise=noise)
             metrics = hit if noise != "none" else []
-            out.append(Shown(planner, noise, 0, log, 0.0 if metrics else 0.87, metrics))
+            out.append(ShownRollout(planner, noise, 0, log, 0.0 if metrics else 0.87, metrics))
     return out
 
 

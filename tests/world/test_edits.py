@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from worlds import cruise_scenario, standing_tracks
 
+from shiftsim.edits.apply import apply_edit
+from shiftsim.edits.density import safe_speed
+from shiftsim.edits.places import ego_path
+from shiftsim.edits.spec import At, make_edit
 from shiftsim.errors import ConfigError
 from shiftsim.sim.loop import simulate
-from shiftsim.world.edits.apply import apply_edit
-from shiftsim.world.edits.density import safe_speed
-from shiftsim.world.edits.places import ego_path
-from shiftsim.world.edits.spec import At, make_edit
+from shiftsim.world.events import MIXED, STOPPED
 from shiftsim.world.scenario import duration_class
-from shiftsim.world.script import MIXED, STOPPED
 from shiftsim.world.state import VX, AgentKind, Command, LightStatus, center_poses
 
 
@@ -238,7 +238,7 @@ def test_a_goal_in_the_other_lane_ends_the_rollout_there(scene):
 
 
 def test_agents_may_look_where_the_ego_will_be(scene):
-    assert scene.edited(agents="mixed", window_s=3.0).script.manner == MIXED
+    assert scene.edited(agents="mixed", window_s=3.0).script.yielding == MIXED
 
 
 def test_the_path_goes_on_beyond_the_recording(scene):

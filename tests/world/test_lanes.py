@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from shiftsim.data.demo.city import bench_scene
+from shiftsim.benchmarks.speed.city import bench_scene
 from shiftsim.world.lanes import find_start, find_starts
 
 

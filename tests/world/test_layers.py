@@ -89,3 +89,12 @@ def test_touching_a_box_from_outside_counts():
     layer = layers.make_layer(["0", "1"], [shapely.box(0, 0, 2, 2), shapely.box(3, 3, 4, 4)])
     assert layers.meeting(layer.polygons, layers.square_around(3.0, 1.0, 1.0)).tolist() == [0]
     assert layers.meeting(layer.polygons, layers.square_around(2.5, 2.5, 0.5)).tolist() == [0, 1]
+
+
+def test_a_grid_that_would_fill_the_memory_is_refused():
+    square = np.array([[0.0, 0.0], [1e5, 0.0], [1e5, 1e5], [0.0, 1e5]])
+    starts = [np.arange(count + 1) for count in (4, 100)]
+    few = layers.index_polygons(np.tile(square, (4, 1)), starts[0] * 4, starts[0])
+    assert few.shape.tolist() == [1563, 1563]
+    with pytest.raises(ValueError, match="too many polygons cover too much"):
+        layers.index_polygons(np.tile(square, (100, 1)), starts[1] * 4, starts[1])

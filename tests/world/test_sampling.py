@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from worlds import cruise_scenario
 
+from shiftsim.edits.apply import apply_edit
+from shiftsim.edits.builder import EGO_SIZE
+from shiftsim.edits.sampling import GRADES, KINDS, graded, sample_edits
+from shiftsim.edits.spec import make_edit
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.rings import convex_intersect
-from shiftsim.world.edits.apply import apply_edit
-from shiftsim.world.edits.draft import EGO_SIZE
-from shiftsim.world.edits.sampling import GRADES, KINDS, graded, sample_edits
-from shiftsim.world.edits.spec import make_edit
 from shiftsim.world.state import center_poses
 
 SCENES = {str(speed): cruise_scenario(speed=float(speed)) for speed in (3, 8, 12)}

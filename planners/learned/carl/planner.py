@@ -18,7 +18,7 @@ from shiftsim.planners.learned.carl import view
 from shiftsim.planners.learned.carl.raster import Raster
 from shiftsim.planners.learned.carl.roads import MAX_SPEED, Roads, level, make_roads
 from shiftsim.planners.learned.checkpoint import load_network, split_ensemble
-from shiftsim.planners.learned.device import on_device, resolve_device
+from shiftsim.planners.learned.device import resolve_device
 from shiftsim.planners.learned.features import route_blocks
 from shiftsim.planners.learned.map_features import LightLookup
 from shiftsim.planners.per_map import PerMap
@@ -58,13 +58,13 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         self.device = resolve_device(device)
 
     def begin(self) -> None:
-        """Make the maps that are laid out."""
-        self._maps = PerMap(_lay_out)
+        """Make the cache of prepared maps."""
+        self._maps = PerMap(make_roads)
 
     def reset(self, scene: SceneInfo) -> None:
-        """Lay out the map and forget the last action; the route is corrected at the first step."""
+        """Prepare the map and forget the last action; the route is corrected at the first step."""
         self._scene = scene
-        self._roads, self._scratch = self._maps(scene.map)
+        self._roads = self._maps(scene.map)
         self._on_route: BoolArray | None = None
         self._pictures = np.zeros((len(view.CHANNELS), view.SIZE, view.SIZE), np.uint8)
         self._last_action = np.zeros(2, np.float32)
@@ -83,9 +83,9 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         if on_route is None:
             on_route = self._start(scene, ego, state.center_poses(ego[:3], scene.vehicle))
         status = self._lights.at(observation.lights)
-        roads, scratch, pictures = self._roads, self._scratch, self._pictures
+        roads, pictures = self._roads, self._pictures
         pictures.fill(0)
-        self.found = draw(pictures, roads, scratch, ego, tracks, -1, on_route, status)
+        self.found = draw(pictures, roads, ego, tracks, -1, on_route, status)
         self._blindness = self._why_blind(scene.map, status)
         return CarlFeatures(pictures, measure(ego, self._last_action))
 
@@ -94,9 +94,9 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         import torch
 
         parts = (np.stack(part) for part in zip(*features, strict=True))
-        pictures, measured = (on_device(part, self.device) for part in parts)
+        pictures, measured = (torch.from_numpy(part).to(self.device) for part in parts)
         with torch.inference_mode():
-            each = [network.act(pictures, measured) for network in self.networks]
+            each = [network(pictures, measured).action for network in self.networks]
             return list(torch.stack(each).mean(dim=0).cpu().numpy())
 
     def decode(self, output: Action, observation: Observation) -> state.Command:
@@ -135,7 +135,6 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
 def draw(
     pictures: Raster,  # (9, 256, 256) zeros, written
     roads: Roads,
-    scratch: view.Scratch,
     ego: FloatArray,  # (11,) the present state
     tracks: state.Tracks,
     row: int,  # of the tracks that is the present
@@ -146,11 +145,11 @@ def draw(
     center, velocity = state.center_poses(ego[:3]), state.center_velocities(ego)
     frame = view.picture_frame(center)
     found: IntArray = view.find_areas(roads, frame)
-    view.draw_roads(pictures, roads, scratch, frame, found, on_route, status)
-    view.draw_objects(pictures, frame, _boxes(tracks, row), scratch)
+    view.draw_roads(pictures, roads, frame, found, on_route, status)
+    view.draw_objects(pictures, frame, _boxes(tracks, row))
     value = level(float(np.hypot(velocity[0], velocity[1])), MAX_SPEED)
     box = (*center.tolist(), state.PACIFICA.length, state.PACIFICA.width)
-    view.draw_box(pictures[view.EGO], frame, *box, value, scratch)
+    view.draw_box(pictures[view.EGO], frame, *box, value)
     return found
 
 
@@ -170,11 +169,6 @@ def command_of(action: Action, ego: FloatArray) -> state.Command:
         # nuPlan rule 361: it comes to a stop, rather than that it drives backwards
         acceleration = -float(ego[state.VX]) - REVERSE_GAIN * float(ego[state.AX])
     return state.Command(min(max(acceleration, -MAX_BRAKING), MAX_ACCELERATION), steering_rate)
-
-
-def _lay_out(road: VectorMap) -> tuple[Roads, view.Scratch]:
-    roads = make_roads(road)
-    return roads, view.make_scratch(roads)
 
 
 def _boxes(tracks: state.Tracks, row: int) -> view.Boxes:

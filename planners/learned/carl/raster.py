@@ -12,8 +12,6 @@ the raster:
   rounded down. Edges of a box are not cut.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -70,7 +68,7 @@ def _cut(
 ) -> tuple[bool, int, int, int, int]:
     """Cut a line at the borders: whether it can be seen, and its ends as far as they were cut."""
     sx0, sy0, sx1, sy1 = _side(x0, width), _side(y0, height), _side(x1, width), _side(y1, height)
-    if _apart(sx0, sx1) or _apart(sy0, sy1):
+    if sx0 * sx1 > 0 or sy0 * sy1 > 0:  # both ends lie beyond the same border
         return False, x0, y0, x1, y1
     if sy0 != 0:
         border = 0 if sy0 < 0 else height - 1
@@ -82,7 +80,7 @@ def _cut(
         x1 += int(float(border - y1) * (x1 - x0) / (y1 - y0))
         y1 = border
         sx1 = _side(x1, width)
-    if _apart(sx0, sx1):
+    if sx0 * sx1 > 0:
         return False, x0, y0, x1, y1
     if sx0 != 0:
         border = 0 if sx0 < 0 else width - 1
@@ -96,34 +94,17 @@ def _cut(
 
 
 @kernel
-def _apart(side0: int, side1: int) -> bool:
-    """Whether both ends lie beyond the same border."""
-    return side0 * side1 > 0
-
-
-@kernel
 def _quotient(dividend: int, divisor: int) -> int:
     """Whole quotient, rounded towards zero; the divisor is positive."""
     return dividend // divisor if dividend >= 0 else -(-dividend // divisor)
 
 
-class Crossings(NamedTuple):
-    """Scratch for the columns at which an outline crosses the rows."""
-
-    # (H, V) columns of each row; an area of up to V vertices can be filled
-    columns: NDArray[np.int32]
-    counts: IntArray  # (H,) how many of them are used; all 0 between two areas
-
-
-def make_crossings(height: int, max_vertices: int) -> Crossings:
-    """Scratch for rasters of a given height, and areas of so many vertices at most."""
-    return Crossings(np.empty((height, max(max_vertices, 4)), np.int32), np.zeros(height, np.int64))
-
-
 @kernel
-def fill(raster: Raster, xy: IntArray, value: int, crossings: Crossings, is_box: bool) -> None:
+def fill(raster: Raster, xy: IntArray, value: int, is_box: bool) -> None:
     """Fill the area within a ring of pixels (V, 2), by the even-odd rule, or a box (4, 2)."""
     height, width = raster.shape
+    # the columns at which edges cross each row, and how many they are
+    columns, counts = np.empty((height, len(xy)), np.int32), np.zeros(height, np.int64)
     top, bottom = height, -1
     bx, by = xy[-1, 0], xy[-1, 1]
     for index in range(len(xy)):
@@ -147,35 +128,12 @@ def fill(raster: Raster, xy: IntArray, value: int, crossings: Crossings, is_box:
         else:
             slope = _quotient((dx - cx) * _ONE, dy - cy)
         first = min(ay, by)
-        _cross(crossings, first, max(ay, by), cx * _ONE + shift + (first - cy) * slope, slope)
-    _fill_rows(raster, max(top, 0), min(bottom, height - 1), value, crossings)
-
-
-@kernel
-def _cross(crossings: Crossings, first: int, stop: int, start: int, slope: int) -> None:
-    """Note where an edge crosses the rows `first` … `stop` - 1.
-
-    It starts at the column `start` and moves by `slope` a row, both in fixed point.
-    """
-    for row in range(max(first, 0), min(stop, len(crossings.counts))):
-        count = crossings.counts[row]
-        crossings.columns[row, count] = (start + (row - first) * slope) >> 16
-        crossings.counts[row] = count + 1
-
-
-@kernel
-def _fill_rows(raster: Raster, top: int, bottom: int, value: int, crossings: Crossings) -> None:
-    """Fill the rows between the noted columns, and forget these."""
-    width = raster.shape[1]
-    for row in range(top, bottom + 1):
-        count, columns = crossings.counts[row], crossings.columns[row]
-        crossings.counts[row] = 0
-        for index in range(1, count):  # few and nearly sorted
-            column, place = columns[index], index
-            while place > 0 and columns[place - 1] > column:
-                columns[place] = columns[place - 1]
-                place -= 1
-            columns[place] = column
-        for index in range(0, count - 1, 2):
-            for column in range(max(columns[index], 0), min(columns[index + 1] + 1, width)):
+        start = cx * _ONE + shift + (first - cy) * slope
+        for row in range(max(first, 0), min(max(ay, by), height)):
+            columns[row, counts[row]] = (start + (row - first) * slope) >> 16
+            counts[row] += 1
+    for row in range(max(top, 0), min(bottom, height - 1) + 1):
+        ends = np.sort(columns[row, : counts[row]])
+        for index in range(0, len(ends) - 1, 2):
+            for column in range(max(ends[index], 0), min(ends[index + 1] + 1, width)):
                 raster[row, column] = value

@@ -6,25 +6,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shiftsim.kernels import FloatArray, IntArray, kernel
+from shiftsim.kernels import IntArray, kernel
 from shiftsim.planners.proposals.areas import index_ranks
 from shiftsim.world.layers import Lists, Polygons, Polylines, index_polygons, make_polylines
 from shiftsim.world.map import NONE, VectorMap
 
 YES = 255
 MAX_SPEED = 30.0  # m/s
-CHUNK = 16  # segments of a line that are left out together where they cannot be seen
 
 Values = NDArray[np.uint8]
-
-
-class Lines(NamedTuple):
-    """Polylines in chunks that are left out together where they cannot be seen."""
-
-    xy: FloatArray  # (V, 2) vertices [m]
-    ptr: IntArray  # (M + 1,) first vertex of each line
-    chunk_ptr: IntArray  # (M + 1,) first chunk of each line
-    circles: FloatArray  # (C, 3) a circle around each chunk: x, y, radius [m]
 
 
 class Roads(NamedTuple):
@@ -37,7 +27,7 @@ class Roads(NamedTuple):
     # (I,) polygon to fill for an area: itself, for a connector its intersection, or NONE
     drivable: IntArray
     block_edges: Lists  # edges of a block
-    lines: Lines  # baselines of the E edges, then boundaries of lanes, each once
+    lines: Polylines  # baselines of the E edges, then boundaries of lanes, each once
     # (E, 4) lines of an edge: baseline, left and right boundary, baseline; NONE where it has none
     # to draw
     lines_of: IntArray
@@ -45,7 +35,7 @@ class Roads(NamedTuple):
 
 
 def make_roads(road: VectorMap) -> Roads:
-    """Lay out a map."""
+    """What of a map is drawn."""
     areas = _joined([road.blocks.polygons, road.car_parks.polygons, road.intersections.polygons])
     num_blocks, num_areas = len(road.blocks), len(road.blocks) + len(road.car_parks)
     drivable = np.arange(num_areas)
@@ -79,7 +69,7 @@ def _joined(parts: Sequence[Polygons]) -> Polygons:
     return index_polygons(xy, np.concatenate(ring_ptr), np.concatenate(poly_ptr))
 
 
-def _lines(road: VectorMap) -> tuple[Lines, IntArray]:
+def _lines(road: VectorMap) -> tuple[Polylines, IntArray]:
     """All lines to draw, and which of them an edge has; neighbours share their boundary."""
     lines = [road.baselines.at(edge) for edge in range(len(road.edges))]
     lines_of = np.full((len(lines), 4), NONE)
@@ -93,30 +83,7 @@ def _lines(road: VectorMap) -> tuple[Lines, IntArray]:
             lines_of[lane, side] = known.setdefault(line.tobytes(), len(lines))
             if lines_of[lane, side] == len(lines):
                 lines.append(line)
-    return _in_chunks(make_polylines(lines)), lines_of
-
-
-def _in_chunks(lines: Polylines) -> Lines:
-    segments = np.maximum(np.diff(lines.ptr) - 1, 0)
-    chunk_ptr = np.concatenate([[0], np.cumsum(-(-segments // CHUNK))])
-    circles = np.empty((chunk_ptr[-1], 3))
-    _surround(lines.xy, lines.ptr, chunk_ptr, circles)
-    return Lines(lines.xy, lines.ptr, chunk_ptr, circles)
-
-
-@kernel
-def _surround(xy: FloatArray, ptr: IntArray, chunk_ptr: IntArray, circles: FloatArray) -> None:
-    """Write a circle around every chunk into `circles` (C, 3)."""
-    for line in range(len(ptr) - 1):
-        for chunk in range(chunk_ptr[line], chunk_ptr[line + 1]):
-            start = ptr[line] + (chunk - chunk_ptr[line]) * CHUNK
-            stop = min(start + CHUNK + 1, ptr[line + 1])
-            x = 0.5 * (xy[start:stop, 0].min() + xy[start:stop, 0].max())
-            y = 0.5 * (xy[start:stop, 1].min() + xy[start:stop, 1].max())
-            radius = 0.0
-            for vertex in range(start, stop):
-                radius = max(radius, np.hypot(xy[vertex, 0] - x, xy[vertex, 1] - y))
-            circles[chunk, 0], circles[chunk, 1], circles[chunk, 2] = x, y, radius
+    return make_polylines(lines), lines_of
 
 
 @kernel

@@ -11,9 +11,9 @@ import numpy as np
 
 from shiftsim.geometry.boxes import box_corners
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.planners.learned.carl.raster import Crossings, Raster, draw_line, fill, make_crossings
-from shiftsim.planners.learned.carl.roads import CHUNK, MAX_SPEED, YES, Lines, Roads, level
-from shiftsim.world.layers import Polygons, meets_convex
+from shiftsim.planners.learned.carl.raster import Raster, draw_line, fill
+from shiftsim.planners.learned.carl.roads import MAX_SPEED, YES, Roads, level
+from shiftsim.world.layers import Polygons, meeting
 from shiftsim.world.map import NONE
 from shiftsim.world.state import LAST_AGENT_KIND, AgentKind
 
@@ -34,15 +34,6 @@ _PEDESTRIAN = AgentKind.PEDESTRIAN
 _LAST_AGENT = LAST_AGENT_KIND
 
 
-class Scratch(NamedTuple):
-    """Scratch of `draw_roads`, as large as the map needs."""
-
-    ring: IntArray  # (V, 2) pixels of one ring
-    crossings: Crossings  # of its outline
-    filled: BoolArray  # areas that are drawn already
-    drawn: BoolArray  # lines that are drawn already
-
-
 class Boxes(NamedTuple):
     """Objects of one moment. N objects."""
 
@@ -52,19 +43,6 @@ class Boxes(NamedTuple):
     kinds: IntArray  # (N,) AgentKind codes
 
 
-def make_scratch(roads: Roads) -> Scratch:
-    """Scratch for a map."""
-    shells = roads.areas.poly_ptr[:-1]
-    sizes = roads.areas.ring_ptr[shells + 1] - roads.areas.ring_ptr[shells]
-    longest = max(4, *sizes.tolist())
-    return Scratch(
-        np.empty((longest, 2), np.int64),
-        make_crossings(SIZE, longest),
-        np.zeros(len(roads.areas.bounds), np.bool_),
-        np.zeros(len(roads.lines.ptr), np.bool_),
-    )
-
-
 @kernel
 def picture_frame(center: FloatArray) -> FloatArray:
     """(4,) x [m], y [m], cosine and sine of the heading of the raster's middle."""
@@ -72,30 +50,14 @@ def picture_frame(center: FloatArray) -> FloatArray:
     return np.array([center[0] + AHEAD * cos, center[1] + AHEAD * sin, cos, sin])
 
 
-@kernel
 def find_areas(roads: Roads, frame: FloatArray) -> IntArray:
     """Areas that touch the raster, in the order of the spatial index."""
-    corners = np.empty((4, 2))
-    for corner in range(4):
-        ahead = HALF_SIDE if corner == 0 or corner == 3 else -HALF_SIDE
-        left = HALF_SIDE if corner < 2 else -HALF_SIDE
-        corners[corner, 0] = frame[0] + (ahead * frame[2] - left * frame[3])
-        corners[corner, 1] = frame[1] + (ahead * frame[3] + left * frame[2])
-    reach = HALF_SIDE * (abs(frame[2]) + abs(frame[3])) + 1e-6
-    bounds = roads.areas.bounds
-    out = np.empty(len(roads.order), np.int64)
-    found = 0
-    for area in roads.order:
-        if (
-            bounds[area, 0] <= frame[0] + reach
-            and bounds[area, 2] >= frame[0] - reach
-            and bounds[area, 1] <= frame[1] + reach
-            and bounds[area, 3] >= frame[1] - reach
-            and meets_convex(roads.areas, area, corners)
-        ):
-            out[found] = area
-            found += 1
-    return out[:found].copy()
+    ahead, left = HALF_SIDE * np.array([[1, -1, -1, 1], [1, 1, -1, -1]])
+    cos, sin = frame[2:]
+    corners = frame[:2] + np.column_stack([ahead * cos - left * sin, ahead * sin + left * cos])
+    touches = np.zeros(len(roads.areas.bounds), np.bool_)
+    touches[meeting(roads.areas, corners)] = True
+    return roads.order[touches[roads.order]]
 
 
 @kernel
@@ -119,7 +81,6 @@ def _to_pixel(frame: FloatArray, x: float, y: float) -> tuple[int, int]:
 def draw_roads(
     rasters: Raster,
     roads: Roads,
-    scratch: Scratch,
     frame: FloatArray,
     found: IntArray,
     on_route: BoolArray,
@@ -130,18 +91,18 @@ def draw_roads(
     `found` are the areas in the raster, `on_route` (B,) the blocks of the route, `lights` (E,) the
     LightStatus by edge, ABSENT where there is none.
     """
-    scratch.filled[:] = False
-    scratch.drawn[:] = False
+    filled = np.zeros(len(roads.areas.bounds), np.bool_)
+    drawn = np.zeros(len(roads.lines.ptr), np.bool_)
     for area in found:
         for channel in (DRIVABLE, ROUTE):
             shape = roads.drivable[area] if channel == DRIVABLE else area
             if channel == ROUTE and (area >= roads.num_blocks or not on_route[area]):
                 continue
-            if channel == DRIVABLE and (shape == NONE or scratch.filled[shape]):
+            if channel == DRIVABLE and (shape == NONE or filled[shape]):
                 continue
             if channel == DRIVABLE:
-                scratch.filled[shape] = True
-            _fill_shell(rasters[channel], roads.areas, shape, frame, scratch)
+                filled[shape] = True
+            _fill_shell(rasters[channel], roads.areas, shape, frame)
     for connectors in (False, True):  # lanes first
         for area in found:
             if area >= roads.num_blocks or (area >= roads.num_roadblocks) != connectors:
@@ -149,13 +110,14 @@ def draw_roads(
             for entry in range(roads.block_edges.ptr[area], roads.block_edges.ptr[area + 1]):
                 edge = roads.block_edges.items[entry]
                 light = LIGHT_VALUES[lights[edge]] if connectors else 0
-                _draw_edge(rasters, roads, scratch, frame, edge, light)
+                _draw_edge(rasters, roads, drawn, frame, edge, light)
 
 
 @kernel
 def _draw_edge(
-    rasters: Raster, roads: Roads, scratch: Scratch, frame: FloatArray, edge: int, light: int
+    rasters: Raster, roads: Roads, drawn: BoolArray, frame: FloatArray, edge: int, light: int
 ) -> None:
+    """Draw the lines of an edge: its speed limit, boundaries that are not drawn yet, its light."""
     for slot in range(4):
         line = roads.lines_of[edge, slot]
         channel, value = BOUNDARIES, YES
@@ -164,49 +126,32 @@ def _draw_edge(
         elif slot == 3:
             channel, value = LIGHTS, int(light)
         elif line != NONE:
-            if scratch.drawn[line]:
+            if drawn[line]:
                 continue
-            scratch.drawn[line] = True
-        if line != NONE and value > 0:
-            _draw_line_of(rasters[channel], roads.lines, line, frame, value)
+            drawn[line] = True
+        if line == NONE or value == 0:
+            continue
+        xy = roads.lines.xy[roads.lines.ptr[line] : roads.lines.ptr[line + 1]]
+        for vertex in range(len(xy) - 1):
+            x0, y0 = _to_pixel(frame, xy[vertex, 0], xy[vertex, 1])
+            x1, y1 = _to_pixel(frame, xy[vertex + 1, 0], xy[vertex + 1, 1])
+            draw_line(rasters[channel], x0, y0, x1, y1, value)
 
 
 @kernel
-def _fill_shell(
-    raster: Raster, polygons: Polygons, poly: int, frame: FloatArray, scratch: Scratch
-) -> None:
+def _fill_shell(raster: Raster, polygons: Polygons, poly: int, frame: FloatArray) -> None:
     """Fill a polygon; its holes are filled, too."""
     shell = polygons.poly_ptr[poly]
     start, stop = polygons.ring_ptr[shell], polygons.ring_ptr[shell + 1]
+    ring = np.empty((stop - start, 2), np.int64)
     for vertex in range(start, stop):
         x, y = _to_pixel(frame, polygons.xy[vertex, 0], polygons.xy[vertex, 1])
-        scratch.ring[vertex - start, 0], scratch.ring[vertex - start, 1] = x, y
-    fill(raster, scratch.ring[: stop - start], YES, scratch.crossings, False)
+        ring[vertex - start, 0], ring[vertex - start, 1] = x, y
+    fill(raster, ring, YES, False)
 
 
 @kernel
-def _draw_line_of(raster: Raster, lines: Lines, line: int, frame: FloatArray, value: int) -> None:
-    """Draw a line, chunk by chunk."""
-    first, last = lines.ptr[line], lines.ptr[line + 1] - 1
-    for chunk in range(lines.chunk_ptr[line], lines.chunk_ptr[line + 1]):
-        start = first + (chunk - lines.chunk_ptr[line]) * CHUNK
-        dx, dy = lines.circles[chunk, 0] - frame[0], lines.circles[chunk, 1] - frame[1]
-        reach = HALF_SIDE + lines.circles[chunk, 2] + 1.0  # a pixel more than needed
-        if abs(frame[2] * dx + frame[3] * dy) > reach or abs(frame[2] * dy - frame[3] * dx) > reach:
-            continue
-        px, py = _to_pixel(frame, lines.xy[start, 0], lines.xy[start, 1])
-        for vertex in range(start + 1, min(start + CHUNK, last) + 1):
-            x, y = _to_pixel(frame, lines.xy[vertex, 0], lines.xy[vertex, 1])
-            if vertex > start + 1 and abs(x - px) <= 1 and abs(y - py) <= 1:
-                if 0 <= x < SIZE and 0 <= y < SIZE:  # the pixel before is drawn already
-                    raster[y, x] = value
-            else:
-                draw_line(raster, px, py, x, y, value)
-            px, py = x, y
-
-
-@kernel
-def draw_objects(rasters: Raster, frame: FloatArray, boxes: Boxes, scratch: Scratch) -> None:
+def draw_objects(rasters: Raster, frame: FloatArray, boxes: Boxes) -> None:
     """Draw the objects whose centre is in the raster."""
     for is_static in (False, True):
         for index in range(len(boxes.kinds)):
@@ -221,7 +166,7 @@ def draw_objects(rasters: Raster, frame: FloatArray, boxes: Boxes, scratch: Scra
             elif kind == _PEDESTRIAN:
                 channel, value = PEDESTRIANS, level(speed, MAX_WALK)
             length, width = boxes.sizes[index, 0], boxes.sizes[index, 1]
-            draw_box(rasters[channel], frame, x, y, heading, length, width, value, scratch)
+            draw_box(rasters[channel], frame, x, y, heading, length, width, value)
 
 
 @kernel
@@ -234,12 +179,11 @@ def draw_box(
     length: float,
     width: float,
     value: int,
-    scratch: Scratch,
 ) -> None:
     """Draw a box."""
-    corners, pixels = np.empty((4, 2)), scratch.ring[:4]
+    corners, pixels = np.empty((4, 2)), np.empty((4, 2), np.int64)
     box_corners(x, y, heading, length, width, corners)
     for corner in range(4):
         column, row = _to_pixel(frame, corners[corner, 0], corners[corner, 1])
         pixels[corner, 0], pixels[corner, 1] = column, row
-    fill(raster, pixels, value, scratch.crossings, True)
+    fill(raster, pixels, value, True)

@@ -19,11 +19,11 @@ from shiftsim.planners.learned.diffusion.features import (
 )
 from shiftsim.planners.learned.features import (
     NO_ROUTE,
+    plan_of_poses,
     poses_of,
     short_history,
     stack_scenes,
 )
-from shiftsim.planners.learned.plan_states import plan_of_poses
 from shiftsim.planners.per_map import PerMap
 from shiftsim.sim.noise import keyed_generator
 from shiftsim.sim.planner import Observation, SceneInfo
@@ -59,7 +59,13 @@ class DiffusionPlanner(LearnedPlanner[Features, Single]):
         draw = keyed_generator(*self._key, f"planner-diffusion-{observation.iteration}")
         noise = draw.standard_normal(NOISE_SHAPE, np.float32)
         out = self._build(observation, noise)
-        self._reason = _why_fallback(out, len(observation.history.ego))
+        # why the official planner would fail here
+        if out.route is None:
+            self._reason = NO_ROUTE
+        elif len(out.edges) == 0:
+            self._reason = "no lane within 100 m"
+        else:
+            self._reason = short_history(len(observation.history.ego))
         return out
 
     def infer(self, features: Sequence[Features]) -> Sequence[Single]:
@@ -79,19 +85,5 @@ class DiffusionPlanner(LearnedPlanner[Features, Single]):
     def decode(self, output: Single, observation: Observation) -> Trajectory:
         """The ego's trajectory in the map frame."""
         self.degraded = self._reason
-        return decode_ego(output, observation)
-
-
-def decode_ego(output: Single, observation: Observation) -> Trajectory:
-    """The ego's trajectory in the map frame, from trajectories (A, T, 4) in the ego frame."""
-    history = observation.history
-    return plan_of_poses(from_frame(poses_of(output[0]), history.ego[-1]), history)
-
-
-def _why_fallback(features: Features, num_samples: int) -> str:
-    """Why the official planner would fail here; empty where it would not."""
-    if features.route is None:
-        return NO_ROUTE
-    if len(features.edges) == 0:
-        return "no lane within 100 m"
-    return short_history(num_samples)
+        history = observation.history
+        return plan_of_poses(from_frame(poses_of(output[0]), history.ego[-1]), history)

@@ -7,28 +7,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from shiftsim.planners.learned import network as layers
 from shiftsim.planners.learned.deterministic import DriveHead, State, override_head
-from shiftsim.planners.learned.network import blocks
-from shiftsim.planners.learned.network.rows import Linear, store_by_columns, without_padding
+from shiftsim.planners.learned.network import DIM, Linear, head, perceptron
 
-PREFIXES = ("model.",)  # of the names in the published checkpoint
 POLYGON_CHANNELS = 6
 DEPTH, HEADS, MODES, STEPS = 4, 8, 6, 80
-RELEASED = {
-    "dim": blocks.DIM,
-    "state_channel": blocks.STATE_CHANNELS,
-    "polygon_channel": POLYGON_CHANNELS,
-    "history_channel": 9,
-    "history_steps": 21,
-    "future_steps": STEPS,
-    "encoder_depth": DEPTH,
-    "drop_path": 0.2,  # training only
-    "num_heads": HEADS,
-    "num_modes": MODES,
-    "state_dropout": 0.75,  # training only
-    "use_ego_history": False,
-    "state_attn_encoder": True,
-}
 DRIVE_HEADS = {
     "trajectory_decoder.loc.3": DriveHead(
         gain=(20, 2, 0.05, 0.05), exponent=(1, 1, 1, 1), const=(0, 0, 1, 0), slope=(40, 0, 0, 0)
@@ -37,10 +21,10 @@ DRIVE_HEADS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Inputs(blocks.SceneTensors):
+class Inputs(layers.SceneTensors):
     """One batch."""
 
-    # how many agents and polygons each scene has, the rest is padding; None where nothing is
+    # by agents and polygons how many each scene has, the rest is padding; None where nothing is
     counts: Sequence[Sequence[int]] | None = None
 
 
@@ -49,8 +33,7 @@ class Outputs(NamedTuple):
 
     trajectory: Tensor  # (B, modes, 80, 4) x, y [m], cosine and sine of the heading
     probability: Tensor  # (B, modes) logits
-    # (B, A - 1, 80, 2) positions of the agents [m]; None unless asked for
-    prediction: Tensor | None
+    prediction: Tensor  # (B, A - 1, 80, 2) positions of the agents [m]
 
 
 class TrajectoryDecoder(nn.Module):
@@ -58,24 +41,14 @@ class TrajectoryDecoder(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.multimodal_proj = Linear(blocks.DIM, MODES * blocks.DIM)
-        self.loc = _head(4 * STEPS)
-        self.pi = _head(1)
+        self.multimodal_proj = Linear(DIM, MODES * DIM)
+        self.loc = head(DIM, 2 * DIM, 4 * STEPS)
+        self.pi = head(DIM, 2 * DIM, 1)
 
     def forward(self, ego: Tensor) -> tuple[Tensor, Tensor]:
         """Trajectories (B, modes, steps, 4) and logits (B, modes) from (B, 128)."""
-        modes = self.multimodal_proj(ego).reshape(len(ego), MODES, blocks.DIM)
-        trajectories = self.loc(modes).reshape(len(ego), MODES, STEPS, 4)
-        return trajectories, self.pi(modes)[..., 0]
-
-
-def _head(outputs: int, *, bias: bool = True) -> nn.Sequential:
-    return nn.Sequential(
-        Linear(blocks.DIM, 2 * blocks.DIM, bias=bias),
-        nn.LayerNorm(2 * blocks.DIM),
-        nn.ReLU(),
-        Linear(2 * blocks.DIM, outputs),
-    )
+        modes = self.multimodal_proj(ego).view(len(ego), MODES, DIM)
+        return self.loc(modes).view(len(ego), MODES, STEPS, 4), self.pi(modes)[..., 0]
 
 
 class PlanTfNetwork(nn.Module):
@@ -83,41 +56,30 @@ class PlanTfNetwork(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.pos_emb = nn.Sequential(
-            Linear(4, blocks.DIM), nn.ReLU(), Linear(blocks.DIM, blocks.DIM)
-        )
-        self.agent_encoder = blocks.AgentEncoder()
-        limits = nn.Sequential(Linear(1, blocks.DIM), nn.ReLU(), Linear(blocks.DIM, blocks.DIM))
-        self.map_encoder = blocks.MapEncoder(POLYGON_CHANNELS, limits)
-        self.encoder_blocks = nn.ModuleList(blocks.EncoderBlock(HEADS) for _ in range(DEPTH))
-        self.norm = nn.LayerNorm(blocks.DIM)
+        self.pos_emb = perceptron(4, DIM, DIM)
+        self.agent_encoder = layers.AgentEncoder()
+        self.map_encoder = layers.MapEncoder(POLYGON_CHANNELS, perceptron(1, DIM, DIM))
+        self.encoder_blocks = nn.ModuleList(layers.EncoderBlock(HEADS) for _ in range(DEPTH))
+        self.norm = nn.LayerNorm(DIM)
         self.trajectory_decoder = TrajectoryDecoder()
-        self.agent_predictor = _head(2 * STEPS, bias=False)
-        store_by_columns(self)
+        self.agent_predictor = head(DIM, 2 * DIM, 2 * STEPS, bias=False)
 
-    def forward(self, seen: Inputs, *, predict: bool = False) -> Outputs:
-        """Plan for a batch; the agents' predictions only where asked for, no plan needs them."""
-        points = torch.cat(blocks.along_line(seen.points, seen), dim=-1)
-        packing, scenes = without_padding(seen.there, seen.counts)
-        tokens = torch.cat([self.agent_encoder(seen), self.map_encoder(points, seen)], dim=1)
-        x = packing.pack(tokens) + self._placed(packing.pack(seen.poses))
-        egos = scenes.firsts(x.device)
-        last = len(self.encoder_blocks) - 1
-        for index, block in enumerate(self.encoder_blocks):
-            x = block(x, scenes, egos if index == last and not predict else None)
+    def forward(self, inputs: Inputs) -> Outputs:
+        """Plan for a batch."""
+        scenes = layers.Scenes(inputs.known, inputs.counts)
+        points = torch.cat(inputs.along_lines(inputs.points), dim=-1)
+        tokens = torch.cat([self.agent_encoder(inputs), self.map_encoder(points, inputs)], dim=1)
+        poses = scenes.pack(inputs.poses)
+        angle = poses[:, 2:]
+        x = scenes.pack(tokens)
+        x = x + self.pos_emb(torch.cat([poses[:, :2], angle.cos(), angle.sin()], dim=-1))
+        for block in self.encoder_blocks:
+            x = block(x, scenes)
         x = self.norm(x)
-        trajectory, probability = self.trajectory_decoder(x[egos] if predict else x)
-        if not predict:
-            return Outputs(trajectory, probability, None)
-        prediction = self.agent_predictor(packing.unpack(x)[:, 1 : seen.valid.shape[1]])
-        shape = (*prediction.shape[:2], STEPS, 2)
-        return Outputs(trajectory, probability, prediction.reshape(shape))
-
-    def _placed(self, poses: Tensor) -> Tensor:
-        """(T, 128) of poses (T, 3)."""
-        angle = poses[:, 2]
-        where = torch.stack([poses[:, 0], poses[:, 1], angle.cos(), angle.sin()], dim=-1)
-        return self.pos_emb(where)
+        agents = scenes.unpack(x)[:, 1 : inputs.valid.shape[1]]
+        prediction = self.agent_predictor(agents).view(*agents.shape[:2], STEPS, 2)
+        trajectory, probability = self.trajectory_decoder(scenes.firsts(x))
+        return Outputs(trajectory, probability, prediction)
 
 
 def build_network(args: Mapping[str, Any] | None = None) -> PlanTfNetwork:
@@ -127,5 +89,5 @@ def build_network(args: Mapping[str, Any] | None = None) -> PlanTfNetwork:
 
 def drive_overrides(state: State) -> None:
     """Turn `base` weights into `drive` ones, in place."""
-    for layer, head in DRIVE_HEADS.items():
-        override_head(state, layer, head)
+    for layer, drive_head in DRIVE_HEADS.items():
+        override_head(state, layer, drive_head)

@@ -15,9 +15,11 @@ from shiftsim.kernels import BoolArray
 from shiftsim.planners.learned.base import LearnedPlanner
 from shiftsim.planners.learned.features import (
     NO_ROUTE,
+    STEP,
     AgentFeatures,
     agent_features,
     map_poses,
+    plan_of_poses,
     poses_of,
     route_blocks,
     short_history,
@@ -25,7 +27,6 @@ from shiftsim.planners.learned.features import (
     straight_on,
 )
 from shiftsim.planners.learned.map_features import LightLookup, RoadFeatures, road_features
-from shiftsim.planners.learned.plan_states import STEP, plan_of_poses
 from shiftsim.planners.routes.correction import RouteCorrector
 from shiftsim.sim.planner import History, Observation, SceneInfo
 from shiftsim.world.state import AX, HEADING, PACIFICA, VX, Trajectory, center_poses

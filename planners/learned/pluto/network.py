@@ -7,50 +7,14 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from shiftsim.planners.learned import network as layers
 from shiftsim.planners.learned.deterministic import DriveHead, State, override_head
-from shiftsim.planners.learned.network import blocks
-from shiftsim.planners.learned.network.rows import (
-    Linear,
-    Packing,
-    Scenes,
-    store_by_columns,
-    without_padding,
-)
-from shiftsim.planners.learned.pluto.network_decoder import (
-    DEPTH,
-    HEADS,
-    MODES,
-    STEPS,
-    FourierEmbedding,
-    MlpLayer,
-    MotionHeads,
-    PlanningDecoder,
-    motion,
-    motion_heads,
-)
+from shiftsim.planners.learned.network import DIM, Attention, Linear, Scenes, head, key_mask
 
-PREFIXES = ("model.",)  # of the names in the published checkpoint
-POLYGON_CHANNELS = 10
-RELEASED = {
-    "dim": blocks.DIM,
-    "state_channel": blocks.STATE_CHANNELS,
-    "polygon_channel": 6,  # and the boundaries
-    "history_channel": 9,
-    "history_steps": 21,
-    "future_steps": STEPS,
-    "encoder_depth": DEPTH,
-    "decoder_depth": DEPTH,
-    "drop_path": 0.2,  # training only
-    "dropout": 0.1,  # training only
-    "num_heads": HEADS,
-    "num_modes": MODES,
-    "state_dropout": 0.75,  # training only
-    "use_ego_history": False,
-    "state_attn_encoder": True,
-    "use_hidden_proj": True,
-    "cat_x": True,
-    "ref_free_traj": True,
-}
+POLYGON_CHANNELS, LINE_CHANNELS = 10, 6
+DEPTH, HEADS, MODES, STEPS = 4, 4, 12, 80
+NUM_FREQUENCIES = 64
+NEVER = -1e6  # logit of a reference line without points
 DRIVE_HEADS = {
     "planning_decoder.loc_head.mlp.3": DriveHead(
         gain=(80, 12), exponent=(1, 2), const=(0, 0), slope=(104, 7.8)
@@ -79,7 +43,7 @@ DRIVE_SCALES = {
 
 
 @dataclass(frozen=True, slots=True)
-class Inputs(blocks.SceneTensors):
+class Inputs(layers.SceneTensors):
     """One batch; S static objects and R reference lines."""
 
     object_pose: Tensor  # (B, S, 3) static objects x [m], y [m], heading [rad]
@@ -105,37 +69,158 @@ class Outputs(NamedTuple):
     ego: Tensor  # (B, 128) its token
 
 
+class Head(nn.Module):
+    """Linear, LayerNorm, ReLU, Linear."""
+
+    def __init__(self, hidden: int, outputs: int) -> None:
+        super().__init__()
+        self.mlp = head(DIM, hidden, outputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., 128) to (..., outputs)."""
+        return self.mlp(x)
+
+
+def _motion(x: Tensor, heads: Sequence[nn.Module]) -> Tensor:
+    """(..., steps, 2 H) from x (..., 128): each of H heads has two of the channels."""
+    return torch.cat([part(x).unflatten(-1, (STEPS, 2)) for part in heads], dim=-1)
+
+
+class FourierEmbedding(nn.Module):
+    """A vector from a few scalars, each by its own frequencies and layers; the sum counts."""
+
+    def __init__(self, inputs: int) -> None:
+        super().__init__()
+        self.freqs = nn.Embedding(inputs, NUM_FREQUENCIES)
+        self.mlps = nn.ModuleList(head(2 * NUM_FREQUENCIES + 1, DIM, DIM) for _ in range(inputs))
+        self.to_out = nn.Sequential(nn.LayerNorm(DIM), nn.ReLU(), Linear(DIM, DIM))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., inputs) to (..., 128)."""
+        turns = x[..., None] * self.freqs.weight * (2.0 * torch.pi)
+        waves = torch.cat([turns.cos(), turns.sin(), x[..., None]], dim=-1)
+        each = [layer(waves[..., index, :]) for index, layer in enumerate(self.mlps)]
+        return self.to_out(torch.stack(each).sum(dim=0))
+
+
 class StaticObjectsEncoder(nn.Module):
     """Tokens of the static objects, without their poses."""
 
     def __init__(self) -> None:
         super().__init__()
         self.obj_encoder = FourierEmbedding(2)
-        self.type_emb = nn.Embedding(4, blocks.DIM)
+        self.type_emb = nn.Embedding(4, DIM)
 
     def forward(self, shape: Tensor, category: Tensor, valid: Tensor) -> Tensor:
         """(B, S, 128) from sizes (B, S, 2); zero where not valid (B, S)."""
-        if not category.numel():
-            return shape.new_zeros(*category.shape, blocks.DIM)
         tokens: Tensor = self.obj_encoder(shape) + self.type_emb(category)
         return tokens * valid[..., None]
 
 
-class AgentPredictor(blocks.Prepared):
+class AgentPredictor(nn.Module):
     """Motion of the agents from their tokens."""
 
     def __init__(self) -> None:
         super().__init__()
-        heads = (MlpLayer(blocks.DIM, 2 * blocks.DIM, 2 * STEPS) for _ in range(3))
+        heads = (Head(2 * DIM, 2 * STEPS) for _ in range(3))
         self.loc_predictor, self.yaw_predictor, self.vel_predictor = heads
 
     def forward(self, tokens: Tensor) -> Tensor:
         """(B, A, 128) to (B, A, 80, 6)."""
-        return motion(tokens, self.prepared())
+        return _motion(tokens, (self.loc_predictor, self.yaw_predictor, self.vel_predictor))
 
-    def prepare(self) -> MotionHeads:
-        """The heads as one."""
-        return motion_heads([self.loc_predictor, self.yaw_predictor, self.vel_predictor])
+
+class DecoderBlock(nn.Module):
+    """Attention among lines, among modes, and to the scene; then a feed-forward part."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.r2r_attn, self.m2m_attn, self.cross_attn = (Attention(DIM, HEADS) for _ in range(3))
+        self.ffn = nn.Sequential(
+            Linear(DIM, 4 * DIM), nn.ReLU(), nn.Identity(), Linear(4 * DIM, DIM)
+        )
+        self.norm1, self.norm2, self.norm3, self.norm4 = (nn.LayerNorm(DIM) for _ in range(4))
+
+    def forward(
+        self,
+        x: Tensor,  # (L, modes, 128) queries of the reference lines
+        place: Tensor,  # (1, modes, 128) embedding of the modes
+        lines: Scenes,  # how the lines lie
+        masks: Sequence[Tensor],  # by scene, added to the logits of its lines as keys
+        tokens: Tensor,  # (T, 128) of the scenes
+        scenes: Scenes,  # how these lie
+    ) -> Tensor:
+        """(L, modes, 128); zero before the attention to the scene for lines without points."""
+        normed = self.norm1(x)
+        parts = self.r2r_attn.project(normed, normed, normed)
+        mixed = []
+        for q, k, v, mask in zip(*map(lines.split, parts), masks, strict=True):
+            # every mode of a line attends to the same mode of the scene's others
+            q, k, v = q.transpose(0, 1), k.transpose(0, 1), v.transpose(0, 1)
+            mixed.append(self.r2r_attn.attend(q, k, v, mask).transpose(0, 1))
+        x = x + self.r2r_attn.out_proj(torch.cat(mixed))
+        normed = self.norm2(x)
+        x = x + self.m2m_attn(normed + place, normed + place, normed)
+        x = x * lines.valid[:, None, None]
+        rows, counts = x.flatten(0, 1), [count * MODES for count in lines.counts]
+        rows = rows + self.cross_attn.segment_attention(self.norm3(rows), tokens, counts, scenes)
+        return (rows + self.ffn(self.norm4(rows))).view(x.shape)
+
+
+class PlanningDecoder(nn.Module):
+    """Twelve trajectories and their logits for every reference line."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.misordered_masks = False  # for comparisons with the official network
+        self.r_encoder = layers.PointsEncoder(LINE_CHANNELS)
+        self.r_pos_emb = FourierEmbedding(3)
+        self.q_proj = Linear(2 * DIM, DIM)
+        self.m_emb = nn.Parameter(0.01 * torch.randn(1, 1, MODES, DIM))
+        self.m_pos = nn.Parameter(0.01 * torch.randn(1, MODES, DIM))
+        self.decoder_blocks = nn.ModuleList(DecoderBlock() for _ in range(DEPTH))
+        self.cat_x_proj = Linear(2 * DIM, DIM)
+        self.loc_head, self.yaw_head, self.vel_head = (Head(2 * DIM, 2 * STEPS) for _ in range(3))
+        self.pi_head = Head(DIM, 1)
+
+    def forward(
+        self, inputs: Inputs, tokens: Tensor, scenes: Scenes, egos: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Trajectories (B, R, modes, steps, 6) and logits (B, R, modes).
+
+        `tokens` (T, 128) are those of the scenes, `egos` (B, 128) of the egos.
+        """
+        valid = inputs.line_valid.any(dim=-1)
+        lines = Scenes([valid], inputs.counts and inputs.counts[-1:])
+        embedded = lines.pack(self._embed_lines(inputs))
+        shape = len(embedded), MODES, DIM
+        x = torch.cat([embedded[:, None].expand(shape), self.m_emb[0].expand(shape)], dim=-1)
+        x, masks = self.q_proj(x), self._line_masks(valid, lines.counts)
+        for block in self.decoder_blocks:
+            x = block(x, self.m_pos, lines, masks, tokens, scenes)
+        counts = torch.tensor(lines.counts, device=egos.device)
+        ego = egos.repeat_interleave(counts, dim=0)[:, None].expand(shape)
+        x = self.cat_x_proj(torch.cat([x, ego], dim=-1))
+        plans = _motion(x, (self.loc_head, self.yaw_head, self.vel_head))
+        logits = self.pi_head(x)[..., 0].masked_fill(~lines.valid[:, None], NEVER)
+        return lines.unpack(plans), lines.unpack(logits, NEVER)
+
+    def _line_masks(self, valid: Tensor, counts: Sequence[int]) -> list[Tensor]:
+        """By scene (1 or modes, 1, 1, count) logits added to its lines as keys, from (B, R)."""
+        # a scene without any line that has points attends to all of them, and nothing reads it
+        logits = key_mask(valid | ~valid.any(dim=1, keepdim=True))[:, None]
+        if self.misordered_masks:  # nuPlan rule 307: by mode, where queries are ordered by scene
+            logits = logits.repeat(MODES, 1, 1, 1, 1).view(len(valid), MODES, *logits.shape[2:])
+        return [row[..., :count] for row, count in zip(logits, counts, strict=True)]
+
+    def _embed_lines(self, inputs: Inputs) -> Tensor:
+        """(B, R, 128)."""
+        points, angles = inputs.line_points, inputs.line_orientations
+        directions = torch.stack([angles.cos(), angles.sin()], dim=-1)
+        parts = (points - points[:, :, :1], inputs.line_vectors, directions)
+        start = torch.cat([points[:, :, 0], angles[:, :, :1]], dim=-1)
+        lines = self.r_encoder(torch.cat(parts, dim=-1), inputs.line_valid)
+        return lines + self.r_pos_emb(start)
 
 
 class PlutoNetwork(nn.Module):
@@ -144,58 +229,36 @@ class PlutoNetwork(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.pos_emb = FourierEmbedding(3)
-        self.agent_encoder = blocks.AgentEncoder()
-        self.map_encoder = blocks.MapEncoder(POLYGON_CHANNELS, FourierEmbedding(1))
+        self.agent_encoder = layers.AgentEncoder()
+        self.map_encoder = layers.MapEncoder(POLYGON_CHANNELS, FourierEmbedding(1))
         self.static_objects_encoder = StaticObjectsEncoder()
-        self.encoder_blocks = nn.ModuleList(blocks.EncoderBlock(HEADS) for _ in range(DEPTH))
-        self.norm = nn.LayerNorm(blocks.DIM)
+        self.encoder_blocks = nn.ModuleList(layers.EncoderBlock(HEADS) for _ in range(DEPTH))
+        self.norm = nn.LayerNorm(DIM)
         self.agent_predictor = AgentPredictor()
         self.planning_decoder = PlanningDecoder()
-        # of the training only; the checkpoint holds it
-        self.hidden_proj = nn.Sequential(
-            Linear(blocks.DIM, blocks.DIM), nn.ReLU(), Linear(blocks.DIM, blocks.DIM)
-        )
-        self.ref_free_decoder = MlpLayer(blocks.DIM, 2 * blocks.DIM, 4 * STEPS)
-        store_by_columns(self)
+        self.hidden_proj = layers.perceptron(DIM, DIM, DIM)  # of the contrastive loss only
+        self.ref_free_decoder = Head(2 * DIM, 4 * STEPS)
 
-    def forward(self, seen: Inputs) -> Outputs:
+    def forward(self, inputs: Inputs) -> Outputs:
         """Plan for a batch."""
-        *counts, num_lines = seen.counts or _all_counts(seen)
-        x, scenes, packing = self._encode(seen, counts)
-        egos = x[scenes.firsts(x.device)]
-        prediction = self.agent_predictor(packing.unpack(x)[:, 1 : seen.valid.shape[1]])
-        free = self.ref_free_decoder(egos).reshape(len(egos), -1, 4)
-        trajectory, probability = self.planning_decoder(seen, num_lines, x, scenes, egos)
-        return Outputs(trajectory, probability, prediction, free, egos)
-
-    def _encode(
-        self, seen: Inputs, counts: Sequence[Sequence[int]]
-    ) -> tuple[Tensor, Scenes, Packing]:
-        """Tokens (T, 128) of ego, agents, polygons and static objects, scene by scene.
-
-        Also how they lie, and which of all rows (B, A + M + S) they are: those without padding.
-        """
-        packing, scenes = without_padding((*seen.there, seen.object_valid), counts)
-        middle = seen.points[:, :, 0]
-        sides = [seen.points[:, :, side] - middle for side in (1, 2)]
-        points = torch.cat([*blocks.along_line(middle, seen), *sides], dim=-1)
-        tokens = (
-            self.agent_encoder(seen),
-            self.map_encoder(points, seen),
-            self.static_objects_encoder(seen.object_shape, seen.object_category, seen.object_valid),
-        )
-        poses = packing.pack(torch.cat([seen.poses, seen.object_pose], dim=1))
+        scenes = Scenes((*inputs.known, inputs.object_valid), inputs.counts and inputs.counts[:-1])
+        middle, left, right = inputs.points.unbind(dim=2)
+        sides = [left - middle, right - middle]
+        points = torch.cat([*inputs.along_lines(middle), *sides], dim=-1)
+        objects = inputs.object_shape, inputs.object_category, inputs.object_valid
+        agents, polygons = self.agent_encoder(inputs), self.map_encoder(points, inputs)
+        tokens = torch.cat([agents, polygons, self.static_objects_encoder(*objects)], dim=1)
+        poses = scenes.pack(torch.cat([inputs.poses, inputs.object_pose], dim=1))
         angle = (poses[:, 2:] + torch.pi) % (2.0 * torch.pi) - torch.pi
-        where = self.pos_emb(torch.cat([poses[:, :2], angle], dim=-1))
-        x = packing.pack(torch.cat(tokens, dim=1)) + where
+        x = scenes.pack(tokens) + self.pos_emb(torch.cat([poses[:, :2], angle], dim=-1))
         for block in self.encoder_blocks:
             x = block(x, scenes)
-        return self.norm(x), scenes, packing
-
-
-def _all_counts(seen: Inputs) -> list[list[int]]:
-    parts = (seen.category, seen.kind, seen.object_category, seen.line_valid)
-    return [[part.shape[1]] * len(part) for part in parts]
+        x = self.norm(x)
+        egos = scenes.firsts(x)
+        prediction = self.agent_predictor(scenes.unpack(x)[:, 1 : inputs.valid.shape[1]])
+        free = self.ref_free_decoder(egos).view(len(egos), STEPS, 4)
+        trajectory, probability = self.planning_decoder(inputs, x, scenes, egos)
+        return Outputs(trajectory, probability, prediction, free, egos)
 
 
 def build_network(args: Mapping[str, Any] | None = None) -> PlutoNetwork:
@@ -205,7 +268,7 @@ def build_network(args: Mapping[str, Any] | None = None) -> PlutoNetwork:
 
 def drive_overrides(state: State) -> None:
     """Turn `base` weights into `drive` ones, in place."""
-    for layer, head in DRIVE_HEADS.items():
-        override_head(state, layer, head)
+    for layer, drive_head in DRIVE_HEADS.items():
+        override_head(state, layer, drive_head)
     for name, factor in DRIVE_SCALES.items():
         state[name] = (factor * state[name].astype("float64")).astype(state[name].dtype)

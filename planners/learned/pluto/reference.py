@@ -9,11 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.geometry.boxes import meets_bounds, wrap_angles
-from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.geometry.boxes import wrap_angles
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.planners.proposals.areas import Areas, make_areas, select_areas
 from shiftsim.planners.routes.graph import LanePath, deviation, lane_path, sub_path
-from shiftsim.world.layers import Polygons, Polylines, meets_convex, square_around
 from shiftsim.world.map import NONE, VectorMap
 
 AREA_HALF_SIDE = 60.0  # m, of the square of the drivable areas
@@ -37,13 +36,6 @@ class Drivable(NamedTuple):
     limits: FloatArray  # (M,) speed limit of each area of the map, of this step [m/s]
 
 
-class MapAreas(NamedTuple):
-    """What is made once per map."""
-
-    areas: Areas  # all areas of the map, none of them on a route
-    limits: FloatArray  # (M,) speed limits, 50 where the map has none [m/s]
-
-
 class RouteLanes(NamedTuple):
     """What is made once per scenario."""
 
@@ -56,25 +48,27 @@ class RouteLanes(NamedTuple):
     paths: dict[tuple[int, ...], LanePath]  # made so far, by their lanes
 
 
-def map_areas(road: VectorMap) -> MapAreas:
-    """Areas of all lanes, connectors and car parks of a map."""
+def areas_of_map(road: VectorMap) -> tuple[Areas, FloatArray]:
+    """Areas of a map, none on a route, and their speed limits (M,), 50 m/s where it has none."""
     limits = np.full(len(road.edges) + len(road.car_parks), FALLBACK_LIMIT)
     known = np.nan_to_num(road.speed_limits, nan=0.0)
     limits[: len(known)] = np.where(known == 0.0, FALLBACK_LIMIT, known)
-    return MapAreas(make_areas(road, []), limits)
+    return make_areas(road, []), limits
 
 
-def route_lanes(road: VectorMap, made: MapAreas, blocks: Sequence[int]) -> RouteLanes:
-    """Lanes of a corrected route."""
+def route_lanes(
+    road: VectorMap, map_areas: tuple[Areas, FloatArray], blocks: Sequence[int]
+) -> RouteLanes:
+    """Lanes of a corrected route; `map_areas` are of `areas_of_map`."""
+    areas, limits = map_areas
     unique = list(dict.fromkeys(blocks))
     has_block = np.zeros(len(road.blocks), np.bool_)
     has_block[unique] = True
     is_on = (road.block_of != NONE) & has_block[road.block_of]
     lanes = np.flatnonzero(is_on)
     starts = np.concatenate([lanes[lanes >= road.num_lanes], lanes[lanes < road.num_lanes]])
-    on_route = np.isin(made.areas.lane, lanes)
-    areas = made.areas._replace(on_route=on_route)
-    return RouteLanes(unique, starts, has_block, is_on, areas, made.limits, {})
+    areas = areas._replace(on_route=np.isin(areas.lane, lanes))
+    return RouteLanes(unique, starts, has_block, is_on, areas, limits, {})
 
 
 def drivable_near(road: VectorMap, route: RouteLanes, x: float, y: float) -> Drivable:
@@ -97,11 +91,13 @@ def reference_lines(
     `rear` (3,) and `center` (3,) are the poses of the rear axle and of the ego box.
     """
     x, y = float(rear[0]), float(rear[1])
-    found = np.empty(len(route.starts), np.int64)
-    count = _start_lanes(
-        road.edges.polygons, road.baselines, route.starts, rear, center[0], center[1], found
-    )
-    starts = found[:count].tolist()
+    near = road.edges.within_box(float(center[0]), float(center[1]), START_HALF_SIDE)
+    starts = [
+        start
+        for start in route.starts[np.isin(route.starts, near)].tolist()
+        if road.baselines.length(start) > MIN_BASELINE
+        and deviation(road.baselines, start, STRIDE, *rear.tolist())[1] < MAX_HEADING_ERROR
+    ]
     after = {lane for start in starts for lane in road.outgoing.at(start).tolist()}
     lines, lengths = [], []
     for start in starts:
@@ -138,47 +134,16 @@ def _paths_from(
 
 def _distinct(lines: list[FloatArray]) -> list[FloatArray]:
     """The lines without those that run where an earlier one does."""
-    kept = [True] * len(lines)
-    for i, first in enumerate(lines):
-        for j in range(i + 1, len(lines)):
-            # nuPlan rule 247: a removed line still removes others
-            if kept[j] and _runs_along(first, lines[j]):
-                kept[j] = False
-    return [line for line, keep in zip(lines, kept, strict=True) if keep]
-
-
-@kernel
-def _runs_along(first: FloatArray, second: FloatArray) -> bool:
-    for row in range(min(len(first), len(second))):
-        dx, dy = first[row, 0] - second[row, 0], first[row, 1] - second[row, 1]
-        if abs(dx) + abs(dy) >= SAME_LINE:
-            return False
-    return True
-
-
-@kernel
-def _start_lanes(
-    polygons: Polygons,
-    baselines: Polylines,
-    lanes: IntArray,
-    rear: FloatArray,
-    x: float,
-    y: float,
-    out: IntArray,
-) -> int:
-    """Write the lanes a line may start on into `out`; their number."""
-    count = 0
-    square = square_around(x, y, START_HALF_SIDE)
-    for lane in lanes:
-        if (
-            meets_bounds(square, polygons.bounds[lane])
-            and baselines.arc[baselines.ptr[lane + 1] - 1] > MIN_BASELINE
-            and meets_convex(polygons, lane, square)
-            and deviation(baselines, lane, STRIDE, rear[0], rear[1], rear[2])[1] < MAX_HEADING_ERROR
-        ):
-            out[count] = lane
-            count += 1
-    return count
+    distinct = []
+    for index, line in enumerate(lines):
+        for earlier in lines[:index]:  # nuPlan rule 247: a removed line still removes others
+            count = min(len(earlier), len(line))
+            apart = np.abs(earlier[:count, :2] - line[:count, :2])
+            if (apart[:, 0] + apart[:, 1] < SAME_LINE).all():
+                break
+        else:
+            distinct.append(line)
+    return distinct
 
 
 def _cut(path: LanePath, x: float, y: float) -> tuple[FloatArray, float]:
@@ -204,24 +169,21 @@ class LineFeatures(NamedTuple):
 
 def line_features(lines: Sequence[FloatArray], rear: FloatArray) -> LineFeatures:
     """Every fourth point of each line, in the frame of the rear axle (3,)."""
-    made = LineFeatures(
-        np.zeros((len(lines), NUM_POINTS, 2), np.float32),
-        np.zeros((len(lines), NUM_POINTS, 2), np.float32),
-        np.zeros((len(lines), NUM_POINTS), np.float32),
-        np.zeros((len(lines), NUM_POINTS), np.bool_),
-    )
     points = np.zeros((len(lines), NUM_POINTS, 5))
+    valid = np.zeros((len(lines), NUM_POINTS), np.bool_)
     for row, line in enumerate(lines):
         sampled = line[::STRIDE][: NUM_POINTS + 1]
         count = len(sampled) - 1
         points[row, :count, :2] = sampled[:-1, :2]
         points[row, :count, 2:4] = np.diff(sampled[:, :2], axis=0)
         points[row, :count, 4] = sampled[:-1, 2]
-        made.valid_mask[row, :count] = True
+        valid[row, :count] = True
     cos, sin = np.cos(rear[2]), np.sin(rear[2])
     turn = np.array([[cos, -sin], [sin, cos]])
     # nuPlan rule 248: padding is moved as well
-    made.position[:] = (points[..., :2] - rear[:2]) @ turn
-    made.vector[:] = points[..., 2:4] @ turn
-    made.orientation[:] = points[..., 4] - rear[2]
-    return made
+    position, vector = (points[..., :2] - rear[:2]) @ turn, points[..., 2:4] @ turn
+    orientation = points[..., 4] - rear[2]
+    single = np.float32
+    return LineFeatures(
+        position.astype(single), vector.astype(single), orientation.astype(single), valid
+    )

@@ -4,14 +4,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.geometry.boxes import box_corners, boxes_to_corners, meets_bounds
-from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.geometry.boxes import box_corners, boxes_to_corners
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.planners.learned.pluto.reference import Drivable, RouteLanes
-from shiftsim.planners.proposals.contacts import Others, touches_boxes
+from shiftsim.planners.proposals.contacts import Obstacles, touches_boxes
 from shiftsim.planners.proposals.tracker import SCORED
 from shiftsim.planners.routes.lights import red_lanes
 from shiftsim.sim.planner import Observation
-from shiftsim.world.layers import Polygons, meets_convex
+from shiftsim.world.layers import meeting
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AgentKind, Tracks
 
@@ -46,7 +46,7 @@ class World(NamedTuple):
     """Everything a proposal can hit."""
 
     # static objects, then agents, at 0, 0.1, … 4 s; what touches the ego now is ignored
-    others: Others
+    obstacles: Obstacles
     lights: IntArray  # connectors of the route whose light is red
 
 
@@ -61,25 +61,13 @@ def static_objects(tracks: Tracks, drivable: Drivable, x: float, y: float) -> St
     distances = np.hypot(poses[here, 0] - x, poses[here, 1] - y)
     here, distances = here[distances <= SEEN_RADIUS], distances[distances <= SEEN_RADIUS]
     if len(here):
+        areas, near = drivable.areas.polygons, drivable.selected
         corners = boxes_to_corners(poses[here], sizes[here])
-        on_road = _touch_areas(drivable.areas.polygons, drivable.selected, corners)
+        on_road = [np.isin(meeting(areas, box), near).any() for box in corners]
         here, distances = here[on_road], distances[on_road]
     order = np.argsort(categories[here], kind="stable")
     here = here[order]
     return StaticObjects(poses[here], sizes[here], categories[here], distances[order])
-
-
-@kernel
-def _touch_areas(polygons: Polygons, selected: IntArray, corners: FloatArray) -> BoolArray:
-    """(S,) whether a box (S, 4, 2) shares a point with an selected area."""
-    out = np.zeros(len(corners), np.bool_)
-    for index in range(len(corners)):
-        box = corners[index]
-        for area in selected:
-            if meets_bounds(box, polygons.bounds[area]) and meets_convex(polygons, area, box):
-                out[index] = True
-                break
-    return out
 
 
 def red_lights(road: VectorMap, route: RouteLanes, observation: Observation) -> IntArray:
@@ -102,7 +90,7 @@ def make_world(
     centers = np.ascontiguousarray(poses[..., :2])
     boxes = np.empty((*poses.shape[:2], 4, 2))
     _place(poses, sizes, boxes)
-    others = Others(
+    obstacles = Obstacles(
         boxes=boxes,
         centers=centers,
         centroids=centers,
@@ -111,7 +99,7 @@ def make_world(
         is_agent=np.arange(len(sizes)) >= count,
         ignored=touches_boxes(footprint, boxes[0]),
     )
-    return World(others, lights)
+    return World(obstacles, lights)
 
 
 @kernel

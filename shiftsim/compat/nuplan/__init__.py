@@ -1,6 +1,6 @@
 """Runs planners written for nuPlan: subclasses of its `AbstractPlanner`, unchanged.
 
-Where nuPlan's devkit is installed, planners get its own objects. Where it is not, stand-ins take
+Where nuPlan's devkit is installed, planners get its own objects. Where it is not, shims take
 the `nuplan.*` module names in this process.
 
     shiftsim run --planner nuplan:my_package.planner:MyPlanner --planner-arg horizon=8

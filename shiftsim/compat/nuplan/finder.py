@@ -1,4 +1,4 @@
-"""Makes `import nuplan…` find the stand-ins, and says clearly what they do not have."""
+"""Makes `import nuplan…` find the shims, and says clearly what they do not have."""
 
 import importlib.util
 import re
@@ -12,95 +12,48 @@ from typing import Any
 
 from shiftsim.errors import MissingExtraError
 
-_SOURCES = ("geometry", "transforms", "boxes", "objects", "ego", "map_types", "planning")
-# module: the names that can be imported from it: its own, then those it imports itself
+_SHIMS = ("geometry", "transforms", "boxes", "objects", "ego", "map_types", "planning")
 _TABLE = """
-nuplan.common.actor_state.agent: Agent AgentState AgentTemporalState OrientedBox PredictedTrajectory
-    SceneObjectMetadata StateVector2D TimePoint TrackedObjectType
-nuplan.common.actor_state.agent_state: AgentState OrientedBox SceneObject SceneObjectMetadata
-    StateSE2 StateVector2D TrackedObjectType
-nuplan.common.actor_state.agent_temporal_state: AgentTemporalState PredictedTrajectory TimePoint
-    Waypoint
-nuplan.common.actor_state.car_footprint: CarFootprint OrientedBox OrientedBoxPointType Point2D
-    StateSE2 VehicleParameters translate_longitudinally
-nuplan.common.actor_state.dynamic_car_state: DynamicCarState get_velocity_shifted
-    get_acceleration_shifted StateVector2D
-nuplan.common.actor_state.ego_state: EgoState AgentState CarFootprint DynamicCarState
-    InterpolatableState SceneObjectMetadata SplitState StateSE2 StateVector2D TimePoint
-    TrackedObjectType VehicleParameters Waypoint get_acceleration_shifted get_velocity_shifted
-nuplan.common.actor_state.oriented_box: OrientedBox OrientedBoxPointType Dimension in_collision
-    collision_by_radius_check Point2D StateSE2 translate_longitudinally_and_laterally
-nuplan.common.actor_state.scene_object: SceneObject SceneObjectMetadata OrientedBox StateSE2
-    TrackedObjectType
-nuplan.common.actor_state.state_representation: TimeDuration TimePoint Point2D StateSE2
-    ProgressStateSE2 TemporalStateSE2 StateVector2D
-nuplan.common.actor_state.static_object: StaticObject OrientedBox SceneObject SceneObjectMetadata
-    StateVector2D TrackedObjectType
-nuplan.common.actor_state.tracked_objects: TrackedObjects TrackedObject AGENT_TYPES Agent
-    AgentTemporalState OrientedBox STATIC_OBJECT_TYPES SceneObject SceneObjectMetadata StaticObject
-    TrackedObjectType
-nuplan.common.actor_state.tracked_objects_types: TrackedObjectType AGENT_TYPES STATIC_OBJECT_TYPES
-nuplan.common.actor_state.vehicle_parameters: BoxParameters VehicleParameters
-    get_pacifica_parameters
-nuplan.common.actor_state.waypoint: Waypoint InterpolatableState OrientedBox SplitState StateSE2
-    StateVector2D TimePoint
-nuplan.common.geometry.compute: lateral_distance longitudinal_distance compute_distance
-    principal_value AngularInterpolator Dimension OrientedBox Point2D StateSE2
-    get_pacifica_parameters translate_laterally translate_longitudinally
-nuplan.common.geometry.convert: pose_from_matrix matrix_from_pose absolute_to_relative_poses
-    relative_to_absolute_poses numpy_array_to_absolute_pose numpy_array_to_absolute_velocity
-    vector_2d_from_magnitude_angle StateSE2 StateVector2D
-nuplan.common.geometry.transform: rotate_2d translate rotate rotate_angle transform
-    translate_longitudinally translate_laterally translate_longitudinally_and_laterally Point2D
-    StateSE2
-nuplan.common.maps.abstract_map: AbstractMap MapObject PolygonMapObject Intersection Lane
-    LaneConnector Point2D RoadBlockGraphEdgeMapObject SemanticMapLayer StopLine
-nuplan.common.maps.abstract_map_objects: AbstractMapObject PolygonMapObject PolylineMapObject
-    GraphEdgeMapObject LaneGraphEdgeMapObject Lane LaneConnector RoadBlockGraphEdgeMapObject
-    StopLine Intersection IntersectionType LaneConnectorType Point2D StateSE2 StopLineType
-nuplan.common.maps.maps_datatypes: SemanticMapLayer LaneConnectorType StopLineType IntersectionType
-    TrafficLightStatusType TrafficLightStatusData
-nuplan.common.utils.interpolatable_state: InterpolatableState SplitState TimePoint
-nuplan.common.utils.split_state: SplitState
-nuplan.planning.simulation.controller.motion_model.kinematic_bicycle: KinematicBicycleModel
-    DynamicCarState EgoState StateSE2 StateVector2D TimePoint VehicleParameters principal_value
-nuplan.planning.simulation.history.simulation_history_buffer: SimulationHistoryBuffer
-    DetectionsTracks EgoState Observation Sensors
-nuplan.planning.simulation.observation.observation_type: CameraChannel LidarChannel Observation
-    Sensors DetectionsTracks TrackedObjects
-nuplan.planning.simulation.planner.abstract_planner: AbstractPlanner PlannerInitialization
-    PlannerInput AbstractMap AbstractTrajectory Observation PlannerReport SimulationHistoryBuffer
-    SimulationIteration StateSE2 TrafficLightStatusData
-nuplan.planning.simulation.planner.planner_report: PlannerReport MLPlannerReport
-nuplan.planning.simulation.simulation_time_controller.simulation_iteration: SimulationIteration
-    TimePoint
-nuplan.planning.simulation.trajectory.abstract_trajectory: AbstractTrajectory TimePoint
-nuplan.planning.simulation.trajectory.interpolated_trajectory: InterpolatedTrajectory
-    AbstractTrajectory AngularInterpolator InterpolatableState SplitState TimePoint
-nuplan.planning.simulation.trajectory.predicted_trajectory: PredictedTrajectory AbstractTrajectory
-    EgoState InterpolatedTrajectory Waypoint
-nuplan.planning.simulation.trajectory.trajectory_sampling: TrajectorySampling
+nuplan.common.actor_state: agent agent_state agent_temporal_state car_footprint dynamic_car_state
+    ego_state oriented_box scene_object state_representation static_object tracked_objects
+    tracked_objects_types vehicle_parameters waypoint
+nuplan.common.geometry: compute convert transform
+nuplan.common.maps: abstract_map abstract_map_objects maps_datatypes
+nuplan.common.utils: interpolatable_state split_state
+nuplan.planning.simulation.controller.motion_model: kinematic_bicycle
+nuplan.planning.simulation.history: simulation_history_buffer
+nuplan.planning.simulation.observation: observation_type
+nuplan.planning.simulation.planner: abstract_planner planner_report
+nuplan.planning.simulation.simulation_time_controller: simulation_iteration
+nuplan.planning.simulation.trajectory: abstract_trajectory interpolated_trajectory
+    predicted_trajectory trajectory_sampling
 """
-MODULES = dict(re.findall(r"^(\S+): (.*(?:\n .*)*)", _TABLE, re.MULTILINE))
+MODULES = [
+    f"{package}.{name}"
+    for package, names in re.findall(r"^(\S+): (.*(?:\n .*)*)", _TABLE, re.MULTILINE)
+    for name in names.split()
+]
 _PACKAGES = {name[:end] for name in MODULES for end, sign in enumerate(name) if sign == "."}
 
 _HINT = "install nuplan-devkit itself, which is then used instead, or leave that import out"
 
 
-class StandInFinder(MetaPathFinder, Loader):
+class ShimFinder(MetaPathFinder, Loader):
     """Finds the modules of `MODULES`. Nothing else of that name exists once it is installed.
 
-    Every module says that it is a package: then `from module import name` with a name that it does
-    not have comes here, and ends with one clear error instead of Python's own.
+    Every module has all names of the shims: modules of the devkit import from each other, and
+    planners import from either. Every module says that it is a package: then `from module import
+    name` with a name that there is not comes here, and ends with one clear error instead of
+    Python's own.
     """
 
     def find_spec(
         self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """A spec for a stand-in, or None for modules of others.
+        """A spec for a shim, or None for modules of others.
 
         Raises:
-            MissingExtraError: There is no stand-in for this part of the devkit.
+            MissingExtraError: There is no shim for this part of the devkit.
         """
         if name.partition(".")[0] != "nuplan":
             return None
@@ -113,11 +66,10 @@ class StandInFinder(MetaPathFinder, Loader):
 
     def exec_module(self, module: ModuleType) -> None:
         """Put the names into a module."""
-        if wanted := MODULES.get(module.__name__, "").split():
-            known: dict[str, Any] = {}
-            for source in _SOURCES:
-                known |= vars(import_module(f"shiftsim.compat.nuplan.stand_ins.{source}"))
-            vars(module).update((name, known[name]) for name in wanted)
+        if module.__name__ in MODULES:
+            for shim in _SHIMS:
+                names = vars(import_module(f"shiftsim.compat.nuplan.shims.{shim}"))
+                vars(module).update((name, names[name]) for name in names if name[0] != "_")
 
         def missing(name: str) -> Any:
             raise AttributeError(f"{_missing(f'{module.__name__}.{name}')}; {_HINT}")
@@ -128,9 +80,9 @@ class StandInFinder(MetaPathFinder, Loader):
 def install() -> bool:
     """Make `import nuplan…` work in this process; call it before importing a planner's module.
 
-    Returns whether the stand-ins are used: false where nuPlan's devkit is there.
+    Returns whether the shims are used: false where nuPlan's devkit is there.
     """
-    if any(isinstance(finder, StandInFinder) for finder in sys.meta_path):
+    if any(isinstance(finder, ShimFinder) for finder in sys.meta_path):
         return True
     try:
         if (
@@ -143,9 +95,9 @@ def install() -> bool:
     # a folder named nuplan, of data for instance, counts as an empty package: drop it
     for name in [name for name in sys.modules if name.partition(".")[0] == "nuplan"]:
         del sys.modules[name]
-    sys.meta_path.insert(0, StandInFinder())
+    sys.meta_path.insert(0, ShimFinder())
     return True
 
 
 def _missing(name: str) -> str:
-    return f"{name!r} is not among shiftsim's stand-ins for nuPlan's devkit"
+    return f"{name!r} is not among shiftsim's shims for nuPlan's devkit"

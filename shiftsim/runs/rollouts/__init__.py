@@ -49,7 +49,7 @@ def complete_rollout(rows: pa.RecordBatch, scenario: Scenario, task: Task) -> Si
     """
     time_us = rows["time_us"].to_numpy()
     samples = scenario.iteration_rows[:-1]
-    if scenario.script is not None and scenario.script.finish is not None:
+    if scenario.script is not None and scenario.script.termination is not None:
         samples = samples[: len(time_us)]  # it may have ended before its time
     if not np.array_equal(time_us, scenario.time_us[samples]):
         raise DataError(
@@ -62,12 +62,8 @@ def complete_rollout(rows: pa.RecordBatch, scenario: Scenario, task: Task) -> Si
     tracks = scenario.tracks.rows(samples)
     try:
         plans = stored_plans(rows)
-        if "track_valid" in rows.schema.names:
-            stored: dict[str, Any] = stored_tracks(rows)
-            if stored["valid"].shape != tracks.valid.shape:
-                raise ValueError(
-                    f"tracks of shape {stored['valid'].shape}, not {tracks.valid.shape}"
-                )
+        if "track_tokens" in rows.schema.names:
+            stored: dict[str, Any] = stored_tracks(rows, tracks.tokens)
             tracks = replace(tracks, **stored)
     except ValueError as error:
         raise DataError(f"{where} is damaged: {error}", hint="make the run again") from error

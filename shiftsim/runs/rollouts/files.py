@@ -9,33 +9,24 @@ whose. The first columns name the task, for readers that know nothing of places.
 import re
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from shiftsim.data.store.tables import TableWriter
+from shiftsim.data.store.tables import encodings
 from shiftsim.errors import DataError
-from shiftsim.files import draft
+from shiftsim.files import temp_path
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.rollouts.columns import IN_PLANES, as_today, check_columns
+from shiftsim.runs.rollouts.columns import STATES, TRACKS
 
 FOLDER = "rollouts"
 _PART = re.compile(r"part-\d+\.parquet")
 _MAX_FILE = 1024, 256 << 20  # rollouts, bytes in memory
 _MAX_GROUP = 16, 16 << 20
-# states hardly compress and are never searched: what costs more time brings next to nothing, but
-# bytes in planes
-_WRITE_OPTIONS: dict[str, Any] = {
-    "compression": "zstd",
-    "compression_level": 1,
-    "use_dictionary": ["planner", "noise", "token"],
-    "use_byte_stream_split": IN_PLANES,
-    "write_statistics": False,
-}
-_NAME = pa.dictionary(pa.int32(), pa.string())
-_KINDS = {"planner": _NAME, "noise": _NAME, "seed": pa.int64(), "token": _NAME}
+_REPEATING = ("planner", "noise", "token", "track_tokens", "track_length_m", "track_width_m")
+_KINDS = {"planner": pa.string(), "noise": pa.string(), "seed": pa.int64(), "token": pa.string()}
 _KEY = pa.schema(
     [
         pa.field(name, kind, nullable=False)
@@ -91,7 +82,7 @@ class RolloutReader:
         if self._file is None or self._path != place.file:
             self._file, self._path, self._group = _opened(place.file), place.file, -1
             try:
-                check_columns({field.name: field.type for field in self._file.schema_arrow})
+                _check_columns(self._file.schema_arrow)
             except TypeError as error:
                 raise _unreadable(place.file, error) from error
             found = self._file.metadata
@@ -110,10 +101,19 @@ class RolloutReader:
         rows = self._rows.slice(first, place.rows).combine_chunks()
         if len(rows) != place.rows:
             raise _unreadable(place.file, IndexError(f"rows {place.row} and after are cut off"))
-        try:
-            return as_today(rows.to_batches()[0])
-        except ValueError as error:
-            raise _unreadable(place.file, error) from error
+        return rows.to_batches()[0]
+
+
+def _check_columns(found: pa.Schema) -> None:
+    """Check that these are the columns of stored rollouts.
+
+    Raises:
+        TypeError: One is missing or has another type.
+    """
+    for column in [*STATES, *(TRACKS if TRACKS.names[0] in found.names else ())]:
+        at = found.get_field_index(column.name)
+        if at < 0 or not found.field(at).type.equals(column.type):
+            raise TypeError(f"column {column.name!r} is missing or not {column.type}")
 
 
 class PartWriter:
@@ -122,7 +122,7 @@ class PartWriter:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._number = next_number(folder)
-        self._writer: TableWriter | None = None
+        self._writer: pq.ParquetWriter | None = None
         self._partial = folder  # what it writes to
         self._pending: list[tuple[Task, pa.RecordBatch]] = []
         self._count = self._rows = self._bytes = 0  # in the file under way
@@ -157,8 +157,16 @@ class PartWriter:
         rows = pa.Table.from_batches([batch for _, batch in self._pending]).combine_chunks()
         schema = pa.schema([*_KEY, *rows.schema])
         if self._writer is None:
-            self._partial = draft(self._path)
-            self._writer = TableWriter(self._partial, schema, **_WRITE_OPTIONS)
+            self._partial = temp_path(self._path)
+            self._writer = pq.ParquetWriter(
+                self._partial,
+                schema,
+                compression="zstd",
+                compression_level=3,
+                **encodings(schema, _REPEATING),
+                write_statistics=False,
+                store_schema=False,
+            )
         group = pa.Table.from_arrays([*_keys(self._pending), *rows.columns], schema=schema)
         self._writer.write_table(group, row_group_size=len(group))
         self._pending.clear()
@@ -188,20 +196,13 @@ class PartWriter:
 
 def _keys(rollouts: list[tuple[Task, pa.RecordBatch]]) -> list[pa.Array]:
     """The columns of `_KEY`."""
-    tasks = [task for task, _ in rollouts]
     lengths = [len(rows) for _, rows in rollouts]
-    owner = np.repeat(np.arange(len(tasks), dtype=np.int32), lengths)
-    columns: list[pa.Array] = []
-    for name in Task._fields:
-        values = [getattr(task, name) for task in tasks]
-        if name == "seed":
-            columns.append(pa.array(np.array(values, np.int64)[owner]))
-            continue
-        distinct = sorted(set(values))
-        codes = np.array([distinct.index(value) for value in values], np.int32)
-        columns.append(pa.DictionaryArray.from_arrays(codes[owner], pa.array(distinct)))
-    iterations = np.concatenate([np.arange(length, dtype=np.int64) for length in lengths])
-    return [*columns, pa.array(iterations)]
+    owner = pa.array(np.repeat(np.arange(len(rollouts)), lengths))
+    columns = [
+        pa.array([getattr(task, name) for task, _ in rollouts], kind).take(owner)
+        for name, kind in _KINDS.items()
+    ]
+    return [*columns, pa.array(np.concatenate([np.arange(length) for length in lengths]))]
 
 
 def without_key(rows: pa.RecordBatch) -> pa.RecordBatch:

@@ -9,9 +9,9 @@ from shiftsim.errors import InvalidTrajectoryError, TrafficError
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.sim.dynamics.bicycle import command_and_step
 from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
-from shiftsim.sim.plan_check import find_fault, plain
-from shiftsim.sim.planner import Planner, SceneInfo, Sight, rollout_rows
-from shiftsim.sim.traffic.following import CANDIDATES, NO_LANE, choose_lane, lanes_of, next_lane
+from shiftsim.sim.plan_check import contiguous, find_fault
+from shiftsim.sim.planner import ObservationBuilder, Planner, SceneInfo, rollout_rows
+from shiftsim.sim.traffic.lanes import CANDIDATES, NO_LANE, choose_lane, lanes_of, next_lane
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import (
     NUM_STATE,
@@ -37,7 +37,7 @@ class _Driver:
     planner: Planner
     ego: FloatArray  # (B, 11) its states, by row of the rollout
     tracks: Tracks  # what it sees: the ego in its own place
-    sight: Sight
+    observations: ObservationBuilder
 
 
 class PlannedTraffic:
@@ -147,7 +147,9 @@ class PlannedTraffic:
                 log_name=scenario.log_name,
             )
         )
-        driver = _Driver(track, planner, ego, seen, Sight(self._time_us, ego, seen, self._lights))
+        driver = _Driver(
+            track, planner, ego, seen, ObservationBuilder(self._time_us, ego, seen, self._lights)
+        )
         for past in range(row + 1):
             self._show(driver, tracks, past)
         return driver
@@ -169,7 +171,7 @@ class PlannedTraffic:
     def _move(self, driver: _Driver, iteration: int, row: int) -> None:
         """Write the next state of a driver."""
         now_us, next_us = self._clock[row - 1], self._clock[row]
-        plan = driver.planner.plan(driver.sight.at(iteration, row - 1))
+        plan = driver.planner.plan(driver.observations.at(iteration, row - 1))
         fault = find_fault(plan, now_us, next_us)
         if fault is not None:
             raise InvalidTrajectoryError(fault.message, fault.hint)
@@ -178,8 +180,7 @@ class PlannedTraffic:
             command[:] = plan.acceleration, plan.steering_rate
             command_and_step(now_us, next_us, state, command, 0.0, 0.0, after)
             return
-        times = plan.time_us + now_us if plan.relative else plain(plan.time_us)
-        states = plain(plan.states)
+        times, states = contiguous(plan.starting_at(now_us).time_us), contiguous(plan.states)
         status = track_and_step(now_us, next_us, state, times, states, 0.0, 0.0, after, command)
         raise_for_status(status, now_us, times)
 

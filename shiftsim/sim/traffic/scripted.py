@@ -1,16 +1,15 @@
-"""Walkers that an edit adds, beside any traffic: they wait for the ego, cross once, and stand."""
+"""Pedestrians that an edit adds to any traffic: they wait for the ego, cross once, and stand."""
 
 import numpy as np
 
 from shiftsim.errors import TrafficError
 from shiftsim.kernels import FloatArray
 from shiftsim.sim.traffic import Traffic
+from shiftsim.world.events import CROSSING_SIZE, ScriptedPedestrian
 from shiftsim.world.lanes import find_start
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.script import Walker
 from shiftsim.world.state import Tracks, center_poses
 
-PEDESTRIAN_SIZE = (0.9000033778444835, 0.7913900336773054)  # length, width of interPlan's [m]
 _SETS_OFF = 50.0  # m, how near along its lane the ego must be
 _AT_END = 0.1  # m, a projection on the end of the lane
 _WALK = 150  # iterations that a walk takes, and as many more as it starts late
@@ -22,21 +21,21 @@ def share_walked(iteration: int, active: int, num_iterations: int) -> float:
 
 
 class Scripted:
-    """Traffic of any model, and the walkers of an edited scenario."""
+    """Traffic of any model, and the pedestrians of an edited scenario."""
 
     def __init__(self, traffic: Traffic) -> None:
         self._traffic = traffic
-        self._walkers: tuple[Walker, ...] = ()
-        self._begun: list[float] = []
+        self._pedestrians: tuple[ScriptedPedestrian, ...] = ()
+        self._start_times: list[float] = []
         self._seconds = np.zeros(0)
 
     def start(self, scenario: Scenario, tracks: Tracks, row: int) -> None:
-        """Prepare traffic and walkers."""
-        self._walkers = scenario.script.walkers if scenario.script else ()
+        """Prepare traffic and pedestrians."""
+        self._pedestrians = scenario.script.pedestrians if scenario.script else ()
         self._crossings = scenario.script.crossings if scenario.script else ()
         self._map = scenario.map
         self._active = [crossing.iteration for crossing in self._crossings]
-        self._begun = [np.inf] * len(self._walkers)
+        self._start_times = [np.inf] * len(self._pedestrians)
         times = scenario.iteration_times
         self._seconds = (times - times[0]) * 1e-6
         self._traffic.start(scenario, tracks, row)
@@ -45,18 +44,20 @@ class Scripted:
             self._cross(0, scenario.ego[now], tracks, row)
 
     def step(self, iteration: int, ego: FloatArray, tracks: Tracks, row: int) -> None:
-        """Move the walkers, which the other traffic then sees, and that traffic."""
+        """Move the pedestrians, which the other traffic then sees, and that traffic."""
         now, after = self._seconds[iteration], self._seconds[iteration + 1]
         x, y, _ = center_poses(ego[None, :3])[0]
-        for number, walker in enumerate(self._walkers):
-            near = np.hypot(walker.start[0] - x, walker.start[1] - y) <= walker.ego_within
-            if near and self._begun[number] == np.inf:
-                self._begun[number] = now
-        self._place(after, tracks, row)
+        for number, pedestrian in enumerate(self._pedestrians):
+            near = (
+                np.hypot(pedestrian.start[0] - x, pedestrian.start[1] - y) <= pedestrian.ego_within
+            )
+            if near and self._start_times[number] == np.inf:
+                self._start_times[number] = now
+        self._move_pedestrians(after, tracks, row)
         if self._crossings:
             self._cross(iteration + 1, ego, tracks, row)
         self._traffic.step(iteration, ego, tracks, row)
-        self._place(after, tracks, row)  # a model may have moved all pedestrians
+        self._move_pedestrians(after, tracks, row)  # a model may have moved all pedestrians
 
     def _cross(self, iteration: int, ego: FloatArray, tracks: Tracks, row: int) -> None:
         """Move pedestrians of interPlan.
@@ -88,19 +89,14 @@ class Scripted:
             tracks.poses[row, track] = crossing.start
             tracks.poses[row, track, :2] += share * (crossing.end - crossing.start[:2])
             tracks.velocities[row, track] = 0.0
-            tracks.sizes[row, track] = PEDESTRIAN_SIZE
+            tracks.sizes[row, track] = CROSSING_SIZE
 
-    def _place(self, seconds: float, tracks: Tracks, row: int) -> None:
-        for walker, begun in zip(self._walkers, self._begun, strict=True):
-            track = walker.track
-            if begun == np.inf and not walker.visible:
-                continue
-            step = walker.end - walker.start[:2]
-            length = float(np.hypot(*step))
-            gone = 0.0 if begun == np.inf else min((seconds - begun) * walker.speed, length)
-            walks = 0.0 < gone < length
-            tracks.valid[row, track] = True
-            tracks.poses[row, track] = walker.start
-            tracks.poses[row, track, :2] += gone / length * step
-            tracks.velocities[row, track] = walker.speed * step / length if walks else 0.0
-            tracks.sizes[row, track] = walker.size
+    def _move_pedestrians(self, seconds: float, tracks: Tracks, row: int) -> None:
+        for pedestrian, start_time in zip(self._pedestrians, self._start_times, strict=True):
+            poses, velocities, present = pedestrian.walk(np.array([seconds]), start_time)
+            if present[0]:
+                track = pedestrian.track
+                tracks.valid[row, track] = True
+                tracks.poses[row, track] = poses[0]
+                tracks.velocities[row, track] = velocities[0]
+                tracks.sizes[row, track] = pedestrian.size

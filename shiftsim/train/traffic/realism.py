@@ -28,11 +28,11 @@ class Realism:
     distances: list[float] = field(default_factory=list)  # m in the end, of vehicles that move
     agents: int = 0  # that were simulated
     collided: int = 0  # of them with another agent, which they did not touch at first
-    away: int = 0  # of vehicles, off the road in the end; those that were on it at first
+    off_road: int = 0  # of vehicles, off the road in the end; those that were on it at first
     on_road: int = 0  # vehicles that were on the road at first
     speeds: list[float] = field(default_factory=list)  # m/s in the end, of vehicles that move
     recorded: list[float] = field(default_factory=list)  # m/s, the same as recorded
-    gone: int = 0  # vehicles that the model took away
+    taken_away: int = 0  # vehicles that the model took away
     failed: int = 0  # scenarios in which it failed
 
     def row(self, name: str) -> dict[str, Any]:
@@ -41,12 +41,12 @@ class Realism:
             "traffic": name,
             "distance_m": float(np.mean(self.distances or [np.nan])),
             "collided": self.collided / self.agents if self.agents else np.nan,
-            "off_road": self.away / self.on_road if self.on_road else np.nan,
+            "off_road": self.off_road / self.on_road if self.on_road else np.nan,
             "speed_mps": float(np.mean(self.speeds or [np.nan])),
             "recorded_speed_mps": float(np.mean(self.recorded or [np.nan])),
             "agents": self.agents,
             "vehicles_that_moved": len(self.distances),
-            "taken_away": self.gone,
+            "taken_away": self.taken_away,
             "failed_scenarios": self.failed,
         }
 
@@ -96,7 +96,7 @@ def _measure(scenario: Scenario, traffic: Traffic, out: Realism, steps: int) -> 
     is_vehicle = (kinds == AgentKind.VEHICLE) & is_agent
     way = recorded.poses[end, :, :2] - recorded.poses[start, :, :2]
     moves = is_vehicle & recorded.valid[end] & (np.hypot(*way.T) > _MOVING)
-    out.gone += int((is_vehicle & ~tracks.valid[end]).sum())
+    out.taken_away += int((is_vehicle & ~tracks.valid[end]).sum())
     moves &= tracks.valid[end]
     apart = tracks.poses[end, moves, :2] - recorded.poses[end, moves, :2]
     out.distances += np.hypot(*apart.T).tolist()
@@ -113,7 +113,7 @@ def _measure(scenario: Scenario, traffic: Traffic, out: Realism, steps: int) -> 
     for track in np.flatnonzero(is_vehicle & tracks.valid[end]).tolist():
         if in_any(areas, *recorded.poses[start, track, :2].tolist()):
             out.on_road += 1
-            out.away += not in_any(areas, *tracks.poses[end, track, :2].tolist())
+            out.off_road += not in_any(areas, *tracks.poses[end, track, :2].tolist())
 
 
 @kernel

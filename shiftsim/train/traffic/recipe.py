@@ -13,21 +13,24 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor, nn
+from torch.nn import functional
 
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError
-from shiftsim.files import whole_file
+from shiftsim.files import atomic_write
 from shiftsim.runs.scenarios import find_split, open_named_store
 from shiftsim.sim.traffic import Traffic, make_traffic
-from shiftsim.sim.traffic.learned.model import LearnedTraffic
-from shiftsim.sim.traffic.learned.network import Weights
-from shiftsim.train.curves import Say, write_table
+from shiftsim.sim.traffic.learned.features import NUM_FEATURES
+from shiftsim.sim.traffic.learned.model import HIDDEN, SCALES, LearnedTraffic, Weights
+from shiftsim.train.folder import OnMessage, write_table
 from shiftsim.train.jobs import divide
-from shiftsim.train.traffic.learning import learn, new_network, weights_of
 from shiftsim.train.traffic.realism import compare
 from shiftsim.train.traffic.states import States, join, states_of
 
 WEIGHTS, TABLE, CURVE = "weights.npz", "realism.parquet", "losses.parquet"
+BATCH, RATE, FLOOR = 1024, 2e-3, 0.02
+ASIDE = 0.3  # m beside the point steered to that weigh as much as 1 m/s^2
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +53,7 @@ class TrafficSettings:
                 raise ConfigError(f"{name} is {value!r}", hint="give a number above 0")
 
 
-def train_traffic(settings: TrafficSettings, say: Say) -> Path:
+def train_traffic(settings: TrafficSettings, on_message: OnMessage) -> Path:
     """Train, write weights, losses and the table of realism, and return the file of the weights.
 
     The same settings on the same machine give the same weights.
@@ -81,7 +84,7 @@ def train_traffic(settings: TrafficSettings, say: Say) -> Path:
             for epoch, loss in enumerate(found)
         ]
         count = sum(len(part.features) for part in parts)
-        say(f"round {number + 1} of {settings.rounds}: {count} states, loss {found[-1]:.3f}")
+        on_message(f"round {number + 1} of {settings.rounds}: {count} states, loss {found[-1]:.3f}")
     write_weights(file, weights_of(network))
     write_table(out / CURVE, losses)
     order = np.random.default_rng([seed, 4]).permutation(tested)[: settings.tests].tolist()
@@ -114,5 +117,53 @@ def _collected(
 
 def write_weights(path: Path, weights: Weights) -> None:
     """Write weights as `LearnedTraffic` reads them."""
-    with whole_file(path) as partial_file, partial_file.open("wb") as stream:
+    with atomic_write(path) as partial_file, partial_file.open("wb") as stream:
         np.savez(stream, **weights._asdict())
+
+
+def new_network(seed: int) -> nn.Sequential:
+    """A network that has learnt nothing."""
+    torch.manual_seed(seed)
+    last = nn.Linear(HIDDEN, 2)
+    nn.init.zeros_(last.weight)
+    return nn.Sequential(
+        nn.Linear(NUM_FEATURES, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, HIDDEN), nn.ReLU(), last
+    )
+
+
+def weights_of(network: nn.Sequential) -> Weights:
+    """Its weights, as the traffic takes them."""
+    arrays: list[np.ndarray] = []
+    for parameter in network.parameters():  # a weight, transposed, and a bias of each layer
+        arrays.append(np.ascontiguousarray(parameter.detach().numpy().T))
+    return Weights(*arrays)
+
+
+def learn(network: nn.Sequential, states: States, epochs: int, seed: int) -> list[float]:
+    """Train on all states; the mean loss of each epoch."""
+    torch.manual_seed(seed)
+    features, labels = map(torch.from_numpy, states)
+    optimiser = torch.optim.Adam(network.parameters(), lr=RATE)
+    steps = max(epochs * (len(features) // BATCH), 1)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps, RATE * FLOOR)
+    losses = []
+    count = max(len(features) // BATCH, 1)
+    for _ in range(epochs):
+        total, order = 0.0, torch.randperm(len(features))
+        for first in range(0, count * BATCH, BATCH):
+            part = order[first : first + BATCH]
+            loss = _loss(network(features[part]), labels[part])
+            optimiser.zero_grad()
+            torch.autograd.backward(loss)
+            optimiser.step()
+            schedule.step()
+            total += float(loss.detach())
+        losses.append(total / count)
+    return losses
+
+
+def _loss(out: Tensor, labels: Tensor) -> Tensor:
+    controls = out * torch.tensor(SCALES, dtype=out.dtype)
+    harder = functional.huber_loss(controls[:, 0], labels[:, 0], delta=1.0)
+    aside = 0.5 * labels[:, 2] ** 2 * (controls[:, 1] - labels[:, 1]) / ASIDE
+    return harder + functional.huber_loss(aside, torch.zeros_like(aside), delta=1.0)

@@ -1,15 +1,21 @@
-"""States of agents with labels: as recorded, pushed aside, or where the network brought them."""
+"""States of agents with labels: as recorded, pushed aside, or where the network brought them.
 
+A label is what leads an agent back to its recorded drive, wherever its own has brought it.
+"""
+
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shiftsim.geometry.boxes import wrap_angle
+from shiftsim.geometry.polylines import arc_lengths, point_on_polyline, project_on_polyline
+from shiftsim.kernels import BoolArray, FloatArray
 from shiftsim.sim.planner import rollout_rows
 from shiftsim.sim.traffic.learned.features import AHEAD, NUM_FEATURES, PATH, REACH
-from shiftsim.sim.traffic.learned.model import LAG, LearnedTraffic
-from shiftsim.train.traffic.labels import labels_of
+from shiftsim.sim.traffic.learned.model import LAG, LIMITS, LearnedTraffic
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Tracks
 
@@ -17,6 +23,11 @@ EVERY = 5  # iterations between two states of an agent
 SEGMENT = 50  # iterations that the network drives before the agents are put back
 ASIDE, TURNED, FASTER = 0.4, 0.05, 0.8  # m, rad, m/s: spread of what agents are pushed by
 STANDING = 0.05  # share of the agents that stand and stay that is kept
+HORIZON = 15  # iterations: when an agent should be where it was recorded
+LEAST = 5  # iterations that must be recorded for a label
+LOOK_AHEAD, NEAREST = 1.0, 3.0  # s and m, whichever is farther: the point that is steered to
+FIRM = 1.5  # m/s^2 of braking that another in the way asks for before it counts
+_STEP = 0.1  # s
 _LEADER = PATH + 2 * len(AHEAD)
 
 
@@ -108,8 +119,76 @@ def _labelled(
     )
     closing[features[:, _LEADER] == 0.0, 1] = 0.0
     poses = tracks.poses[row, own]
-    labels = labels_of(recorded.select(own), row, poses, speeds, closing)
+    labels = compute_labels(recorded.select(own), row, poses, speeds, closing)
     rests = (np.abs(speeds) < 0.2) & (np.abs(labels.accelerations) < 0.1)
-    kept = labels.known & (~rests | (random.random(len(own)) < STANDING))
+    chosen = labels.known & (~rests | (random.random(len(own)) < STANDING))
     values = np.stack([labels.accelerations, labels.curvatures, labels.distances], axis=1)
-    return States(features[kept].astype(np.float32), values[kept].astype(np.float32))
+    return States(features[chosen].astype(np.float32), values[chosen].astype(np.float32))
+
+
+class Labels(NamedTuple):
+    """Wanted controls of agents. A agents."""
+
+    known: BoolArray  # (A,) whether there is a label
+    accelerations: FloatArray  # (A,) [m/s^2]
+    curvatures: FloatArray  # (A,) [rad/m]
+    distances: FloatArray  # (A,) to the point that is steered to [m]; 0 where the agent stays
+
+
+def compute_labels(
+    recorded: Tracks, row: int, poses: FloatArray, speeds: FloatArray, closing: FloatArray
+) -> Labels:
+    """Labels at a row of the tracks as recorded, of agents that are elsewhere by now.
+
+    Args:
+        recorded: (B, A, …) the agents as recorded.
+        row: The row that is now.
+        poses: (A, 3) where they are [m], [rad]; NaN where absent.
+        speeds: (A,) [m/s].
+        closing: (A, 2) gap to who leads [m] and speed at which it shrinks [m/s]; inf and 0.
+    """
+    known = np.zeros(len(poses), np.bool_)
+    out = np.zeros((len(poses), 3))
+    for agent in np.flatnonzero(recorded.valid[row] & ~np.isnan(poses[:, 0])).tolist():
+        valid = recorded.valid[:, agent]
+        last = _last_in_a_row(valid[row:]) + row
+        first = row - _last_in_a_row(valid[row::-1][: 2 * HORIZON + 1])
+        if last - row >= LEAST:
+            line = np.ascontiguousarray(recorded.poses[first : last + 1, agent, :2])
+            known[agent] = True
+            out[agent] = _label(line, row - first, poses[agent], float(speeds[agent]))
+    need = np.where(
+        closing[:, 1] > 0.0, closing[:, 1] ** 2 / (2.0 * np.maximum(closing[:, 0] - 1.0, 0.2)), 0.0
+    )
+    out[:, 0] = np.where(need > FIRM, np.minimum(out[:, 0], -need), out[:, 0])
+    out[:, :2] = np.clip(out[:, :2], LIMITS[:, 0], LIMITS[:, 1])
+    return Labels(known, *out.T)
+
+
+def _last_in_a_row(valid: BoolArray) -> int:
+    """Index of the last of the samples that are valid from the first one on."""
+    return len(valid) - 1 if valid.all() else int(np.argmin(valid)) - 1
+
+
+def _label(
+    line: FloatArray, row: int, pose: FloatArray, speed: float
+) -> tuple[float, float, float]:
+    """Acceleration, curvature and distance steered to that lead back to a recorded drive.
+
+    It has the positions `line` (V, 2), at `row` of which the agent should be; it is at `pose`.
+    """
+    x, y, heading = pose.tolist()
+    arc = arc_lengths(line, np.array([0, len(line)]))
+    here = project_on_polyline(line, arc, 0, len(line), x, y)
+    wanted_row = min(row + HORIZON, len(line) - 1)
+    span = (wanted_row - row) * _STEP
+    acceleration = 2.0 * (float(arc[wanted_row]) - here - speed * span) / (span * span)
+    if acceleration < 0.0:  # do not brake beyond standing
+        acceleration = max(acceleration, -speed / 0.5)
+    goal = min(here + max(LOOK_AHEAD * speed, NEAREST), float(arc[-1]))
+    if goal - here < 1.0:
+        return acceleration, 0.0, 0.0
+    px, py = point_on_polyline(line, arc, 0, len(line), goal)
+    distance = max(math.hypot(px - x, py - y), 0.5)
+    angle = wrap_angle(math.atan2(py - y, px - x) - heading)
+    return acceleration, 2.0 * math.sin(angle) / distance, distance

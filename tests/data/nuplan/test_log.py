@@ -10,14 +10,20 @@ from pathlib import Path
 import numpy as np
 import places
 import pytest
+from recordings import require_plausible
 
 from shiftsim.data.nuplan.boxes import read_boxes
 from shiftsim.data.nuplan.convert import convert_nuplan
 from shiftsim.data.nuplan.log import open_log, read_ego
 from shiftsim.data.nuplan.map import read_map
-from shiftsim.data.nuplan.mapping import NAMED_TYPES, mapping_of, parse_mapping
-from shiftsim.data.nuplan.scenarios import cut_window, list_scenarios, read_scenario
-from shiftsim.data.store.plausible import require_plausible
+from shiftsim.data.nuplan.scenarios import (
+    NAMED_TYPES,
+    cut_window,
+    list_scenarios,
+    mapping_of,
+    parse_mapping,
+    read_scenario,
+)
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError, ConversionError, DataError
 from shiftsim.planners.basic.log_future import LogFuture
@@ -362,7 +368,7 @@ def test_a_box_that_a_store_could_not_hold_is_brought_into_its_range(
     assert flaw.startswith(f"lidar_box: {field} beyond")
     found = getattr(scene.tracks, column)[scene.tracks.valid]
     assert (found == kept).any(axis=1).sum() > 100
-    require_plausible(scene, "ego", log_path)
+    require_plausible(scene)
 
 
 def test_a_goal_off_the_earth_is_left_out_with_one_warning(log_path: Path, tmp_path: Path) -> None:

@@ -8,12 +8,13 @@ import shapely
 from nuplan_trips import SCENES, round_trip
 from stores import write_toy_store
 
-from shiftsim.data.demo.store import demo_store
 from shiftsim.data.nuplan.convert import convert_nuplan
 from shiftsim.data.nuplan.export import export_nuplan
 from shiftsim.data.nuplan.export_log import quaternions_of
 from shiftsim.data.nuplan.log import yaw_of
 from shiftsim.data.store.reading import open_store
+from shiftsim.data.synthetic.recordings import make_town
+from shiftsim.data.synthetic.store import DEMO_TOWNS, demo_store
 from shiftsim.metrics import compute_metrics
 from shiftsim.planners.idm import Idm
 from shiftsim.planners.pdm.planner import PdmClosed
@@ -164,9 +165,12 @@ def exported(drone, folder, tokens):
 
 
 @pytest.mark.slow
-def test_what_was_recorded_around_a_window_is_exported_too(drone, tmp_path):
+def test_what_was_recorded_around_a_window_is_exported_too(tmp_path):
+    street = next(town for town in DEMO_TOWNS if town.name == "street")
+    make_town(tmp_path, replace(street, overlap_s=12.0))  # scenarios up to the last row
+    drone = open_store(tmp_path / "street")
     early = next(t for t in drone.tokens if drone.window(t).first_row == 0)
-    late = next(t for t in drone.tokens if drone.window(t).last_row == 600)
+    late = next(t for t in drone.tokens if drone.window(t).last_row == 840)
     back, report = exported(drone, tmp_path, (early, late))
     assert report.cut_off == 1
     for token in (early, late):

@@ -11,7 +11,7 @@ from worlds import cruise_scenario, standing_tracks, straight_road
 import shiftsim
 from shiftsim.cli import main
 from shiftsim.data.recording import EgoTrace, Recording, Window
-from shiftsim.data.store import tracks as stored
+from shiftsim.data.store import recordings as stored
 from shiftsim.data.store.check import check_store, survey_store
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import MapError
@@ -80,14 +80,14 @@ def test_no_scenario_at_all_is_an_error(tmp_path):
 
 
 def test_repeated_boxes_are_an_error(tmp_path, monkeypatch):
-    block = stored._track_block
+    make = stored.tracks_table
 
     def twice(tracks, rows):
-        table = block(tracks, rows)
+        table = make(tracks, rows)
         more = table.slice(3, 2 if rows.start == 0 else 0)
         return stored.pa.concat_tables([table, more]).combine_chunks()
 
-    monkeypatch.setattr(stored, "_track_block", twice)
+    monkeypatch.setattr(stored, "tracks_table", twice)
     problem = _only(_write(tmp_path / "s"))
     assert (problem.is_error, problem.kind, problem.recording) == (True, "repeated rows", "log")
     assert "has two boxes in row 3 (2 such boxes)" in problem.what

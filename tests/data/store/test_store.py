@@ -2,15 +2,11 @@
 
 import dataclasses
 import hashlib
-import json
 import shutil
 import sqlite3
 from pathlib import Path
 
 import numpy as np
-import places
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from recordings import GOLDEN, LOG, TOKEN, make_recording, make_window, write_store
 
@@ -18,16 +14,11 @@ from shiftsim.data.nuplan.convert import convert_nuplan
 from shiftsim.data.nuplan.scenarios import list_scenarios, read_scenario
 from shiftsim.data.recording import EgoTrace, Recording
 from shiftsim.data.store import schema
-from shiftsim.data.store.boxes import restored, second_differences
-from shiftsim.data.store.plausible import BOX_LIMITS
 from shiftsim.data.store.reading import open_store
-from shiftsim.data.store.tracks import ego_span, ego_states, open_ego, write_ego
-from shiftsim.data.store.writing import StoreWriter
+from shiftsim.data.store.recordings import ego_span, ego_states, open_ego, write_ego
 from shiftsim.errors import DataError
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import Tracks, TrafficLights
-
-VERSION_1, VERSION_2 = (places.GOLDEN / f"store_version_{number}" for number in (1, 2))
 
 
 def assert_same(a: object, b: object, where: str = "") -> None:
@@ -165,12 +156,12 @@ def test_a_window_reads_only_its_part_of_a_long_recording(
     asked: list[list[int]] = []
     tracks = store.recording("drive").tracks
     read = tracks.read
-    monkeypatch.setattr(tracks, "read", lambda blocks: asked.append(blocks) or read(blocks))
+    monkeypatch.setattr(
+        tracks, "read", lambda blocks, **how: asked.append(blocks) or read(blocks, **how)
+    )
     store.read("a")
-    rows = store.recording("drive").block_rows
-    assert 0.7 * schema.BLOCK_ROWS < rows < 1.5 * schema.BLOCK_ROWS
-    assert asked == [[block] for block in range(1000 // rows, 1199 // rows + 1)]
-    assert len(asked) < tracks.num_blocks
+    assert asked == [[2]]  # of four, which hold 500 rows each
+    assert tracks.blocks(0, 2000) == [0, 1, 2, 3]
 
 
 def test_windows_of_several_blocks_come_back_to_the_last_bit(
@@ -180,7 +171,7 @@ def test_windows_of_several_blocks_come_back_to_the_last_bit(
     tracks = recording.tracks
     write_store(tmp_path / "s", road, recording, make_window("a", 400, 1500))
     stored = open_store(tmp_path / "s").recording("drive")
-    assert stored.tracks.num_blocks == 3
+    assert stored.tracks.blocks(0, 1700) == [0, 1, 2]
     for first, last in ((0, 1700), (400, 1500), (566, 568), (1699, 1700)):
         part = stored.read(first, last).tracks
         kept = [tracks.tokens.index(token) for token in part.tokens]
@@ -188,24 +179,6 @@ def test_windows_of_several_blocks_come_back_to_the_last_bit(
         for name in ("valid", "poses", "velocities", "sizes"):
             expected = getattr(tracks, name)[first:last, kept]
             np.testing.assert_array_equal(getattr(part, name), expected)
-
-
-@pytest.mark.parametrize("count", [0, 1, 2, 3, 1000])
-def test_any_bits_come_back_from_their_second_differences(
-    count: int, rng: np.random.Generator
-) -> None:
-    smooth = 4_475_000.0 + np.cumsum(rng.normal(0.5, 1e-4, count))
-    odd = np.array([0.0, -0.0, np.nan, -np.nan, np.inf, -np.inf, 5e-324, 1.7e308])
-    anything = np.concatenate([rng.integers(-(2**63), 2**63, count).view(np.float64), odd])
-    for values in (smooth, -smooth, anything):
-        codes = second_differences(values)
-        assert restored(codes).tobytes() == values.tobytes()
-    assert (second_differences(smooth)[2:] < 2**40).all()
-
-
-def test_limits_of_motion_are_as_wide_to_both_sides() -> None:
-    # `scatter` looks at sizes only
-    assert (BOX_LIMITS[: len(schema.MOTION), 0] == -BOX_LIMITS[: len(schema.MOTION), 1]).all()
 
 
 def test_an_ego_of_several_row_groups_comes_back_to_the_last_bit(
@@ -220,46 +193,6 @@ def test_an_ego_of_several_row_groups_comes_back_to_the_last_bit(
         assert part.tobytes() == states[first:last].tobytes()
     with pytest.raises(DataError, match="no rows"):
         ego_states(table, 39, 60)
-
-
-@pytest.mark.golden
-@pytest.mark.parametrize("folder", [VERSION_1, VERSION_2])
-def test_stores_of_earlier_versions_are_read(folder: Path) -> None:
-    expected = json.loads((VERSION_1 / "expected.json").read_text("utf-8"))
-    store = open_store(folder / "store")
-    found: dict[str, object] = {}
-    for scene in store:
-        parts = {name: getattr(scene, name) for name in ("time_us", "ego")}
-        for name in ("valid", "poses", "velocities", "sizes", "kinds"):
-            parts[name] = getattr(scene.tracks, name)
-        parts["lights"] = scene.traffic_lights.status
-        found |= {f"{scene.token} {name}": digest(array) for name, array in parts.items()}
-        found[f"{scene.token} tokens"] = list(scene.tracks.tokens)
-    road = store.map("fixture-town")
-    arrays = {"edges": road.edges.polygons.xy, "cells": road.edges.polygons.cell_items}
-    arrays |= {"baselines": road.baselines.xy, "outgoing": road.outgoing.items}
-    found |= {name: digest(array) for name, array in arrays.items()}
-    found["ids"] = list(road.edges.ids[:3])
-    assert found == expected
-
-
-@pytest.mark.golden
-@pytest.mark.parametrize("folder", [VERSION_1, VERSION_2])
-def test_a_store_of_an_earlier_version_is_added_to(
-    folder: Path, tmp_path: Path, road: VectorMap, rng: np.random.Generator
-) -> None:
-    path = Path(shutil.copytree(folder / "store", tmp_path / "s"))
-    before = open_store(path).read("a")
-    recording = dataclasses.replace(make_recording(150, 3, rng), log_name="late")
-    with StoreWriter(path) as writer:
-        writer.add_map(road)
-        writer.add_recording(recording)
-        writer.add_ego(EgoTrace("late", "ego", 0, np.full((150, 11), 0.25)))
-        writer.add_window(dataclasses.replace(make_window("c", 0, 150), log_name="late"))
-    assert json.loads((path / "store.json").read_text("utf-8"))["version"] == schema.VERSION
-    after = open_store(path)
-    assert_same(after.read("a"), before)
-    assert after.read("c").tracks.num_tracks == 3
 
 
 def test_an_empty_recording_is_fine(tmp_path: Path, road: VectorMap) -> None:
@@ -277,7 +210,29 @@ def test_a_map_is_read_once_per_store(store: Path) -> None:
     assert opened.read(TOKEN).map is opened.map("fixture-town")
 
 
-def test_columns_carry_their_units(store: Path) -> None:
-    tracks = pq.read_schema(next(store.rglob("tracks.parquet")))
-    assert {"x_m_diff2", "heading_rad_diff2", "vx_mps_diff2", "length_m"} <= set(tracks.names)
-    assert pa.types.is_float64(tracks.field("length_m").type)
+def test_pandas_polars_and_duckdb_read_the_files_as_they_are(
+    tmp_path: Path, road: VectorMap, rng: np.random.Generator
+) -> None:
+    duckdb, pandas, polars = map(pytest.importorskip, ("duckdb", "pandas", "polars"))
+    recording = make_recording(700, 4, rng)
+    write_store(tmp_path / "s", road, recording, make_window("a", 0, 700))
+    path = tmp_path / "s" / "recordings" / "drive" / "tracks.parquet"
+    found = pandas.read_parquet(path)
+    assert len(found) == np.count_nonzero(recording.tracks.valid)
+    tracks = recording.tracks
+    for track, token in enumerate(tracks.tokens):
+        own = found[found.token == token].sort_values("row")
+        there = tracks.valid[:, track]
+        assert (own.row == np.flatnonzero(there)).all()
+        assert (own[["x_m", "y_m", "heading_rad"]] == tracks.poses[there, track]).all(axis=None)
+        assert (own[["vx_mps", "vy_mps"]] == tracks.velocities[there, track]).all(axis=None)
+    query = f"select row, track, x_m, length_m from '{path}' order by all"
+    columns = ["row", "track", "x_m", "length_m"]
+    expected = found[columns].sort_values(columns).to_numpy()
+    assert np.array_equal(duckdb.sql(query).df().to_numpy(), expected)
+    assert np.array_equal(
+        polars.read_parquet(path, columns=columns).sort(columns).to_numpy(), expected
+    )
+    lights = pandas.read_parquet(path.with_name("lights.parquet"))
+    assert (lights.status >= 0).all()
+    assert len(lights) == np.count_nonzero(recording.lights.status >= 0)

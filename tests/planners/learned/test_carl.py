@@ -10,7 +10,6 @@ from worlds import cruise_scenario, standing_tracks, straight_road, with_velocit
 
 from shiftsim.errors import CheckpointError, PlannerError
 from shiftsim.planners.learned.carl import view as carl_view
-from shiftsim.planners.learned.carl.drawn import convolve_drawn
 from shiftsim.planners.learned.carl.planner import Carl, command_of
 from shiftsim.sim.loop import Rollout, simulate, simulate_together
 from shiftsim.sim.planner import observe_log, scene_info
@@ -290,17 +289,3 @@ def test_an_ensemble_does_the_mean_of_its_members(tmp_path):
 def test_a_checkpoint_that_is_missing_names_where_it_was_looked_for():
     with pytest.raises(CheckpointError, match="'nowhere'"):
         Carl("nowhere")
-
-
-@pytest.mark.parametrize("share", [0.0, 0.001, 0.05, 1.0])
-def test_the_drawn_pixels_are_convolved_as_the_whole_raster(share, rng):
-    torch = pytest.importorskip("torch")
-    picture = rng.integers(1, 256, (2, 32, 32), np.uint8) * (rng.random((2, 32, 32)) < share)
-    picture[1, [0, 0, -1, -1, 7, 8], [0, -1, 0, -1, 7, 8]] = 255  # corners, and where words meet
-    weight = rng.standard_normal((8, 2, 5, 5)).astype(np.float32)
-    out = np.ones((14, 14, 8), np.float32)
-    picture, turned = picture.astype(np.uint8), np.ascontiguousarray(weight.transpose(1, 2, 3, 0))
-    convolve_drawn(picture, picture.view(np.uint64), turned, out)
-    whole = torch.from_numpy(picture.astype(np.float32) / 255)[None]
-    expected = 1.0 + torch.conv2d(whole, torch.from_numpy(weight), stride=2)[0].permute(1, 2, 0)
-    np.testing.assert_allclose(out, expected.numpy(), rtol=0.0, atol=1e-5)  # sums of 50 floats

@@ -8,16 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shiftsim.planners.learned.carl.raster import (
-    draw_line,
-    fill,
-    make_crossings,
-)
+from shiftsim.planners.learned.carl.raster import draw_line, fill
 
 GOLDEN = places.GOLDEN / "opencv_shapes.npz"
 SIZE = 64
 LINE, AREA, BOX = range(3)
-CROSSINGS = make_crossings(SIZE, 100)
 
 near = st.integers(-40, 104)
 inside = st.integers(0, SIZE - 1)
@@ -31,9 +26,9 @@ def draw(kind, points):
         for (x0, y0), (x1, y1) in pairwise(xy.tolist()):
             draw_line(picture, x0, y0, x1, y1, 1)
     elif kind == AREA:
-        fill(picture, xy, 1, CROSSINGS, False)
+        fill(picture, xy, 1, False)
     else:
-        fill(picture, xy, 1, CROSSINGS, True)
+        fill(picture, xy, 1, True)
     return picture
 
 
@@ -141,7 +136,7 @@ def test_a_square_of_three_pixels_is_filled_to_its_borders():
 
 def test_later_shapes_are_drawn_over_earlier_ones():
     picture = np.zeros((SIZE, SIZE), np.uint8)
-    fill(picture, np.array([[1, 1], [9, 1], [9, 9], [1, 9]]), 7, CROSSINGS, False)
+    fill(picture, np.array([[1, 1], [9, 1], [9, 9], [1, 9]]), 7, False)
     draw_line(picture, 0, 4, 12, 4, 9)
     assert picture[4, :13].tolist() == [9] * 13
     assert picture[5, 5] == 7

@@ -2,7 +2,6 @@
 
 import importlib.util
 import json
-import os
 import pickle
 import zipfile
 from contextlib import suppress
@@ -31,12 +30,12 @@ from hypothesis import strategies as st
 
 from shiftsim.errors import CheckpointError
 from shiftsim.planners.learned.checkpoint import (
+    empty_state,
     load_weights,
     open_checkpoint,
 )
 from shiftsim.planners.learned.convert import convert_checkpoint, inspect_checkpoint
-from shiftsim.planners.learned.match import empty_state
-from shiftsim.planners.learned.reader import PlainReader, read_contents
+from shiftsim.planners.learned.reader import read_contents
 
 pytestmark = [pytest.mark.learned, pytest.mark.usefixtures("checkpoints")]
 
@@ -114,19 +113,11 @@ def test_the_old_format_of_torch_loads(tmp_path, plantf):
 # --- what else is in a file
 
 
-def test_numpy_scalars_are_no_obstacle(tmp_path, plantf):
-    path = save(lightning_entries(plantf), tmp_path / "a.ckpt")
-    contents = read_contents(path)
-    assert contents.skipped == ()
-    assert contents.entries["hyper_parameters"]["lr"] == 1e-3
-
-
-@pytest.mark.parametrize("protocol", [2, 4])
-def test_objects_of_foreign_classes_are_left_out_and_named(tmp_path, plantf, protocol):
+def test_objects_of_foreign_classes_are_left_out_and_named(tmp_path, plantf):
     entries = lightning_entries(plantf)
-    entries["hyper_parameters"] = AttributeDict(lr=0.1, nested=AttributeDict(a=1))
+    entries["hyper_parameters"] = AttributeDict(lr=0.1, nested=AttributeDict(a=np.float64(1.0)))
     entries["callbacks"] = {"best": Callback(), Callback: [Callback()]}
-    path = save(entries, tmp_path / "a.ckpt", pickle_protocol=protocol)
+    path = save(entries, tmp_path / "a.ckpt")
     assert_same(load_weights(str(path), "plantf").state, plantf)
     skipped = open_checkpoint(path).skipped
     assert {"checkpoint_files.AttributeDict", "checkpoint_files.Callback"} <= set(skipped)
@@ -139,12 +130,9 @@ def test_a_hostile_object_is_never_run(tmp_path, plantf, old):
     entries["callbacks"] = [Hostile(marker)]
     path = tmp_path / "a.ckpt"
     save(entries, path, _use_new_zipfile_serialization=not old)
-    if old:
-        with pytest.raises(CheckpointError, match="more than tensors in the old format"):
-            load_weights(str(path), "plantf")
-    else:
-        assert_same(load_weights(str(path), "plantf").state, plantf)
-        assert f"{os.system.__module__}.system" in open_checkpoint(path).skipped
+    with pytest.raises(CheckpointError, match="more than tensors") as caught:
+        load_weights(str(path), "plantf")
+    assert "where you trust it" in caught.value.hint
     assert not marker.exists()
 
 
@@ -154,25 +142,23 @@ def test_the_test_of_hostility_would_notice(tmp_path):
     assert marker.exists()
 
 
-def test_a_hostile_object_in_the_place_of_a_tensor_is_a_missing_tensor(tmp_path, plantf):
-    marker = tmp_path / "marker"
+def test_a_foreign_object_in_the_place_of_a_tensor_is_a_missing_tensor(tmp_path, plantf):
     entries = lightning_entries(plantf)
-    entries["state_dict"]["model.norm.bias"] = Hostile(marker)
+    entries["state_dict"]["model.norm.bias"] = Callback()
     path = save(entries, tmp_path / "a.ckpt")
     with pytest.raises(CheckpointError, match=r"1 missing: norm\.bias"):
         load_weights(str(path), "plantf")
-    assert not marker.exists()
 
 
 def test_a_plain_pickle_is_refused_unread(tmp_path):
     marker, path = tmp_path / "marker", tmp_path / "a.ckpt"
     path.write_bytes(pickle.dumps(Hostile(marker)))
-    with pytest.raises(CheckpointError, match="is a pickle, but none that torch has saved"):
+    with pytest.raises(CheckpointError, match="neither a torch nor a safetensors file"):
         read_contents(path)
     assert not marker.exists()
 
 
-def test_the_second_reader_agrees_with_torch_on_views_and_types(tmp_path):
+def test_foreign_objects_beside_tensors_change_no_views_or_types(tmp_path):
     base = torch.arange(24.0).reshape(4, 6)
     tensors = {
         "transposed": base.T,
@@ -258,10 +244,10 @@ def write_zip(path):
         ),
         (lambda p: p.write_text("\n<!DOCTYPE html><html>"), "web page: the download has failed"),
         (lambda p: p.write_text("hello"), "neither a torch nor a safetensors file"),
-        (write_zip, "zip file that torch has not saved"),
+        (write_zip, "is damaged, or holds more"),
         (lambda p: save([1, 2], p), "holds one list, not tensors by name"),
         (lambda p: save({"state_dict": {}, "epoch": 1}, p), "holds no tensors"),
-        (lambda p: torch.jit.script(torch.nn.Linear(2, 2)).save(p), "TorchScript program"),
+        (lambda p: torch.jit.script(torch.nn.Linear(2, 2)).save(p), "torchscript"),
         (lambda p: p.mkdir(), "holds no checkpoints"),
         (lambda p: p.write_bytes(b"\x10" + bytes(7) + b'{"a": 1}      '), "is damaged"),
     ],
@@ -348,21 +334,3 @@ def test_what_is_not_complete_is_not_converted(tmp_path, plantf):
         convert_checkpoint(str(source), tmp_path / "b.safetensors")
     assert not (tmp_path / "b.safetensors").exists()
     assert "1 missing" in inspect_checkpoint(str(source)).problem
-
-
-@pytest.mark.parametrize(
-    ("content", "why"),
-    [
-        (b"\x80\x05\x96" + (1 << 40).to_bytes(8, "little") + b"x.", "1099511627776 bytes"),
-        (b"\x80\x02Nr" + (1 << 31).to_bytes(4, "little") + b".", "object number 2147483648"),
-        (b"Np987654321\n.", "object number 987654321"),
-        (b"\x80\x02N", "exhausted"),
-    ],
-)
-def test_a_pickle_that_asks_for_absurd_memory_is_refused_before_it_is_read(content, why):
-    with pytest.raises(ValueError, match=why):
-        PlainReader(content, lambda module, name: None)
-
-
-def test_a_pickle_that_numbers_its_objects_is_read():
-    assert PlainReader(b"\x80\x02(NNr\x05\x00\x00\x00l.", lambda *_: None).load() == [None, None]

@@ -9,14 +9,16 @@ from hypothesis import strategies as st
 from strategies import rigid_motions
 from worlds import cruise_scenario, moved, standing_tracks, straight_road
 
-from shiftsim.data.demo.store import bench_scene
-from shiftsim.planners.learned.diffusion import kernels
+from shiftsim.benchmarks.speed.city import bench_scene
 from shiftsim.planners.learned.diffusion.features import (
     FeatureBuilder,
     agent_features,
     lane_inputs,
     lane_lines,
+    lanes_in_square,
     lanes_on_route,
+    nearest_lanes,
+    resample_lanes,
 )
 from shiftsim.sim.loop import Rollout
 from shiftsim.sim.planner import scene_info
@@ -181,7 +183,7 @@ def lines_of(rng, count):
 def test_resampled_lines_are_those_of_shapely(rng):
     lines = lines_of(rng, 20)
     packed = make_polylines(lines)
-    rows = kernels.resample_lanes(packed, packed, packed)
+    rows = resample_lanes(packed, packed, packed)
     for row, line in zip(rows, lines, strict=True):
         string = shapely.LineString(line)
         points = [string.interpolate(at).coords[0] for at in np.linspace(0, string.length, 20)]
@@ -193,7 +195,7 @@ def test_a_border_that_runs_the_other_way_is_turned_round():
     line = make_polylines([np.array([[0.0, 0], [10, 0]])])
     left = make_polylines([np.array([[10.0, 2], [0, 2]])])
     right = make_polylines([np.zeros((0, 2))])
-    (row,) = kernels.resample_lanes(line, left, right)
+    (row,) = resample_lanes(line, left, right)
     np.testing.assert_allclose(row[:, 4:], [[0, 2, 0, 0]] * 20, atol=1e-12)
 
 
@@ -202,9 +204,9 @@ def test_lanes_count_by_area_and_connectors_by_line(seed):
     rng = np.random.default_rng(seed)
     lines = lines_of(rng, 12)
     shapes = [shapely.LineString(line).buffer(5.0) for line in lines]
-    packed, areas = make_polylines(lines), make_layer(map(str, range(12)), shapes).polygons
-    bounds = kernels.line_bounds(packed)
-    found = kernels.lanes_in_square(areas, packed, bounds, 6, square_around(0.0, 0.0, 100.0))
+    areas = make_layer(map(str, range(12)), shapes).polygons
+    connectors = shapely.STRtree([shapely.LineString(line) for line in lines[6:]])
+    found = lanes_in_square(areas, connectors, 6, square_around(0.0, 0.0, 100.0))
     square = shapely.box(-100, -100, 100, 100)
     expected = [i for i in range(6) if shapes[i].intersects(square)]
     expected += [i for i in range(6, 12) if shapely.LineString(lines[i]).intersects(square)]
@@ -216,14 +218,9 @@ def test_lanes_that_share_their_nearest_vertex_come_by_area_then_as_listed():
     lines = make_polylines([line, line, line[::-1] + np.array([1, 0]), line])
     shapes = [shapely.box(low, -1, 30, 1) for low in (9, 5, 0, 5)]
     areas = make_layer("abcd", shapes).polygons
-    order = kernels.nearest_lanes(np.arange(4), areas, lines, 0.0, 0.0, 70)
+    order = nearest_lanes(np.arange(4), areas, lines, 0.0, 0.0, 70)
     assert order.tolist() == [1, 3, 0, 2]
-    assert kernels.nearest_lanes(np.arange(4), areas, lines, 0.0, 0.0, 2).tolist() == [1, 3]
-
-
-def test_kernels_are_plain_python_too():
-    line = make_polylines([np.array([[0.0, 0], [10, 0]])])
-    assert kernels.line_bounds.py_func(line).tolist() == [[0, 0, 10, 0]]
+    assert nearest_lanes(np.arange(4), areas, lines, 0.0, 0.0, 2).tolist() == [1, 3]
 
 
 def test_in_a_city_seventy_lanes_are_seen():

@@ -10,9 +10,9 @@ from stores import write_toy_store
 from worlds import cruise_scenario, standing_tracks, straight_road
 
 import shiftsim
-from shiftsim.data.deepplan.convert import convert_dsc3d
-from shiftsim.data.demo import files as demo_files
+from shiftsim.data.readers.dsc3d import convert_dsc3d
 from shiftsim.data.store.reading import open_store
+from shiftsim.data.synthetic.store import write_demo
 from shiftsim.metrics import compute_metrics
 from shiftsim.planners.contract import check_planner
 from shiftsim.planners.registry import load_planner
@@ -36,11 +36,7 @@ NOISE = {"noise": "ou-high", "seed": 1}
 def demo(tmp_path_factory):
     """The first scenarios of one demo town, cut short."""
     folder = tmp_path_factory.mktemp("demo")
-    with pytest.MonkeyPatch.context() as patch:
-        site = next(site for site in demo_files.demo_sites() if site.name == "junction")
-        sites = (replace(site, scenes=site.scenes[:1]),)
-        patch.setattr(demo_files, "demo_sites", lambda: sites)
-        demo_files.write_demo(folder / "recordings")
+    write_demo(folder / "recordings", "junction")
     convert_dsc3d(folder / "recordings" / "junction", folder / "store", site="junction")
     store = open_store(folder / "store")
     return [cut(store.read(token)) for token in store.tokens[:3]]

@@ -11,11 +11,11 @@ from scipy.signal import savgol_filter
 from strategies import seeds
 from worlds import straight_road
 
-from shiftsim.planners.learned import features as features_module
 from shiftsim.planners.learned.features import (
     SAMPLES,
     agent_features,
     map_poses,
+    plan_of_poses,
     straight_on,
 )
 from shiftsim.planners.learned.map_features import (
@@ -24,15 +24,15 @@ from shiftsim.planners.learned.map_features import (
     LANE,
     POINTS,
     LightLookup,
-    _resample,
     oriented_rectangle,
+    resample,
     road_features,
     road_objects,
 )
-from shiftsim.planners.learned.plan_states import plan_of_poses
 from shiftsim.planners.per_map import PerMap
 from shiftsim.sim.planner import History
 from shiftsim.world.build import AreaSpec, build_map
+from shiftsim.world.layers import make_polylines
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AX, AY, VX, VY, LightStatus, Tracks, TrafficLights
 
@@ -89,17 +89,16 @@ def test_resampled_polylines_have_equal_steps_along_the_chord(seed, count):
     xy = np.array([6e5, 4e6]) + np.cumsum(rng.normal(0.0, 3.0, (count, 2)), axis=0)
     xy[count // 2] = xy[count // 2 - 1]  # a step without length
     arc = np.r_[0.0, np.cumsum(np.hypot(*np.diff(xy, axis=0).T))]
-    out = np.empty((POINTS + 1, 2))
-    _resample(xy, arc, out)
+    line, out = make_polylines([xy]), np.empty((1, POINTS + 1, 2))
+    resample(line, line, out)
     wanted = np.linspace(0.0, arc[-1], POINTS + 1)
     expected = np.c_[np.interp(wanted, arc, xy[:, 0]), np.interp(wanted, arc, xy[:, 1])]
-    np.testing.assert_allclose(out, expected, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(out[0], expected, rtol=0, atol=1e-8)
 
 
 def test_a_line_without_length_stays_where_it_is():
-    xy = np.full((3, 2), 7.0)
-    out = np.empty((POINTS + 1, 2))
-    _resample(xy, np.zeros(3), out)
+    line, out = make_polylines([np.full((3, 2), 7.0)]), np.empty((1, POINTS + 1, 2))
+    resample(line, line, out)
     np.testing.assert_array_equal(out, 7.0)
 
 
@@ -235,17 +234,6 @@ def test_agent_histories_are_as_computed_one_by_one(seed, count, samples):
             np.testing.assert_allclose(found.shape[at], size, atol=1e-6)
     assert not found.valid[:, : max(0, SAMPLES - samples)].any()
     assert found.valid[0].sum() == min(samples, SAMPLES)
-
-
-def test_the_compiled_history_is_that_of_the_python_original(rng):
-    past = history(tracks=random_tracks(rng, 12))
-    tracks = past.tracks
-    chosen = np.array([3, 0, 7])
-    arrays = (past.ego, tracks.poses, tracks.velocities, tracks.sizes, tracks.valid, chosen)
-    compiled = features_module._agent_histories(*arrays)
-    plain = features_module._agent_histories.py_func(*arrays)
-    for ours, theirs in zip(compiled, plain, strict=True):
-        np.testing.assert_array_equal(ours, theirs)
 
 
 def test_a_plan_at_constant_speed_has_no_acceleration():

@@ -158,7 +158,7 @@ def test_other_weights_are_named_in_the_header_too(official, toy_run):
 
 
 def tables_beside(*runs):
-    return make_tables(read_groups(runs), published_figures(), Options(beside=True))
+    return make_tables(read_groups(runs), published_figures(), Options(with_published=True))
 
 
 def planners_of(tables):

@@ -3,27 +3,23 @@
 import pickle
 import sys
 import time
-from multiprocessing import AuthenticationError, Pipe
+from multiprocessing import AuthenticationError
 from multiprocessing.connection import Client
 from threading import Barrier, Thread
-from typing import NamedTuple
 
-import numpy as np
 import pytest
 
 from shiftsim.errors import ConfigError, PlannerError
 from shiftsim.planners.learned import owner
-from shiftsim.planners.learned.owner import LARGE, Ask, Owner, new_address, receive, send
+from shiftsim.planners.learned.owner import (
+    InferenceClient,
+    InferenceServer,
+    new_address,
+)
 
 pytestmark = pytest.mark.skipif(
     sys.platform not in ("linux", "win32"), reason="devices of torch's CUDA are there only"
 )
-
-
-class Seen(NamedTuple):
-    name: str
-    small: np.ndarray
-    large: np.ndarray
 
 
 class Doubling:
@@ -52,21 +48,12 @@ class Slowly:
 def asking():
     address = new_address()
     slowly = Slowly()
-    held = Owner({"doubling": Doubling, "slowly": lambda: slowly}, address)
-    return lambda name, key=address.key: Ask(address._replace(key=key), name), held, slowly
-
-
-@pytest.mark.parametrize("size", [0, LARGE // 8 - 1, LARGE // 8, 10 * LARGE])
-def test_what_is_received_is_what_was_sent(size):
-    ours, theirs = Pipe()
-    value = [Seen("a", np.arange(3, dtype=np.int8), np.arange(size, dtype=np.float64)[::1])] * 2
-    sender = Thread(target=send, args=(ours, (value, None)))
-    sender.start()
-    found, nothing = receive(theirs)
-    sender.join()
-    assert nothing is None
-    assert pickle.dumps(found) == pickle.dumps(value)
-    assert found[0].large.flags.writeable
+    held = InferenceServer({"doubling": Doubling, "slowly": lambda: slowly}, address)
+    return (
+        lambda name, key=address.key: InferenceClient(address._replace(key=key), name),
+        held,
+        slowly,
+    )
 
 
 def test_errors_are_those_of_the_network(asking):
@@ -118,7 +105,7 @@ def test_what_travels_has_no_connection_and_makes_its_own(asking):
 
 def test_without_an_owner_it_waits_once_and_says_so(monkeypatch):
     monkeypatch.setattr(owner, "PATIENCE", 0.3)
-    ask = Ask(new_address(), "plantf")
+    ask = InferenceClient(new_address(), "plantf")
     took = []
     for _ in range(2):
         began = time.monotonic()

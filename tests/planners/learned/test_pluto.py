@@ -16,9 +16,8 @@ from shiftsim.world.state import HEADING, VX, AgentKind, LightStatus, TrafficLig
 
 torch = pytest.importorskip("torch")
 
-from shiftsim.planners.learned.pluto.inputs import stack  # noqa: E402  # needs torch
-from shiftsim.planners.learned.pluto.network import Inputs, build_network  # noqa: E402  # needs torch
-from shiftsim.planners.learned.pluto.planner import NO_LINE, Pluto  # noqa: E402  # needs torch
+from shiftsim.planners.learned.pluto.network import build_network  # noqa: E402  # needs torch
+from shiftsim.planners.learned.pluto.planner import NO_LINE, Pluto, make_batch  # noqa: E402
 
 pytestmark = pytest.mark.learned
 
@@ -122,7 +121,7 @@ def test_official_masks_of_a_batch_matter_only_where_numbers_of_lines_differ(rou
         network.load_state_dict(rough.network.state_dict())
         network.eval()
     alike, unlike = (
-        [network(Inputs(*stack(batch, "cpu"))).trajectory for network in (official, ours)]
+        [network(make_batch(batch, "cpu")).trajectory for network in (official, ours)]
         for batch in ([two, two], [two, one])
     )
     assert torch.equal(*alike)
@@ -138,7 +137,7 @@ def test_any_number_of_agents_will_do(planner, count):
 
 def test_only_the_nearest_agents_are_seen(planner):
     plan_of(planner, scene(4, 500))
-    assert len(planner.sight.agents.valid) == 49
+    assert len(planner.surroundings.agents.valid) == 49
 
 
 @pytest.mark.parametrize("samples", [1, 20])
@@ -171,7 +170,7 @@ def test_without_a_route_on_the_map_it_drives_on(planner, route):
 def test_a_map_without_speed_limits_counts_as_free(planner):
     plan_of(planner, scene(count=0, road=straight_road(speed_limit=None)))
     assert (planner.choice.scores.speed_limits[:, 0] == 50.0).all()
-    assert not planner.sight.road.has_limit.any()
+    assert not planner.surroundings.road.has_limit.any()
 
 
 def test_a_red_light_on_the_way_is_a_fault(planner):

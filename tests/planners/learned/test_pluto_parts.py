@@ -7,16 +7,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 from worlds import standing_tracks, straight_road
 
-from shiftsim.planners.learned.pluto.brake import brake, must_brake
-from shiftsim.planners.learned.pluto.proposals import Output, best_proposals, predicted_agents
+from shiftsim.planners.learned.pluto.planner import Output, best_proposals, predicted_agents
 from shiftsim.planners.learned.pluto.reference import (
+    areas_of_map,
     drivable_near,
     line_features,
-    map_areas,
     reference_lines,
     route_lanes,
 )
-from shiftsim.planners.learned.pluto.scoring import Place, aggregate, normalise, on_road, score
+from shiftsim.planners.learned.pluto.scoring import (
+    Place,
+    aggregate,
+    brake,
+    must_brake,
+    normalise,
+    on_road,
+    score,
+)
 from shiftsim.planners.learned.pluto.world import Agents, make_world, static_objects
 from shiftsim.planners.proposals.contacts import is_at_fault
 from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
@@ -33,7 +40,7 @@ def road():
 
 
 def lanes_of(road, ids=("1", "2", "3")):
-    return route_lanes(road, map_areas(road), [road.blocks.index[name] for name in ids])
+    return route_lanes(road, areas_of_map(road), [road.blocks.index[name] for name in ids])
 
 
 def lines_from(road, x, y=0.0, heading=0.0, ids=("1", "2", "3")):

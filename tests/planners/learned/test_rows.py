@@ -4,12 +4,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from shiftsim.planners.learned.network.rows import (  # noqa: E402  # needs torch
-    Attention,
-    Linear,
-    linear,
-    make_scenes,
-)
+from shiftsim.planners.learned.network import Attention, Linear, Scenes, linear  # noqa: E402
 
 pytestmark = pytest.mark.learned
 ROUNDING = 1e-5
@@ -46,6 +41,23 @@ def official(layer, query, context, keep):
     return other(query[None], context[None], context[None], key_padding_mask=~keep[None])[0][0]
 
 
+def scenes_of(counts, keep):
+    """How rows with `keep` lie that are scenes of `counts`, filled up in a batch."""
+    valid = torch.zeros(len(counts), max(counts), dtype=torch.bool)
+    for row, part in zip(valid, keep.split(counts), strict=True):
+        row[: len(part)] = part
+    return Scenes([valid], [counts])
+
+
+def test_rows_that_fill_up_are_left_out_and_come_back():
+    scenes = scenes_of([4, 2, 1], torch.ones(7, dtype=torch.bool))
+    x = torch.randn(3, 4, 5)
+    rows = scenes.pack(x)
+    assert torch.equal(rows, torch.cat([x[0], x[1, :2], x[2, :1]]))
+    assert torch.equal(scenes.firsts(rows), x[:, 0])
+    assert torch.equal(scenes.unpack(rows, 7.0)[1, 2:], torch.full((2, 5), 7.0))
+
+
 def test_attention_stays_within_its_scene():
     layer = Attention(8, 2)
     for parameter in layer.parameters():
@@ -53,7 +65,8 @@ def test_attention_stays_within_its_scene():
     asking, counts = [2, 0, 1, 3], [4, 2, 1, 5]
     query, context = torch.randn(sum(asking), 8), torch.randn(sum(counts), 8)
     keep = torch.tensor([1, 0, 1, 1, 1, 0, 1, 0, 1, 1, 0, 1], dtype=torch.bool)
-    out = layer.among(query, context, asking, make_scenes(counts, keep))
+    scenes = scenes_of(counts, keep)
+    out = layer.segment_attention(query, context, asking, scenes)
     parts = zip(query.split(asking), context.split(counts), keep.split(counts), strict=True)
     expected = torch.cat([official(layer, *part) for part in parts])
     torch.testing.assert_close(out, expected, rtol=0.0, atol=ROUNDING)

@@ -6,37 +6,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from worlds import straight_road
 
-from shiftsim.planners.proposals.areas import (
-    areas_of,
-    covering,
-    index_ranks,
-    make_areas,
-    select_areas,
-)
-from shiftsim.planners.proposals.tracker import factor_speed_fit, fit_speed
+from shiftsim.planners.proposals.areas import areas_of, index_ranks, make_areas, select_areas
+from shiftsim.planners.proposals.places import OFF_ROAD, OFF_ROUTE, EgoBox, find_places
+from shiftsim.planners.proposals.tracker import fit_speed
 from shiftsim.world.layers import make_polygons
+from shiftsim.world.state import NUM_STATE
 
 
 def test_areas_and_their_order_are_those_of_the_map():
     road = straight_road()
-    areas = make_areas(road, [1, 3])
     selected = select_areas(road, 195.0, 0.0, 10.0)
     ids = [road.edges.ids[i] for i in selected]
     assert ids == ["10", "11", "20", "21"]
-    for x, y, expected in (
-        (195.0, 0.0, ["11"]),
-        (200.0, 0.0, ["11", "21"]),
-        (195.0, 1.75, ["10", "11"]),
-        (195.0, 5.3, []),
-    ):
-        found = np.empty_like(selected)
-        under = found[: covering(areas.slabs, selected, np.array([[x, y]]), found)]
-        assert [road.edges.ids[i] for i in under] == expected
+    assert np.flatnonzero(make_areas(road, [1, 3]).on_route).tolist() == [1, 3]
 
 
 @settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1))
-def test_what_covers_a_point_is_what_shapely_says(seed):
+def test_an_area_holds_the_points_that_shapely_says(seed):
     rng = np.random.default_rng(seed)
     rings = []
     for count in rng.integers(2, 60, 12).tolist():
@@ -44,20 +31,27 @@ def test_what_covers_a_point_is_what_shapely_says(seed):
         steps = np.column_stack([np.cos(heading), np.sin(heading)]) * rng.uniform(0.1, 9.0)
         middle = np.cumsum(steps, axis=0) + rng.uniform(-20.0, 20.0, 2)
         aside = rng.uniform(0.5, 2.0) * steps[:, ::-1] / np.hypot(*steps[0]) * [-1.0, 1.0]
-        rings.append(np.concatenate([middle + aside, (middle - aside)[::-1]]))
-    rings += [np.array([[0.0, 0.0], [9.0, 0.0], [9.0, 9.0], [5.0, 9.0], [5.0, 4.0], [0.0, 9.0]])]
-    rings = [ring for ring in rings if shapely.Polygon(ring).is_valid]
-    shapes = [shapely.Polygon(ring) for ring in rings]
+        rings.append([np.concatenate([middle + aside, (middle - aside)[::-1]])])
+    square = np.array([[0.0, 0.0], [9.0, 0.0], [9.0, 9.0], [5.0, 9.0], [5.0, 4.0], [0.0, 9.0]])
+    rings += [[square], [square, np.array([[6.0, 1.0], [8.0, 1.0], [8.0, 3.0], [6.0, 3.0]])]]
+    shapes = [shapely.Polygon(shell, holes) for shell, *holes in rings]
+    rings = [ring for ring, shape in zip(rings, shapes, strict=True) if shape.is_valid]
+    shapes = np.array([shape for shape in shapes if shape.is_valid])
     numbers = np.arange(len(rings))
-    areas = areas_of(make_polygons([[ring] for ring in rings]), numbers >= 0, numbers)
-    corners = np.concatenate(rings)
+    areas = areas_of(make_polygons(rings), numbers >= 0, numbers)
+    corners = np.concatenate([ring for shape in rings for ring in shape])
     points = [corners, corners + np.array([1.0, 0.0]), 0.5 * (corners[:-1] + corners[1:])]
     points = np.concatenate([*points, rng.uniform(-30.0, 30.0, (300, 2))])
-    expected = shapely.intersects(np.array(shapes)[:, None], shapely.points(points))
-    for point, covers in zip(points, expected.T, strict=True):
-        found = np.empty_like(numbers)
-        under = found[: covering(areas.slabs, numbers, point[None], found)]
-        assert under.tolist() == np.flatnonzero(covers).tolist()
+    expected = shapely.contains_properly(shapes[:, None], shapely.points(points))
+    states = np.zeros((1, len(points), NUM_STATE))
+    states[0, :, :2] = points
+    size, limits = EgoBox(0.5, 0.3, 0.1), np.zeros(len(rings))
+    for area, expected_of_area in enumerate(expected):
+        selected = np.array([area])
+        places = find_places(states, size, areas, selected, limits, by_center=False)
+        np.testing.assert_array_equal(~places.flags[0, :, OFF_ROUTE], expected_of_area)
+        within = shapely.contains_properly(shapes[area], shapely.points(places.corners[0]))
+        np.testing.assert_array_equal(~places.flags[0, :, OFF_ROAD], within.all(axis=1))
 
 
 @settings(max_examples=20)
@@ -84,7 +78,6 @@ def test_the_speed_fit_is_the_one_of_the_reference_implementation(rng):
     regular[np.arange(37), np.arange(1, 38)] = 1.0
     regular[37, 38], regular[37, 39] = -1.0, 1.0
     solved = np.linalg.solve(matrix.T @ matrix + penalty * regular.T @ regular, matrix.T @ right)
-    out, factors = np.empty(40), np.empty((3, 40))
-    factor_speed_fit(dt, penalty, factors)
-    fit_speed(poses, np.empty((41, 2)), dt, factors, out)
+    out = np.empty(40)
+    fit_speed(poses, dt, penalty, out)
     np.testing.assert_allclose(out, unknowns @ solved, rtol=0, atol=1e-9)

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from worlds import straight_road
 
-from shiftsim.data.demo.store import bench_scene
+from shiftsim.benchmarks.speed.city import bench_scene
 from shiftsim.errors import PlannerError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.planners.routes.correction import (

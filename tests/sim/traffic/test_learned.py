@@ -9,8 +9,8 @@ from worlds import cruise_scenario, moved, standing_tracks, straight_road
 from shiftsim.errors import CheckpointError, ConfigError, TrafficError
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import simulate
-from shiftsim.sim.traffic import following
-from shiftsim.sim.traffic.learned import features, network
+from shiftsim.sim.traffic import lanes as following
+from shiftsim.sim.traffic.learned import features, model
 from shiftsim.sim.traffic.learned.model import LearnedTraffic
 from shiftsim.sim.traffic.mixed import Mixed
 from shiftsim.sim.traffic.planned import PlannedTraffic
@@ -133,7 +133,7 @@ def test_a_red_light_ahead_is_seen():
 def test_weights_of_something_else_are_refused(tmp_path):
     with pytest.raises(CheckpointError, match="no weights of learned traffic"):
         LearnedTraffic(tmp_path / "none.npz")
-    arrays = {name: np.zeros(shape) for name, shape in network.SHAPES.items()}
+    arrays = {name: np.zeros(shape) for name, shape in model.SHAPES.items()}
     np.savez(tmp_path / "short.npz", **(arrays | {"last_bias": np.zeros(3)}))
     with pytest.raises(CheckpointError, match=r"'last_bias' has shape \(3,\), not \(2,\)"):
         LearnedTraffic(tmp_path / "short.npz")

@@ -43,7 +43,7 @@ class BridgeMap(AbstractMap):
 
     def __init__(self, source: VectorMap) -> None:
         self.source = source
-        self._made: dict[tuple[str, int], Any] = {}
+        self._by_index: dict[tuple[str, int], Any] = {}
 
     @property
     def map_name(self) -> str:
@@ -74,12 +74,12 @@ class BridgeMap(AbstractMap):
 
     def object(self, layer: str, index: int) -> Any:
         """Object number `index` of one of our layers, always the same one."""
-        found = self._made.get((layer, index))
+        found = self._by_index.get((layer, index))
         if found is None:
             kind: type[Any] = KINDS[layer]
             if layer == "edges" and self.source.is_connector(index):
                 kind = BridgeLaneConnector
-            found = self._made[layer, index] = kind(self, getattr(self.source, layer), index)
+            found = self._by_index[layer, index] = kind(self, getattr(self.source, layer), index)
         return found
 
     def objects(self, layer: Any) -> list[Any]:

@@ -1,7 +1,7 @@
 """Objects of a map, made when asked for; each one knows its map and its index there."""
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import shapely
@@ -21,9 +21,6 @@ from shiftsim.errors import MapError
 from shiftsim.kernels import FloatArray
 from shiftsim.world.layers import Layer, Lists
 from shiftsim.world.map import NONE, VectorMap
-
-if TYPE_CHECKING:
-    from shiftsim.compat.nuplan.bridge.map import BridgeMap
 
 _HEADING_STEP = 0.5  # m, nuPlan polyline map object
 _CURVATURE_STEP = 2.0  # m, nuPlan polyline map object
@@ -105,15 +102,16 @@ class BridgePolyline(PolylineMapObject):
 
 
 class _Mapped:
-    """An object of one of our layers, `id` its id there."""
+    """An object of one of our layers, `id` its id there; `owner` is the `BridgeMap`."""
 
-    def __init__(self, owner: "BridgeMap", layer: Layer, index: int) -> None:
+    def __init__(self, owner: Any, layer: Layer, index: int) -> None:
         self._map, self._layer, self._index = owner, layer, index
         self.id = layer.ids[index]
 
     @property
     def _source(self) -> VectorMap:
-        return self._map.source
+        source: VectorMap = self._map.source
+        return source
 
     @cached_property
     def polygon(self) -> shapely.Polygon:

@@ -53,8 +53,8 @@ def ego_state(time_us: int, row: FloatArray, vehicle: Any) -> Any:
     )
 
 
-class SeenTracks(DetectionsTracks):
-    """The objects of one moment, made when they are looked at."""
+class ObservedTracks(DetectionsTracks):
+    """The objects of one moment, built on first access."""
 
     def __init__(self, time_us: int, tracks: Tracks) -> None:
         self._time_us, self._tracks = int(time_us), tracks
@@ -121,7 +121,7 @@ class HistoryKeeper:
     def _sample(self, observation: Observation, row: int) -> tuple[Any, Any]:
         history = observation.history
         time_us = int(history.time_us[row])
-        seen = SeenTracks(time_us, history.tracks.rows(slice(row, row + 1)))
+        seen = ObservedTracks(time_us, history.tracks.rows(slice(row, row + 1)))
         return ego_state(time_us, history.ego[row], self._vehicle), seen
 
 
@@ -144,8 +144,8 @@ def to_trajectory(plan: Any, now_us: int, next_us: int, planner: str) -> Traject
         states = plan.get_sampled_trajectory()
     else:
         first, last = int(plan.start_time.time_us), int(plan.end_time.time_us)
-        looked_at = {*range(first, last + 1, _STEP_US), first, last, now_us, next_us}
-        times = [TimePoint(time) for time in sorted(looked_at) if first <= time <= last]
+        moments = {*range(first, last + 1, _STEP_US), first, last, now_us, next_us}
+        times = [TimePoint(time) for time in sorted(moments) if first <= time <= last]
         states = plan.get_state_at_times(times)
     wrong = next((state for state in states if not isinstance(state, EgoState)), None)
     if wrong is not None:

@@ -16,7 +16,7 @@ from shiftsim.sim.traffic.idm.paths import (
     finish_path,
     pose_on_path,
 )
-from shiftsim.sim.traffic.idm.scene import MAX_ROUTE, REPLAYED_KINDS, Fleet, make_paths
+from shiftsim.sim.traffic.idm.scene import MAX_ROUTE, REPLAYED_KINDS, Fleet
 from shiftsim.world.lanes import Start, find_starts
 from shiftsim.world.map import VectorMap
 
@@ -74,7 +74,6 @@ def make_fleet(
     """Agents at their starts."""
     count = len(starts)
     longest = max([len(map.baselines.at(start.edge)) for start in starts], default=2)
-    paths, lines, runs = make_paths(count, longest)
     fleet = Fleet(
         alive=np.ones(count, np.bool_),
         size=np.ascontiguousarray(sizes, np.float64),
@@ -84,11 +83,8 @@ def make_fleet(
         pose=np.zeros((count, 3)),
         route=np.zeros((count, MAX_ROUTE), np.int64),
         route_size=np.ones(count, np.int64),
-        path=paths,
+        path=np.zeros((count, longest, 4)),
         path_size=np.zeros(count, np.int64),
-        line=lines,
-        runs=runs,
-        first=np.full(count, -1),
     )
     target = default_target
     for agent, start in enumerate(starts):

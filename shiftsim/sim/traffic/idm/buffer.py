@@ -20,133 +20,127 @@ _CLOSING = 80.0  # closing points of an inner turn lie this much nearer to the c
 _PER_VERTEX = 4  # most curve vertices of a join, fillets apart
 
 
-@kernel
 def curve_capacity(num_points: int) -> int:
     """Most vertices the buffer curve of a polyline can have, whatever its turns add up to."""
     return 2 * num_points * (_PER_VERTEX + 2 * QUADRANT_SEGMENTS) + 8
 
 
 @kernel
-def buffer_curve(line: FloatArray, distance: float, keep: BoolArray, out: FloatArray) -> int:
+def buffer_curve(line: FloatArray, distance: float, out: FloatArray) -> int:
     """Outline of a polyline (K, 2) buffered by `distance` [m] with flat caps and round joins.
 
-    `keep` (K,) is scratch; `out` (V, 2) receives the curve.
+    `out` (V, 2) receives the curve, V being at least `curve_capacity(K)`.
 
     Returns:
-        How many vertices the curve has, the closing one not repeated; -1 where `out` is too small.
+        How many vertices the curve has, the closing one not repeated.
     """
     count = 0
-    for side in range(2):
-        _simplify(line, distance * _SIMPLIFY, side == 0, keep)
-        count = _offset_side(line, distance, side == 0, keep, out, count)
-        if count < 0:
-            return -1
-    return int(count)
+    for side in range(2):  # the left of the line, and the left of the way back
+        keep = _simplify(line, distance * _SIMPLIFY, side == 0)
+        seen = 0
+        x0 = y0 = x1 = y1 = x2 = y2 = 0.0
+        vx = vy = ux = uy = 0.0  # from the segments before and after x1, y1 to their offsets
+        for index in range(len(line)):
+            at = index if side == 0 else len(line) - 1 - index
+            if not keep[at]:
+                continue
+            x0, y0, x1, y1, x2, y2 = x1, y1, x2, y2, line[at, 0], line[at, 1]
+            seen += 1
+            if seen == 1:
+                continue
+            dx, dy = x2 - x1, y2 - y1
+            length = np.sqrt(dx * dx + dy * dy)
+            vx, vy, ux, uy = ux, uy, -distance * dy / length, distance * dx / length
+            turn = orientation(x0, y0, x1, y1, x2, y2) if seen > 2 else 0
+            if turn == 0:
+                continue
+            is_narrow = np.sqrt((vx - ux) ** 2 + (vy - uy) ** 2) < distance * _NARROW_TURN
+            if turn < 0:  # outside: a round join, clockwise
+                count = _add(out, count, x1 + vx, y1 + vy, distance)
+                if is_narrow:
+                    continue
+                first, last = np.arctan2(vy, vx), np.arctan2(uy, ux)
+                if first <= last:
+                    first += 2.0 * np.pi
+                total = first - last
+                segments = int(total / (0.5 * np.pi / QUADRANT_SEGMENTS) + 0.5)
+                for step in range(segments):
+                    angle = first - step * (total / segments)
+                    x, y = x1 + distance * np.cos(angle), y1 + distance * np.sin(angle)
+                    count = _add(out, count, x, y, distance)
+                count = _add(out, count, x1 + ux, y1 + uy, distance)
+                continue
+            # inside: where the offsets of both segments cross, else closed near the curve
+            ax, ay, bx, by = x1 - x0, y1 - y0, x2 - x1, y2 - y1
+            gap_x, gap_y = (x1 + ux) - (x0 + vx), (y1 + uy) - (y0 + vy)
+            cross = ax * by - ay * bx
+            along_a = (gap_x * by - gap_y * bx) / cross
+            along_b = (gap_x * ay - gap_y * ax) / cross
+            if 0.0 <= along_a <= 1.0 and 0.0 <= along_b <= 1.0:
+                x, y = x0 + vx + along_a * ax, y0 + vy + along_a * ay
+                count = _add(out, count, x, y, distance)
+                continue
+            count = _add(out, count, x1 + vx, y1 + vy, distance)
+            if is_narrow:
+                continue
+            share = _CLOSING / (_CLOSING + 1.0)
+            count = _add(out, count, x1 + share * vx, y1 + share * vy, distance)
+            count = _add(out, count, x1 + share * ux, y1 + share * uy, distance)
+            count = _add(out, count, x1 + ux, y1 + uy, distance)
+        count = _add(out, count, x2 + ux, y2 + uy, distance)
+        count = _add(out, count, x2 - ux, y2 - uy, distance)
+    return count
 
 
 @kernel
-def _simplify(line: FloatArray, tolerance: float, left: bool, keep: BoolArray) -> None:
-    """Mark the vertices that stay when shallow turns to one side are left out."""
+def _simplify(line: FloatArray, tolerance: float, left: bool) -> BoolArray:
+    """(K,) which vertices stay when shallow turns to one side are left out."""
     concave, size = 1 if left else -1, len(line)
-    for vertex in range(size):
-        keep[vertex] = (
-            vertex == 0
-            or line[vertex, 0] != line[vertex - 1, 0]
-            or (line[vertex, 1] != line[vertex - 1, 1])
-        )
+    keep = np.ones(size, np.bool_)
+    for vertex in range(1, size):
+        is_moved_x = line[vertex, 0] != line[vertex - 1, 0]
+        keep[vertex] = is_moved_x or line[vertex, 1] != line[vertex - 1, 1]
     changed = True
     while changed:
         changed = False
-        index = _walk(keep, size, 0, 1)
-        middle = _walk(keep, size, index, 1)
-        last = _walk(keep, size, middle, 1)
+        index = _walk(keep, 0)
+        middle = _walk(keep, index)
+        last = _walk(keep, middle)
         while last < size:
-            if _side(line, index, middle, last) == concave and _is_shallow(
-                line, index, middle, last, tolerance
-            ):
+            ax, ay, bx, by = line[index, 0], line[index, 1], line[middle, 0], line[middle, 1]
+            cx, cy = line[last, 0], line[last, 1]
+            is_shallow = (
+                orientation(ax, ay, bx, by, cx, cy) == concave
+                and point_segment_distance(bx, by, ax, ay, cx, cy) < tolerance
+            )
+            if is_shallow:
+                for vertex in range(index, last, max((last - index) // _SAMPLED, 1)):
+                    # GEOS measures from the middle vertex to the line towards each sampled one
+                    x, y = line[vertex, 0], line[vertex, 1]
+                    if point_segment_distance(bx, by, ax, ay, x, y) >= tolerance:
+                        is_shallow = False
+                        break
+            if is_shallow:
                 keep[middle] = False
                 changed = True
-                index = last
-            else:
-                index = middle
-            middle = _walk(keep, size, index, 1)
-            last = _walk(keep, size, middle, 1)
+            index = last if is_shallow else middle
+            middle = _walk(keep, index)
+            last = _walk(keep, middle)
+    return keep
 
 
 @kernel
-def _side(line: FloatArray, before: int, at: int, after: int) -> int:
-    """Side to which a line turns at a vertex between two others: 1 left, -1 right, 0 none."""
-    ax, ay = line[before, 0], line[before, 1]
-    bx, by = line[at, 0], line[at, 1]
-    return orientation(ax, ay, bx, by, line[after, 0], line[after, 1])
-
-
-@kernel
-def _is_shallow(line: FloatArray, i0: int, i1: int, i2: int, tolerance: float) -> bool:
-    ax, ay = line[i0, 0], line[i0, 1]
-    bx, by = line[i1, 0], line[i1, 1]
-    cx, cy = line[i2, 0], line[i2, 1]
-    if point_segment_distance(bx, by, ax, ay, cx, cy) >= tolerance:
-        return False
-    step = max((i2 - i0) // _SAMPLED, 1)
-    for vertex in range(i0, i2, step):
-        # GEOS measures from the middle vertex to the line towards each sampled one
-        if point_segment_distance(bx, by, ax, ay, line[vertex, 0], line[vertex, 1]) >= tolerance:
-            return False
-    return True
-
-
-@kernel
-def _offset_side(
-    line: FloatArray, distance: float, left: bool, keep: BoolArray, out: FloatArray, count: int
-) -> int:
-    """Append the offset of one side, to the left of the direction walked, and the cap after it."""
-    size, step = len(line), 1 if left else -1
-    at = 0 if left else size - 1
-    while not keep[at]:
-        at += step
-    x1, y1 = line[at, 0], line[at, 1]
-    at = _walk(keep, size, at, step)
-    x2, y2 = line[at, 0], line[at, 1]
-    ux, uy = _offset(x1, y1, x2, y2, distance)
-    limit = len(out) - _PER_VERTEX - 2 * QUADRANT_SEGMENTS
-    at = _walk(keep, size, at, step)
-    while 0 <= at < size:
-        if count > limit:
-            return -1
-        x0, y0, x1, y1 = x1, y1, x2, y2
-        x2, y2 = line[at, 0], line[at, 1]
-        vx, vy = ux, uy
-        ux, uy = _offset(x1, y1, x2, y2, distance)
-        turn = orientation(x0, y0, x1, y1, x2, y2)
-        if turn < 0:
-            count = _outer_turn(x1, y1, vx, vy, ux, uy, distance, out, count)
-        elif turn > 0:
-            count = _inner_turn(x0, y0, x1, y1, x2, y2, vx, vy, ux, uy, distance, out, count)
-        at = _walk(keep, size, at, step)
-    count = _add(out, count, x2 + ux, y2 + uy, distance)
-    return _add(out, count, x2 - ux, y2 - uy, distance)
-
-
-@kernel
-def _walk(keep: BoolArray, size: int, at: int, step: int) -> int:
-    """The next vertex that is kept, or one beyond the ends."""
-    at += step
-    while 0 <= at < size and not keep[at]:
-        at += step
+def _walk(keep: BoolArray, at: int) -> int:
+    """The next vertex that is kept, or one beyond the end."""
+    at += 1
+    while at < len(keep) and not keep[at]:
+        at += 1
     return at
 
 
 @kernel
-def _offset(ax: float, ay: float, bx: float, by: float, distance: float) -> tuple[float, float]:
-    """Vector from a segment to its offset on the left."""
-    dx, dy = bx - ax, by - ay
-    length = np.sqrt(dx * dx + dy * dy)
-    return -distance * dy / length, distance * dx / length
-
-
-@kernel
 def _add(out: FloatArray, count: int, x: float, y: float, distance: float) -> int:
+    """Append a vertex unless it repeats the one before; the new number of vertices."""
     if count:
         dx, dy = x - out[count - 1, 0], y - out[count - 1, 1]
         if np.sqrt(dx * dx + dy * dy) < distance * _SAME_POINT:
@@ -154,66 +148,3 @@ def _add(out: FloatArray, count: int, x: float, y: float, distance: float) -> in
     out[count, 0] = x
     out[count, 1] = y
     return count + 1
-
-
-@kernel
-def _outer_turn(
-    x: float,
-    y: float,
-    vx: float,
-    vy: float,
-    ux: float,
-    uy: float,
-    distance: float,
-    out: FloatArray,
-    count: int,
-) -> int:
-    """Round join at (x, y) from offset v to offset u, clockwise."""
-    count = _add(out, count, x + vx, y + vy, distance)
-    if np.sqrt((vx - ux) ** 2 + (vy - uy) ** 2) < distance * _NARROW_TURN:
-        return count
-    first, last = np.arctan2(vy, vx), np.arctan2(uy, ux)
-    if first <= last:
-        first += 2.0 * np.pi
-    total = first - last
-    segments = int(total / (0.5 * np.pi / QUADRANT_SEGMENTS) + 0.5)
-    for index in range(segments):
-        angle = first - index * (total / segments)
-        count = _add(
-            out, count, x + distance * np.cos(angle), y + distance * np.sin(angle), distance
-        )
-    return _add(out, count, x + ux, y + uy, distance)
-
-
-@kernel
-def _inner_turn(
-    x0: float,
-    y0: float,
-    x1: float,
-    y1: float,
-    x2: float,
-    y2: float,
-    vx: float,
-    vy: float,
-    ux: float,
-    uy: float,
-    distance: float,
-    out: FloatArray,
-    count: int,
-) -> int:
-    """Join on the inside: where the offsets of both segments cross, else closed near the curve."""
-    ax, ay = x1 - x0, y1 - y0
-    bx, by = x2 - x1, y2 - y1
-    gap_x, gap_y = (x1 + ux) - (x0 + vx), (y1 + uy) - (y0 + vy)
-    cross = ax * by - ay * bx
-    along_a = (gap_x * by - gap_y * bx) / cross
-    along_b = (gap_x * ay - gap_y * ax) / cross
-    if 0.0 <= along_a <= 1.0 and 0.0 <= along_b <= 1.0:
-        return _add(out, count, x0 + vx + along_a * ax, y0 + vy + along_a * ay, distance)
-    count = _add(out, count, x1 + vx, y1 + vy, distance)
-    if np.sqrt((vx - ux) ** 2 + (vy - uy) ** 2) < distance * _NARROW_TURN:
-        return count
-    share = _CLOSING / (_CLOSING + 1.0)
-    count = _add(out, count, x1 + share * vx, y1 + share * vy, distance)
-    count = _add(out, count, x1 + share * ux, y1 + share * uy, distance)
-    return _add(out, count, x1 + ux, y1 + uy, distance)

@@ -13,7 +13,6 @@ from shiftsim.errors import ConfigError, TrafficError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.sim.traffic.idm.agents import make_fleet, place_agents
-from shiftsim.sim.traffic.idm.courtesy import make_courtesy, no_courtesy
 from shiftsim.sim.traffic.idm.paths import set_box
 from shiftsim.sim.traffic.idm.scene import (
     REPLAYED_KINDS,
@@ -21,23 +20,16 @@ from shiftsim.sim.traffic.idm.scene import (
     Scene,
     lane_graph,
     make_scene,
-    rows_of,
-    with_longer_curves,
+    row_of,
     with_longer_paths,
 )
-from shiftsim.sim.traffic.idm.step import (
-    BEGIN,
-    DONE,
-    LEFT_PATH,
-    LONGER_PATHS,
-    advance,
-    write_agents,
-)
-from shiftsim.sim.traffic.lights import light_flags
+from shiftsim.sim.traffic.idm.step import DONE, LEFT_PATH, LONGER_PATHS, advance, write_agents
+from shiftsim.sim.traffic.idm.yielding import make_yielding
+from shiftsim.sim.traffic.lanes import light_flags
+from shiftsim.world.events import CAUTIOUS, LOGGED, OFF
 from shiftsim.world.lanes import find_start
 from shiftsim.world.map import NONE
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.script import CAUTIOUS, LOGGED, OFF
 from shiftsim.world.state import PACIFICA, VX, VY, AgentKind, Tracks, center_poses
 
 _EGO_SIZE = np.array([PACIFICA.length, PACIFICA.width])
@@ -93,12 +85,13 @@ class IdmTraffic:
         fleet = make_fleet(scenario.map, placed, sizes[agents], speed, target)
         replayed = np.flatnonzero(is_replayed)
         graph = lane_graph(scenario.map)
-        courtesy = no_courtesy(scenario.map, len(agents))
+        policy, cautious, seed = OFF, np.zeros(len(agents), np.bool_), 0
         if script is not None:
+            policy, seed = script.yielding, script.seed
             cautious = script.behaviors[agents] == CAUTIOUS
-            steps = scenario.num_iterations
-            courtesy = make_courtesy(scenario.map, script.manner, cautious, script.seed, steps)
-        self._scene = make_scene(self._parameters, graph, fleet, agents, replayed, courtesy)
+        steps = scenario.num_iterations
+        yielding = make_yielding(scenario.map, policy, cautious, seed, steps)
+        self._scene = make_scene(self._parameters, graph, fleet, agents, replayed, yielding)
         self._map, self._stopped = scenario.map, np.zeros(0, np.int64)
         if script is not None and keeps_oddities:
             self._stopped = np.flatnonzero(script.stopped)
@@ -109,8 +102,7 @@ class IdmTraffic:
         # nuPlan rule 11: a difference of epoch seconds
         self._spans = np.diff(scenario.iteration_times * 1e-6).tolist()
         _remove(tracks, row, ~is_replayed)
-        write_agents(fleet, agents, rows_of(tracks, row))
-        self._hold(self._scene, tracks)
+        write_agents(fleet, agents, row_of(tracks, row))
 
     def step(self, iteration: int, ego: FloatArray, tracks: Tracks, row: int) -> None:
         """Move the agents; replayed tracks and lights are those of the next iteration.
@@ -124,16 +116,14 @@ class IdmTraffic:
         # nuPlan rule 130: the ego is one step old, lights and replayed tracks are one step ahead
         if len(self._light_edges):
             scene.graph.lights[self._light_edges] = self._lights[iteration + 1]
-        if scene.courtesy.manner != OFF:
+        if scene.yielding.policy != OFF:
             start = find_start(self._map, center_poses(ego[None, :3])[0])
-            scene.courtesy.ego_block[0] = NONE if start is None else self._map.block_of[start.edge]
+            scene.yielding.ego_block[0] = NONE if start is None else self._map.block_of[start.edge]
         if len(self._stopped):
             self._drop_far(ego, tracks, row)
-        if tracks is not self._tracks:
-            self._hold(scene, tracks)
-        end, what, first = -1, 0, BEGIN
+        end, what = -1, 0
         while end != DONE:
-            end, what = advance(self._scene, self._rows, row, ego, self._spans[iteration], first)
+            end, what = advance(scene, row_of(tracks, row), ego, self._spans[iteration])
             if end == LEFT_PATH:
                 raise TrafficError(
                     f"reactive agent {tracks.tokens[scene.agents[what]]} is outside of its own "
@@ -141,14 +131,7 @@ class IdmTraffic:
                     hint="nuPlan fails here as well; leave the scenario out, or use other traffic",
                 )
             if end == LONGER_PATHS:
-                self._hold(scene := with_longer_paths(scene, what), tracks)
-            elif end != DONE:
-                self._hold(scene := with_longer_curves(scene), tracks)
-                first = what
-
-    def _hold(self, scene: Scene, tracks: Tracks) -> None:
-        self._scene, self._tracks = scene, tracks
-        self._rows = rows_of(tracks)
+                self._scene = scene = with_longer_paths(scene, what)
 
     def _drop_far(self, ego: FloatArray, tracks: Tracks, row: int) -> None:
         """Remove stopped vehicles that are far from the ego, for good: nuPlan rule 712."""

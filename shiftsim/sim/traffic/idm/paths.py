@@ -9,7 +9,8 @@ unwrapped along the path and wrapped when a pose is read.
 import numpy as np
 
 from shiftsim.geometry.boxes import box_corners, wrap_angle
-from shiftsim.geometry.polylines import bound_runs, interpolate, runs_of, vertex_heading
+from shiftsim.geometry.polylines import interpolate, vertex_heading
+from shiftsim.geometry.rings import ring_bounds
 from shiftsim.kernels import FloatArray, kernel
 from shiftsim.sim.traffic.idm.buffer import buffer_curve
 from shiftsim.sim.traffic.idm.scene import (
@@ -20,10 +21,8 @@ from shiftsim.sim.traffic.idm.scene import (
     Footprints,
     IdmParameters,
     LaneGraph,
-    Scene,
 )
-from shiftsim.sim.traffic.idm.shapes import bound_ring
-from shiftsim.sim.traffic.lights import GREEN, RED
+from shiftsim.sim.traffic.lanes import GREEN, RED
 from shiftsim.world.lanes import initial_curvature
 from shiftsim.world.layers import Polylines
 
@@ -91,18 +90,11 @@ def first_after(path: FloatArray, size: int, progress: float) -> int:
 def pose_on_path(path: FloatArray, size: int, progress: float) -> tuple[float, float, float]:
     """Pose x [m], y [m], heading [rad] at a progress within the path; heading wrapped."""
     index = min(max(first_after(path, size, progress), 1), size - 1)
-    before, after = path[index - 1], path[index]
-    span, along = after[PROGRESS] - before[PROGRESS], progress - before[PROGRESS]
-    x = interpolate(before[0], after[0], span, along)
-    y = interpolate(before[1], after[1], span, along)
-    return x, y, wrap_angle(interpolate(before[HEADING], after[HEADING], span, along))
-
-
-@kernel
-def point_on_path(path: FloatArray, size: int, progress: float) -> tuple[float, float]:
-    """Point x, y [m] at a progress within the path, as in `pose_on_path`."""
-    index = min(max(first_after(path, size, progress), 1), size - 1)
-    return _point_before(path, index, progress)
+    start = path[index - 1, PROGRESS]
+    span, along = path[index, PROGRESS] - start, progress - start
+    heading = interpolate(path[index - 1, HEADING], path[index, HEADING], span, along)
+    x, y = _point_before(path, index, progress)
+    return x, y, wrap_angle(heading)
 
 
 @kernel
@@ -140,11 +132,8 @@ def extend_route(fleet: Fleet, agent: int, graph: LaneGraph, parameters: IdmPara
         0, or how many vertices a path needs where they do not fit; to be called again then.
     """
     path = fleet.path[agent]
-    while True:
+    while needs_longer_path(fleet, agent, parameters):
         size = fleet.path_size[agent]
-        wanted = parameters.min_path_length + fleet.target[agent] * parameters.headway
-        if not path[size - 1, PROGRESS] - fleet.progress[agent] < wanted:
-            return 0
         chosen = choose_successor(graph, fleet.route[agent, fleet.route_size[agent] - 1])
         if chosen < 0:
             return 0
@@ -156,8 +145,21 @@ def extend_route(fleet: Fleet, agent: int, graph: LaneGraph, parameters: IdmPara
         raw = append_baseline(graph.baselines, chosen, path, raw)
         fleet.path_size[agent] = finish_path(path, raw)
         fleet.progress[agent] = 0.0
-        _remember(fleet, agent, chosen)
-        fleet.first[agent] = -1
+        route, last = fleet.route[agent], fleet.route_size[agent]
+        if last == MAX_ROUTE:  # the oldest edge is dropped
+            route[:-1] = route[1:].copy()
+            last -= 1
+        route[last] = chosen
+        fleet.route_size[agent] = last + 1
+    return 0
+
+
+@kernel
+def needs_longer_path(fleet: Fleet, agent: int, parameters: IdmParameters) -> bool:
+    """Whether the path of an agent is too short for its speed."""
+    path_end = fleet.path[agent, fleet.path_size[agent] - 1, PROGRESS]
+    wanted = parameters.min_path_length + fleet.target[agent] * parameters.headway
+    return path_end - fleet.progress[agent] < wanted
 
 
 @kernel
@@ -183,18 +185,6 @@ def _drop_driven(path: FloatArray, size: int, progress: float) -> int:
 
 
 @kernel
-def _remember(fleet: Fleet, agent: int, edge: int) -> None:
-    """Append an edge to the route of an agent, and drop the oldest one where it is full."""
-    route, size = fleet.route[agent], fleet.route_size[agent]
-    if size == MAX_ROUTE:
-        for index in range(MAX_ROUTE - 1):
-            route[index] = route[index + 1]
-        size -= 1
-    route[size] = edge
-    fleet.route_size[agent] = size + 1
-
-
-@kernel
 def set_box(
     footprints: Footprints,
     index: int,
@@ -205,35 +195,27 @@ def set_box(
     width: float,
 ) -> None:
     """Put something where its box is, without a path ahead."""
-    box, bounds = footprints.box[index], footprints.bounds[index]
+    box, bounds = footprints.box[index], footprints.bounds
     box_corners(x, y, heading, length, width, box)
     footprints.present[index] = True
-    bounds[0], bounds[1], bounds[2], bounds[3] = x, y, x, y
-    bound_ring(box, bounds)
+    bounds[index, 0], bounds[index, 1], bounds[index, 2], bounds[index, 3] = ring_bounds(box)
 
 
 @kernel
-def look_ahead(fleet: Fleet, agent: int) -> None:
-    """Make the `line` of an agent begin where it is; agents do not drive backwards."""
-    path, size, line = fleet.path[agent], fleet.path_size[agent], fleet.line[agent]
-    if fleet.first[agent] < 0:
-        for vertex in range(size - 1):
-            line[vertex, 0], line[vertex, 1] = path[vertex, 0], path[vertex, 1]
-        end = point_on_path(path, size, path[size - 1, PROGRESS])
-        line[size - 1, 0], line[size - 1, 1] = end
-        bound_runs(line[:size], fleet.runs[agent, : runs_of(size)])
-    progress = clamp_progress(path, size, fleet.progress[agent])
-    after = first_after(path, size, progress)
-    fleet.first[agent] = min(after, size - 1) - 1
-    if after < size:
-        line[after - 1, 0], line[after - 1, 1] = _point_before(path, after, progress)
-        return
-    for vertex in range(size - 2, size):  # nuPlan rule 127: at its end two vertices are left
-        line[vertex, 0], line[vertex, 1] = path[vertex, 0], path[vertex, 1]
+def add_curve(footprints: Footprints, index: int, line: FloatArray, distance: float) -> None:
+    """Add the buffer of a line (K, 2) to the box of an agent or of the ego ahead."""
+    bounds, curve = footprints.bounds, footprints.curve[index]
+    size = buffer_curve(line, distance, curve)
+    footprints.curve_size[index] = size
+    low_x, low_y, high_x, high_y = ring_bounds(curve[:size])
+    bounds[index, 0] = min(bounds[index, 0], low_x)
+    bounds[index, 1] = min(bounds[index, 1], low_y)
+    bounds[index, 2] = max(bounds[index, 2], high_x)
+    bounds[index, 3] = max(bounds[index, 3], high_y)
 
 
 @kernel
-def _cut(path: FloatArray, size: int, start: float, stop: float, line: FloatArray) -> int:
+def cut_path(path: FloatArray, size: int, start: float, stop: float, line: FloatArray) -> int:
     """Write a path between two progresses, clamped to it, into `line` (K, 2); returns its size."""
     first, last = clamp_progress(path, size, start), clamp_progress(path, size, stop)
     after = first_after(path, size, first)
@@ -250,24 +232,22 @@ def _cut(path: FloatArray, size: int, start: float, stop: float, line: FloatArra
         line[count, 0], line[count, 1] = path[after, 0], path[after, 1]
         count += 1
         after += 1
-    line[count, 0], line[count, 1] = point_on_path(path, size, last)
+    after = min(max(first_after(path, size, last), 1), size - 1)
+    line[count, 0], line[count, 1] = _point_before(path, after, last)
     return count + 1
 
 
 @kernel
-def move_agent(scene: Scene, agent: int) -> int:
-    """Pose and footprint of an agent from its progress; returns -1 where a curve is too long."""
-    fleet, footprints, scratch = scene.fleet, scene.footprints, scene.scratch
+def move_agent(
+    fleet: Fleet, footprints: Footprints, line: FloatArray, headway: float, agent: int
+) -> None:
+    """Pose and footprint of an agent from its progress; `line` (K, 2) is scratch."""
     path, size = fleet.path[agent], fleet.path_size[agent]
     progress = fleet.progress[agent]
     x, y, heading = pose_on_path(path, size, clamp_progress(path, size, progress))
     fleet.pose[agent, 0], fleet.pose[agent, 1], fleet.pose[agent, 2] = x, y, heading
     length, width = fleet.size[agent, 0], fleet.size[agent, 1]
     set_box(footprints, agent, x, y, heading, length, width)
-    front = progress + 0.5 * length + fleet.speed[agent] * scene.parameters.headway
-    points = _cut(path, size, progress - 0.5 * length, front, scratch.line)
-    curve = footprints.curve[agent]
-    made = buffer_curve(scratch.line[:points], 0.5 * width, scratch.keep, curve)
-    footprints.curve_size[agent] = max(made, 0)
-    bound_ring(curve[: footprints.curve_size[agent]], footprints.bounds[agent])
-    return made
+    front = progress + 0.5 * length + fleet.speed[agent] * headway
+    points = cut_path(path, size, progress - 0.5 * length, front, line)
+    add_curve(footprints, agent, line[:points], 0.5 * width)

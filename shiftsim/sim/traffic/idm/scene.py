@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.geometry.polylines import runs_of
+from shiftsim.geometry.polylines import RUN
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.sim.traffic.idm.buffer import curve_capacity
 from shiftsim.world.layers import Lists, Polygons, Polylines
@@ -24,7 +24,6 @@ REPLAYED_KINDS = (
 )
 HEADING, PROGRESS = 2, 3  # columns of a path vertex, after x and y
 MAX_ROUTE = 5  # segments an agent remembers, nuPlan
-_CURVE_CAPACITY = 256  # vertices of a footprint to begin with
 _EXTRA_POINTS = 2  # a piece of a path has at most two more vertices than the path
 
 
@@ -65,16 +64,13 @@ class Fleet(NamedTuple):
     route_size: IntArray  # (A,) how many of them
     path: FloatArray  # (A, K, 4) vertices of the path: x [m], y [m], heading [rad], progress [m]
     path_size: IntArray  # (A,) how many of them
-    line: FloatArray  # (A, K, 2) the path ahead [m]: vertices from `first` on, the others are gone
-    runs: FloatArray  # (A, R, 4) bounds of the path's runs of segments, those driven included [m]
-    first: IntArray  # (A,) where in `line` the agent is; before the path is surveyed -1
 
 
 class Footprints(NamedTuple):
     """What can be in an agent's way: A agents, the ego, the ego ahead, replayed tracks; M in all.
 
     The footprint of an agent is its box and the buffer of the piece of its path just ahead. The ego
-    ahead is where it will be soon (`courtesy`), and seldom present.
+    ahead is where it will be soon (`yielding`), and seldom present.
     """
 
     present: BoolArray  # (M,) whether it is there
@@ -88,25 +84,21 @@ class Scratch(NamedTuple):
     """Room for intermediate results of one agent."""
 
     line: FloatArray  # (K, 2) a piece of a path [m]
-    keep: BoolArray  # (K,) flags of its vertices
-    runs: FloatArray  # (R, 4) bounds of a line's runs of segments [m]
-    outline: FloatArray  # (W, 2) outline of the buffer of a path [m]
-    near: IntArray  # (M,) footprints that may be in the corridor
-    apart: FloatArray  # (M,) lower bounds of the gaps to them [m]
+    runs: FloatArray  # (R, 4) bounds of its runs of segments, as in `Path` [m]
+    outline: FloatArray  # (V, 2) outline of its buffer [m]
+    outline_size: IntArray  # (1,) how many of its vertices count; -1 before it is made
 
 
-class Courtesy(NamedTuple):
+class Yielding(NamedTuple):
     """What agents make of where the ego will be; A agents."""
 
-    manner: int  # as in `world.script`; OFF for nuPlan's agents, which do not look ahead
+    policy: int  # as in `world.events`; OFF for nuPlan's agents, which do not look ahead
     cautious: BoolArray  # (A,) to whom the ego always stands
     edges: Polygons  # areas of the lanes and connectors
     block_of: IntArray  # (E,) block of an edge
-    draws: IntArray  # (D,) 0 or 1, for agents of mixed manners
-    drawn: IntArray  # (1,) how many were used
+    draws: IntArray  # (D,) 0 or 1, for the policy MIXED
+    num_drawn: IntArray  # (1,) how many were used
     ego_block: IntArray  # (1,) block of the ego's lane
-    line: FloatArray  # (5, 2) scratch for the ego's path [m]
-    keep: BoolArray  # (5,) flags of its vertices
 
 
 class Scene(NamedTuple):
@@ -118,12 +110,12 @@ class Scene(NamedTuple):
     agents: IntArray  # (A,) their tracks
     replayed: IntArray  # (R,) tracks that are replayed from the log
     footprints: Footprints  # of agents, ego and replayed tracks
-    courtesy: Courtesy  # how agents treat the ego
+    yielding: Yielding  # how agents treat the ego
     scratch: Scratch  # intermediate results
 
 
 class Row(NamedTuple):
-    """One row of tracks, as in `Tracks`: (N,), (N, 3), (N, 2), (N, 2); or T of them."""
+    """One row of tracks, as in `Tracks`: (N,), (N, 3), (N, 2), (N, 2)."""
 
     valid: BoolArray
     poses: FloatArray
@@ -131,10 +123,9 @@ class Row(NamedTuple):
     sizes: FloatArray
 
 
-def rows_of(tracks: Tracks, index: int | slice = slice(None)) -> Row:
-    """One row of tracks, or many, as kernels take them."""
-    parts = tracks.valid, tracks.poses, tracks.velocities, tracks.sizes
-    return Row._make(part[index] for part in parts)
+def row_of(tracks: Tracks, row: int) -> Row:
+    """One row of tracks, as kernels take it."""
+    return Row(tracks.valid[row], tracks.poses[row], tracks.velocities[row], tracks.sizes[row])
 
 
 def lane_graph(map: VectorMap) -> LaneGraph:
@@ -157,56 +148,39 @@ def make_scene(
     fleet: Fleet,
     agents: IntArray,
     replayed: IntArray,
-    courtesy: Courtesy,
+    yielding: Yielding,
 ) -> Scene:
     """The scene at iteration 0, with nothing in anyone's way yet (attributes as of `Scene`)."""
-    num_agents = len(agents)
-    count = num_agents + 2 + len(replayed)
+    count = len(agents) + 2 + len(replayed)
     footprints = Footprints(
         present=np.zeros(count, np.bool_),
         bounds=np.zeros((count, 4)),
         box=np.zeros((count, 4, 2)),
-        curve=np.zeros((num_agents + 2, _CURVE_CAPACITY, 2)),
-        curve_size=np.zeros(num_agents + 2, np.int64),
+        curve=_make_curves(fleet),
+        curve_size=np.zeros(len(agents) + 2, np.int64),
     )
-    scratch = _make_scratch(fleet.path.shape[1], count)
-    return Scene(parameters, graph, fleet, agents, replayed, footprints, courtesy, scratch)
+    scratch = _make_scratch(fleet)
+    return Scene(parameters, graph, fleet, agents, replayed, footprints, yielding, scratch)
 
 
-def _make_scratch(longest_path: int, count: int) -> Scratch:
-    points = longest_path + _EXTRA_POINTS
-    return Scratch(
-        line=np.zeros((points, 2)),
-        keep=np.zeros(points, np.bool_),
-        runs=np.zeros((runs_of(points), 4)),
-        outline=np.zeros((curve_capacity(points), 2)),
-        near=np.zeros(count, np.int64),
-        apart=np.zeros(count),
-    )
+def _make_curves(fleet: Fleet) -> FloatArray:
+    # room for any curve: pages of zeros that nobody writes take no memory
+    num_agents, longest, _ = fleet.path.shape
+    return np.zeros((num_agents + 2, curve_capacity(longest + _EXTRA_POINTS), 2))
+
+
+def _make_scratch(fleet: Fleet) -> Scratch:
+    points = fleet.path.shape[1] + _EXTRA_POINTS
+    runs, outline = np.zeros(((points - 2) // RUN + 1, 4)), np.zeros((curve_capacity(points), 2))
+    return Scratch(np.zeros((points, 2)), runs, outline, np.zeros(1, np.int64))
 
 
 def with_longer_paths(scene: Scene, needed: int) -> Scene:
     """The same scene, for paths of `needed` vertices and more."""
-    fleet, count = scene.fleet, 2 * needed
-    path, line, runs = make_paths(len(scene.agents), count)
-    for longer, before in ((path, fleet.path), (line, fleet.line), (runs, fleet.runs)):
-        longer[:, : before.shape[1]] = before
-    scratch = _make_scratch(count, len(scene.footprints.present))
-    return scene._replace(fleet=fleet._replace(path=path, line=line, runs=runs), scratch=scratch)
-
-
-def make_paths(num_agents: int, longest: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Empty paths of at most `longest` vertices, and their `line` and `runs`, as in `Fleet`."""
-    return (
-        np.zeros((num_agents, longest, 4)),
-        np.zeros((num_agents, longest, 2)),
-        np.zeros((num_agents, runs_of(longest), 4)),
-    )
-
-
-def with_longer_curves(scene: Scene) -> Scene:
-    """The same scene, for footprints of twice as many vertices."""
-    before = scene.footprints.curve
-    curve = np.zeros((len(before), 2 * before.shape[1], 2))
-    curve[:, : before.shape[1]] = before
-    return scene._replace(footprints=scene.footprints._replace(curve=curve))
+    path = np.zeros((len(scene.agents), 2 * needed, 4))
+    path[:, : scene.fleet.path.shape[1]] = scene.fleet.path
+    fleet, curve = scene.fleet._replace(path=path), _make_curves(scene.fleet._replace(path=path))
+    longest = int(scene.footprints.curve_size.max())
+    curve[:, :longest] = scene.footprints.curve[:, :longest]
+    footprints = scene.footprints._replace(curve=curve)
+    return scene._replace(fleet=fleet, footprints=footprints, scratch=_make_scratch(fleet))

@@ -5,119 +5,115 @@ import numpy as np
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.sim.dynamics.idm import idm_step
-from shiftsim.sim.traffic.idm.courtesy import place_ego_ahead
-from shiftsim.sim.traffic.idm.lead import OFF_PATH, find_lead
-from shiftsim.sim.traffic.idm.paths import extend_route, move_agent, set_box
+from shiftsim.sim.traffic.idm.lead import (
+    FREE,
+    corridor_ahead,
+    find_lead,
+    in_corridor,
+    stop_line_gap,
+)
+from shiftsim.sim.traffic.idm.paths import (
+    extend_route,
+    move_agent,
+    needs_longer_path,
+    set_box,
+)
 from shiftsim.sim.traffic.idm.scene import PROGRESS, Fleet, Row, Scene
+from shiftsim.sim.traffic.idm.yielding import ignores_ego_ahead, place_ego_ahead
+from shiftsim.sim.traffic.lanes import RED
 from shiftsim.world.state import HEADING as EGO_HEADING
 from shiftsim.world.state import PACIFICA, VX, VY, YAW_RATE
 
-DONE, LONGER_PATHS, LONGER_CURVES, LEFT_PATH = 0, 1, 2, 3  # how a step ends
-BEGIN = -1  # instead of the agent that an interrupted step goes on with
+DONE, LONGER_PATHS, LEFT_PATH = 0, 1, 2  # how a step ends
 _EGO_LENGTH, _EGO_WIDTH, _EGO_CENTER = PACIFICA.length, PACIFICA.width, PACIFICA.rear_axle_to_center
 
 
 @kernel
-def advance(
-    scene: Scene, tracks: Row, at: int, ego: FloatArray, span: float, first: int
-) -> tuple[int, int]:
+def advance(scene: Scene, row: Row, ego: FloatArray, span: float) -> tuple[int, int]:
     """Move every agent by one step, `span` [s] long, and write where it is.
 
-    The scene has the lights of the end of the step, and row `at` of the tracks is of the end of the
-    step; `ego` (11,) is of its beginning. `first` is BEGIN, or the agent that an interrupted step
-    goes on with.
+    The scene has the lights of the end of the step, and the row of tracks is that of the end of the
+    step; `ego` (11,) is of its beginning.
 
     Returns:
-        DONE; LONGER_PATHS and how many vertices a path needs, to begin again; LONGER_CURVES and the
-        agent whose footprint needs more, to go on with; LEFT_PATH and the agent that is outside of
-        its own corridor.
+        DONE; LONGER_PATHS and how many vertices a path needs, to begin again; LEFT_PATH and the
+        agent that is outside of its own corridor.
     """
-    row = Row(tracks.valid[at], tracks.poses[at], tracks.velocities[at], tracks.sizes[at])
-    fleet, agents = scene.fleet, scene.agents
+    fleet, footprints, num_agents = scene.fleet, scene.footprints, len(scene.agents)
+    parameters, graph, scratch = scene.parameters, scene.graph, scene.scratch
     heading = ego[EGO_HEADING]
     x = ego[0] + _EGO_CENTER * np.cos(heading)
     y = ego[1] + _EGO_CENTER * np.sin(heading)
-    set_box(scene.footprints, len(agents), x, y, heading, _EGO_LENGTH, _EGO_WIDTH)
+    set_box(footprints, num_agents, x, y, heading, _EGO_LENGTH, _EGO_WIDTH)
     lateral = ego[VY] + _EGO_CENTER * ego[YAW_RATE]
     place_ego_ahead(scene, x, y, heading, ego[VX], lateral)
-    _place_replayed(scene, row)
-    if first == BEGIN:
-        _remove_far_agents(scene, x, y)
-        for agent in range(len(agents)):
-            if fleet.alive[agent]:
-                needed = extend_route(fleet, agent, scene.graph, scene.parameters)
-                if needed > 0:
-                    return LONGER_PATHS, needed
-    for agent in range(max(first, 0), len(agents)):
-        if not fleet.alive[agent]:
-            continue
-        if agent != first:
-            # nuPlan rule 123: agents move one after the other, and see where those before them went
-            lead, gap = find_lead(scene, agent)
-            if lead == OFF_PATH:
-                return LEFT_PATH, agent
-            _drive(scene, agent, lead, gap, ego, span)
-        if move_agent(scene, agent) < 0:
-            return LONGER_CURVES, agent
-    write_agents(fleet, agents, row)
-    return DONE, 0
-
-
-@kernel
-def _place_replayed(scene: Scene, row: Row) -> None:
-    """Put the replayed tracks that are present where they are."""
-    footprints = scene.footprints
-    place = len(scene.agents) + 1
-    for track in scene.replayed:
-        place += 1
+    poses, sizes = row.poses, row.sizes
+    for index, track in enumerate(scene.replayed):
+        place = num_agents + 2 + index
         footprints.present[place] = row.valid[track]
         if row.valid[track]:
-            x, y, heading = row.poses[track, 0], row.poses[track, 1], row.poses[track, 2]
-            set_box(footprints, place, x, y, heading, row.sizes[track, 0], row.sizes[track, 1])
-
-
-@kernel
-def _remove_far_agents(scene: Scene, x: float, y: float) -> None:
-    """Remove agents that are far from the ego's centre, for good."""
-    fleet = scene.fleet
-    for agent in range(len(scene.agents)):
+            pose_x, pose_y, turn = poses[track, 0], poses[track, 1], poses[track, 2]
+            set_box(footprints, place, pose_x, pose_y, turn, sizes[track, 0], sizes[track, 1])
+    for agent in range(num_agents):
         dx, dy = fleet.pose[agent, 0] - x, fleet.pose[agent, 1] - y
-        if fleet.alive[agent] and np.sqrt(dx * dx + dy * dy) > scene.parameters.radius:
-            fleet.alive[agent] = False
-            scene.footprints.present[agent] = False
-
-
-@kernel
-def _drive(scene: Scene, agent: int, lead: int, gap: float, ego: FloatArray, span: float) -> None:
-    """Progress and speed of an agent after the step, behind the lead that `find_lead` gave."""
-    fleet, parameters = scene.fleet, scene.parameters
-    heading = fleet.pose[agent, 2]
-    lead_speed, lead_heading = 0.0, heading
-    if lead < 0:
-        # nuPlan rule 124: on a free road the agent brakes for the end of its path
-        path_end = fleet.path[agent, fleet.path_size[agent] - 1, PROGRESS]
-        gap = path_end - fleet.progress[agent] - 0.5 * fleet.size[agent, 0]
-    elif lead < len(scene.agents):
-        lead_speed, lead_heading = fleet.speed[lead], fleet.pose[lead, 2]
-    elif lead <= len(scene.agents) + 1 and not scene.courtesy.cautious[agent]:
-        lead_speed, lead_heading = np.hypot(ego[VX], ego[VY]), ego[EGO_HEADING]
-    # nuPlan rule 125: replayed tracks stand still, whatever their velocity
-    limit = scene.graph.speed_limits[fleet.route[agent, fleet.route_size[agent] - 1]]
-    if limit > 0.0:
-        fleet.target[agent] = limit
-    distance, speed = idm_step(
-        fleet.speed[agent],
-        gap,
-        lead_speed * np.cos(wrap_angle(lead_heading - heading)),
-        fleet.target[agent],
-        parameters.min_gap,
-        parameters.headway,
-        parameters.accel_max,
-        parameters.decel_max,
-        span,
-    )
-    fleet.progress[agent] += distance
-    fleet.speed[agent] = max(speed, 0.0)
+        if fleet.alive[agent] and np.sqrt(dx * dx + dy * dy) > parameters.radius:
+            fleet.alive[agent] = footprints.present[agent] = False  # for good
+        if fleet.alive[agent] and needs_longer_path(fleet, agent, parameters):
+            needed = extend_route(fleet, agent, graph, parameters)
+            if needed > 0:
+                return LONGER_PATHS, needed
+    for agent in range(num_agents):
+        if not fleet.alive[agent]:
+            continue
+        # nuPlan rule 123: agents move one after the other, and see where those before them went
+        path, size, progress = fleet.path[agent], fleet.path_size[agent], fleet.progress[agent]
+        path_end, half_width = path[size - 1, PROGRESS], 0.5 * fleet.size[agent, 1]
+        corridor = corridor_ahead(path, size, progress, half_width, scratch)
+        if not progress < path_end and not in_corridor(footprints, agent, corridor, scratch):
+            return LEFT_PATH, agent  # nuPlan rule 128
+        ignored, ahead = FREE, num_agents + 1
+        if (
+            footprints.present[ahead]
+            and in_corridor(footprints, ahead, corridor, scratch)
+            and ignores_ego_ahead(scene, agent)
+        ):
+            ignored = ahead
+        lead, gap = find_lead(footprints, agent, ignored, corridor, scratch)
+        for segment in range(fleet.route_size[agent]):
+            edge = fleet.route[agent, segment]
+            if graph.lights[edge] & RED:
+                stop_gap = stop_line_gap(scene, agent, edge, corridor, gap)
+                if stop_gap < gap:
+                    lead, gap = len(footprints.present), stop_gap
+        heading = fleet.pose[agent, 2]
+        lead_speed, lead_heading = 0.0, heading
+        if lead == FREE:
+            # nuPlan rule 124: on a free road the agent brakes for the end of its path
+            gap = path_end - progress - 0.5 * fleet.size[agent, 0]
+        elif lead < num_agents:
+            lead_speed, lead_heading = fleet.speed[lead], fleet.pose[lead, 2]
+        elif lead <= num_agents + 1 and not scene.yielding.cautious[agent]:
+            lead_speed, lead_heading = np.hypot(ego[VX], ego[VY]), ego[EGO_HEADING]
+        # nuPlan rule 125: replayed tracks stand still, whatever their velocity
+        limit = graph.speed_limits[fleet.route[agent, fleet.route_size[agent] - 1]]
+        if limit > 0.0:
+            fleet.target[agent] = limit
+        distance, speed = idm_step(
+            fleet.speed[agent],
+            gap,
+            lead_speed * np.cos(wrap_angle(lead_heading - heading)),
+            fleet.target[agent],
+            parameters.min_gap,
+            parameters.headway,
+            parameters.accel_max,
+            parameters.decel_max,
+            span,
+        )
+        fleet.progress[agent] += distance
+        fleet.speed[agent] = max(speed, 0.0)
+        move_agent(fleet, footprints, scratch.line, parameters.headway, agent)
+    write_agents(fleet, scene.agents, row)
+    return DONE, 0
 
 
 @kernel

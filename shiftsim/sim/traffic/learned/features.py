@@ -11,7 +11,7 @@ import numpy as np
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.geometry.polylines import point_on_polyline, project_on_polyline
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.sim.traffic.following import CANDIDATES, NO_LANE, Lanes, choose_lane, next_lane
+from shiftsim.sim.traffic.lanes import CANDIDATES, NO_LANE, Lanes, choose_lane, next_lane
 from shiftsim.world.state import AgentKind
 
 AHEAD = np.array([3.0, 6.0, 10.0, 15.0, 22.0, 30.0, 40.0, 52.0])  # m along the path

@@ -1,0 +1,98 @@
+"""What of a benchmark's data is there: stores, splits, maps and checkpoints; and what is missing.
+
+Everything is a plain value, for `shiftsim data --json`; nothing is converted, downloaded or made.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from shiftsim.benchmarks import TRACKS, known_sets, load_track
+from shiftsim.data.store.reading import ScenarioStore, open_store
+from shiftsim.errors import ShiftsimError
+from shiftsim.files import checkpoint_folder, store_path
+from shiftsim.planners.registry import PLANNERS, readiness
+from shiftsim.report.groups import token_digest
+from shiftsim.runs.scenarios import find_split
+
+_PAGE = "docs/data.md"
+OWN = "own scenarios"  # what a track drives besides its published list
+_REMEDIES = {  # of what a track drives: how to make it
+    "val14": "shiftsim convert nuplan LOGS MAPS --store val14 --filter val14_split.yaml",
+    OWN: "shiftsim convert dsc3d DOWNLOAD --store deepplan",
+}
+
+
+Row: TypeAlias = dict[str, Any]
+
+
+def list_available_data() -> Row:
+    """Look through the folders of stores and of checkpoints.
+
+    Returns:
+        `store_folder` and `stores`: each with `name`, `path`, `maps` (cities), `problem` (why it
+        cannot be opened) and `sets` (the whole store first, then splits: `name`, `scenarios`, and
+        the `known` list that it is); `checkpoint_folder` and `checkpoints`: what a planner lacks,
+        or empty; `rows`: a `planner` of a `track`, the set that is its published list (`reference`,
+        "–" where it has none), sets of `own` scenarios, and what is `missing`: `what`, the command
+        to `get` it, and the `page` of the documentation.
+    """
+    folder = store_path("demo").parent
+    stores = [_store(path.parent) for path in sorted(folder.glob("*/store.json"))]
+    learned = {name: entry for name, entry in PLANNERS.items() if entry.checkpoint}
+    return {
+        "store_folder": str(folder),
+        "stores": stores,
+        "checkpoint_folder": str(checkpoint_folder()),
+        "checkpoints": {name: readiness(entry) for name, entry in learned.items()},
+        "rows": [row for track in TRACKS for row in _rows(track, stores)],
+    }
+
+
+def _store(path: Path) -> Row:
+    found: Row = {"name": path.name, "path": str(path), "maps": [], "sets": [], "problem": ""}
+    try:
+        store = open_store(path)
+        found["maps"], found["sets"] = list(store.cities), list(_sets(store))
+    except ShiftsimError as error:
+        found["problem"] = error.message
+    return found
+
+
+def _sets(store: ScenarioStore) -> Iterator[Row]:
+    """The whole store, and its splits as far as it has all of their scenarios."""
+    digests = {known.sha256: known.name for known in known_sets()}
+    names = ["", *(file.stem for file in sorted(store.path.glob("splits/*.toml")))]
+    for name in names:
+        tokens = find_split(name, store.path, store.tokens).tokens
+        if all(token in store for token in tokens):
+            known = digests.get(token_digest(tokens), "")
+            full = f"{store.path.name}:{name}" if name else store.path.name
+            yield {"name": full, "scenarios": len(tokens), "known": known}
+
+
+def _rows(track: str, stores: list[Row]) -> Iterator[Row]:
+    wanted = load_track(track)
+    sets = [one for store in stores for one in store["sets"]]
+    listed = wanted.reference
+    reference = [one["name"] for one in sets if listed and one["known"] == listed.name]
+    own = [one["name"] for one in sets if not one["known"]]
+    for planner in wanted.planners:
+        missing = []
+        if listed and not reference:
+            label = f"{listed.label} ({listed.count} scenarios)"
+            missing.append(dict(what=label, get=_REMEDIES[listed.name], page=_PAGE))
+        if not own:
+            missing.append(dict(what=OWN, get=_REMEDIES[OWN], page=_PAGE))
+        entry, page = PLANNERS[planner], "docs/learned_planners.md"
+        if (lack := readiness(entry)) and (file := entry.checkpoint):
+            get = f"{lack}; it is {file.file} of the project {file.project}"
+            missing.append(dict(what=f"planner {planner}", get=get, page=page))
+        first = reference[0] if reference else "" if listed else "–"
+        yield {
+            "track": track,
+            "planner": planner,
+            "reference": first,
+            "own": own,
+            "missing": missing,
+        }

@@ -1,0 +1,193 @@
+"""From lanes of lane sections to lanes, roadblocks and connectors of the map: which are which.
+
+A group holds the drivable lanes of one direction of one lane section; roads of junctions are
+connectors.
+"""
+
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import TypeAlias
+
+import numpy as np
+import shapely
+
+from shiftsim.data.maps import topology
+from shiftsim.data.maps.opendrive import records
+from shiftsim.data.maps.opendrive.curves import ReferenceLine
+from shiftsim.data.maps.opendrive.lanes import LaneKey, lane_links, runs_forward, section_borders
+from shiftsim.data.maps.opendrive.records import DRIVABLE, OpenDrive
+from shiftsim.data.maps.topology import MAX_GAP, Topology
+from shiftsim.kernels import FloatArray
+
+MIN_LENGTH = 0.1  # m, shorter lanes are linked through
+MIN_WIDTH = 0.5  # m, lanes never wider are linked through
+INFER_GAP, SNAP_GAP = 0.1, 0.05  # m
+_MAX_CHAIN = 63  # lanes along one connector
+_Group: TypeAlias = tuple[str, int, bool]  # road, section, whether it runs along the road
+_CARS = frozenset(("all", "car", "autonomousTraffic", "motorVehicle"))
+
+
+@dataclass(frozen=True)
+class LaneSegment:
+    """Part of a lane: travel enters at `begin` and leaves at `end`, distances on its road [m]."""
+
+    key: LaneKey
+    begin: float
+    end: float
+
+    @property
+    def length(self) -> float:
+        """Length along the reference line [m]."""
+        return abs(self.end - self.begin)
+
+    def split(self, at: float) -> tuple["LaneSegment", "LaneSegment"]:
+        """The parts before and after a distance from where travel enters [m]."""
+        place = float(self.begin + np.sign(self.end - self.begin) * at)
+        return replace(self, end=place), replace(self, begin=place)
+
+
+Lane: TypeAlias = topology.Lane[LaneSegment]
+Connector: TypeAlias = topology.Connector[LaneSegment]
+Graph: TypeAlias = topology.LaneGraph[LaneSegment]
+
+
+def is_drivable(lane: records.Lane) -> bool:
+    """Whether cars may drive on a lane."""
+    if lane.type not in DRIVABLE:
+        return False
+    denied = {what for rule, what in lane.access if rule == "deny"}
+    allowed = {what for rule, what in lane.access if rule == "allow"}
+    return not (denied & _CARS) and (not allowed or bool(allowed & _CARS))
+
+
+def road_order(road: str) -> tuple[int, int, str]:
+    """Sorting key of a road id: numbers by value, then other names."""
+    return (0, int(road), "") if road.isdecimal() else (1, 0, road)
+
+
+def build_lane_graph(od: OpenDrive, warnings: Counter[str]) -> Graph:
+    """Lanes, roadblocks and connectors of a file; counts what was inferred or dropped."""
+    return _Builder(od, warnings).build()
+
+
+class _Builder:
+    def __init__(self, od: OpenDrive, warnings: Counter[str]) -> None:
+        self.od = od
+        self.warnings = warnings
+        self.topology: Topology[LaneKey, LaneSegment] = Topology(self._is_lane, warnings)
+        self.nodes = self.topology.segments
+        self.after, self.before = self.topology.after, self.topology.before
+        # first and last cross-section of a lane, from its left to its right border
+        self.ends: dict[LaneKey, tuple[FloatArray, FloatArray]] = {}
+
+    def build(self) -> Graph:
+        narrow = self._collect_nodes()
+        for source, target in lane_links(self.od, self.warnings):
+            if source in self.nodes and target in self.nodes:
+                self.topology.join(source, target)
+        self._infer_links()
+        for key in sorted(narrow):
+            self._link_through(key)
+        self._drop_wide_gaps()
+        for links in self.after.values():
+            links.sort()
+        self.topology.build_lanes(self._groups())
+        self.topology.cut_connectors()
+        what = "connector without both ends, dropped"
+        self.topology.build_connectors(_MAX_CHAIN, self._junctions, what)
+        return self.topology.graph
+
+    def _is_lane(self, key: LaneKey) -> bool:
+        return self.od.roads[key.road].junction is None
+
+    def _junctions(self, keys: Sequence[LaneKey]) -> frozenset[str]:
+        found = (self.od.roads[key.road].junction for key in keys)
+        return frozenset(junction for junction in found if junction is not None)
+
+    def _collect_nodes(self) -> list[LaneKey]:
+        """Fill nodes and their ends; returns the lanes that are too short or too narrow to keep."""
+        unfit = []
+        for road in self.od.roads.values():
+            line = ReferenceLine(road.geometries)
+            for index, section in enumerate(road.sections):
+                begin, end = section.s, road.section_end(index)
+                s = np.linspace(begin, end, 9)
+                borders = section_borders(road, index, s, repair=True)
+                poses = line.evaluate(s[[0, -1]])
+                for number, lane in section.lanes.items():
+                    if not is_drivable(lane):
+                        continue
+                    key = LaneKey(road.id, index, number)
+                    inner, outer = borders.inner[number], borders.outer[number]
+                    left, right = poses.offset(inner[[0, -1]]), poses.offset(outer[[0, -1]])
+                    ends = [np.stack([left[i], right[i]]) for i in (0, 1)]
+                    forward = runs_forward(road, index, number)
+                    travel = (begin, end) if forward else (end, begin)
+                    self.nodes[key] = LaneSegment(key, *travel)
+                    self.ends[key] = (ends[0], ends[1]) if forward else (ends[1], ends[0])
+                    widest = float(np.abs(outer - inner).max())
+                    if end - begin < MIN_LENGTH or widest < MIN_WIDTH:
+                        unfit.append(key)
+                    if widest > 15.0:
+                        self.warnings["driving lane wider than 15 m"] += 1
+        return unfit
+
+    def _infer_links(self) -> None:
+        """Links between sections of a road that the file forgot: same number, same place."""
+        inferred = 0
+        for key in self.nodes:
+            onward = LaneKey(key.road, key.section + 1, key.lane)
+            if onward not in self.nodes:
+                continue
+            is_forward = self._is_forward(key)
+            source, target = (key, onward) if is_forward else (onward, key)
+            linked = self.after[source] or self.before[target]
+            if linked or self._is_forward(onward) != is_forward:
+                continue
+            if np.abs(self.ends[source][1] - self.ends[target][0]).max() < INFER_GAP:
+                self.topology.join(source, target)
+                inferred += 1
+        if inferred:
+            self.warnings["lane link missing between sections, inferred"] += inferred
+
+    def _is_forward(self, key: LaneKey) -> bool:
+        return runs_forward(self.od.roads[key.road], key.section, key.lane)
+
+    def _link_through(self, key: LaneKey) -> None:
+        """Take a lane out and join what lies before it to what follows (nuPlan rule 514)."""
+        sources, targets = sorted(self.before[key]), sorted(self.after[key])
+        for source in sources:
+            self.topology.separate(source, key)
+        for target in targets:
+            self.topology.separate(key, target)
+        for source, target in product(sources, targets):
+            if source != target:
+                self.topology.join(source, target)
+        self.topology.graph.dropped.append(self.nodes.pop(key))
+        what = "drivable lane shorter than 0.1 m or narrower than 0.5 m, linked through"
+        self.warnings[what] += 1
+
+    def _drop_wide_gaps(self) -> None:
+        pairs = [(a, b) for a in sorted(self.nodes) for b in sorted(self.after[a])]
+        if not pairs:
+            return
+        ends = shapely.linestrings(np.stack([self.ends[a][1] for a, _ in pairs]))
+        starts = shapely.linestrings(np.stack([self.ends[b][0] for _, b in pairs]))
+        for (a, b), gap in zip(pairs, shapely.distance(ends, starts), strict=True):
+            if gap > MAX_GAP:
+                self.topology.separate(a, b)
+                self.warnings[f"lane link over a gap of more than {MAX_GAP:g} m, dropped"] += 1
+            elif gap > SNAP_GAP:
+                self.warnings[f"lane link over a gap of more than {SNAP_GAP:g} m"] += 1
+
+    def _groups(self) -> list[list[LaneKey]]:
+        """Lanes of one direction of one section, leftmost first, in the order of their roads."""
+        groups: dict[_Group, list[LaneKey]] = defaultdict(list)
+        for key in filter(self._is_lane, self.nodes):
+            groups[key.road, key.section, self._is_forward(key)].append(key)
+        order = sorted(groups, key=lambda group: (road_order(group[0]), *group[1:]))
+        for (_, _, forward), keys in groups.items():  # seen in the direction of travel
+            keys.sort(key=lambda key: -key.lane if forward else key.lane)
+        return [groups[group] for group in order]

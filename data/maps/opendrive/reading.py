@@ -1,0 +1,316 @@
+"""OpenDRIVE XML to records.
+
+Nothing is evaluated here. Real files are seldom quite right: what can be repaired is repaired and
+counted in `OpenDrive.warnings`, one count per kind; what cannot raises one error that names file,
+road and element.
+"""
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lxml import etree
+
+from shiftsim.data.maps.opendrive import records
+from shiftsim.data.maps.opendrive.elements import CUBIC, Reader, read_object, read_signal
+from shiftsim.data.maps.opendrive.records import OpenDrive, Road
+from shiftsim.data.xml_elements import xml_elements
+from shiftsim.errors import ConversionError
+from shiftsim.world.ranges import OPENDRIVE
+
+MAX_BYTES = 200_000_000
+TINY_LENGTH = 1e-9  # m, shorter geometry records are skipped
+_PARAM_CUBIC = ("aU", "bU", "cU", "dU", "aV", "bV", "cV", "dV")
+_TOP_LEVEL = ("header", "road", "junction")
+
+
+def read_opendrive(path: Path) -> OpenDrive:
+    """Read an OpenDRIVE file (1.0 to 1.8).
+
+    Entities, document types and external references are refused: the file is data, not a program.
+
+    Raises:
+        ConversionError: The file is missing, too large, not OpenDRIVE, or broken beyond repair.
+    """
+    try:
+        size = path.stat().st_size
+        data = path.read_bytes() if size <= MAX_BYTES else b""
+    except OSError as error:
+        what = f"{path.name}: cannot be read: {error.strerror}"
+        raise ConversionError(what, "give the path of an .xodr file") from error
+    if size > MAX_BYTES:
+        what = f"{path.name}: {size} bytes, more than {MAX_BYTES}"
+        raise ConversionError(what, "cut the map into smaller files")
+    return parse_opendrive(data, path.name)
+
+
+def parse_opendrive(data: bytes, source: str) -> OpenDrive:
+    """Like `read_opendrive`, from the bytes of a file."""
+    reader = Reader(source)
+    header: tuple[Any, str | None, Any] = (("", ""), None, None)  # revision, geoReference, offset
+    roads: dict[str, Road] = {}
+    seen: set[tuple[str, str]] = set()
+    junctions: dict[str, records.Junction] = {}
+
+    def fault(what: str, remedy: str) -> ConversionError:
+        return ConversionError(f"{source}: {what}", remedy or "give an .xodr file, exported again")
+
+    for element in xml_elements(_strip_junk(data, reader), "OpenDRIVE", fault, _TOP_LEVEL):
+        if element.tag.startswith("{"):
+            _drop_namespaces(element)
+        name = element.get("id", "")
+        if element.tag == "header":
+            reader.place = "header"
+            header = _read_header(element, reader)
+            continue
+        reader.place = f"{element.tag} {name!r}"
+        if (element.tag, name) in seen:
+            raise reader.error("its id occurs twice", f"give every {element.tag} its own id")
+        seen.add((element.tag, name))
+        if element.tag == "road":
+            road = _read_road(element, name, reader)
+            if road is not None:
+                roads[name] = road
+        else:
+            junctions[name] = _read_junction(element, name, reader)
+    return OpenDrive(source, *header, roads, junctions, dict(reader.counts), dict(reader.warnings))
+
+
+def _strip_junk(data: bytes, reader: Reader) -> bytes:
+    start = data.find(b"<?xml")
+    if start > 0 and b"<OpenDRIVE" not in data[:start]:
+        if data[:start].strip(b"\xef\xbb\xbf \t\r\n"):
+            reader.warn("bytes before the XML declaration")
+        return data[start:]
+    return data.lstrip(b" \t\r\n")
+
+
+def _drop_namespaces(element: Any) -> None:
+    for child in element.iter(etree.Element):
+        child.tag = etree.QName(child).localname
+
+
+def _read_header(element: Any, reader: Reader) -> tuple[Any, str | None, Any]:
+    geo = element.findtext("geoReference")
+    shift = element.find("offset")
+    offset = None
+    if shift is not None:
+        offset = tuple(reader.finite(shift, key) for key in ("x", "y", "z", "hdg"))
+    revision = (element.get("revMajor", ""), element.get("revMinor", ""))
+    return revision, (geo.strip() or None) if geo else None, offset
+
+
+def _read_road(element: Any, name: str, reader: Reader) -> Road | None:
+    """One road, or None where it has no usable reference line."""
+    junction = element.get("junction", "-1")
+    lanes = element.find("lanes")
+    offsets = [] if lanes is None else lanes.findall("laneOffset")
+    reader.counts["road"] += 1
+    reader.counts["laneOffset"] += len(offsets)
+    reader.counts["road in a junction"] += junction != "-1"
+    reader.counts["road with left-hand traffic"] += element.get("rule") == "LHT"
+    geometries = _read_plan_view(element.find("planView"), reader)
+    stated = reader.number(element, "length", np.nan)
+    found = () if lanes is None else lanes.iter("laneSection")
+    sections = [_read_section(e, reader) for e in found]
+    if geometries is None:
+        return None
+    end = geometries[-1].s + geometries[-1].length
+    if not np.isfinite(stated):
+        reader.warn("road without a length")
+        stated = end
+    elif abs(stated - end) > 0.01:
+        reader.warn("road length is not the end of its geometry")
+    if 0.0 < geometries[0].s >= min(stated, end):
+        reader.warn("road left out: its geometry begins where it ends")
+        return None
+    if any(a.s > b.s for a, b in pairwise(sections)):
+        reader.warn("records out of order")
+    link = element.find("link")
+    objects, signals = element.find("objects"), element.find("signals")
+    placed = [] if signals is None else signals.iter("signal", "signalReference")
+    return Road(
+        id=name,
+        length=min(stated, end),
+        stated_length=stated,
+        junction=None if junction == "-1" else junction,
+        left_hand=element.get("rule") == "LHT",
+        geometries=geometries,
+        offsets=reader.cubics(offsets, "s"),
+        elevation=reader.cubics(element.findall("elevationProfile/elevation"), "s"),
+        sections=tuple(sorted(sections, key=lambda section: section.s)),
+        predecessor=_read_link(link, "predecessor"),
+        successor=_read_link(link, "successor"),
+        types=_read_types(element.findall("type"), reader),
+        objects=tuple(
+            read_object(e, reader) for e in (() if objects is None else objects.findall("object"))
+        ),
+        signals=tuple(read_signal(e, reader) for e in placed if e.get("s") is not None),
+    )
+
+
+def _read_plan_view(element: Any, reader: Reader) -> tuple[records.Geometry, ...] | None:
+    geometries: list[records.Geometry] = []
+    tiny: list[records.Geometry] = []
+    for child in () if element is None else element.findall("geometry"):
+        shape: Any = next((e for e in child if e.tag in records.SHAPES), None)
+        kind = records.LINE if shape is None else shape.tag
+        reader.counts[f"geometry {kind}"] += 1
+        length, s = (reader.number(child, k, may_be_any=True) for k in ("length", "s"))
+        x, y, heading = (
+            reader.number(child, k, np.nan, may_be_any=True) for k in ("x", "y", "hdg")
+        )
+        if shape is None:
+            reader.warn("geometry without a shape taken as a line")
+        if kind == records.PARAM_POLY3 and not any(k in shape.keys() for k in _PARAM_CUBIC):
+            reader.warn("road left out: paramPoly3 without coefficients")
+            return None
+        coefficients, p_end = _read_shape(shape, length, reader)
+        if not np.isfinite([s, x, y, heading, length, *coefficients]).all():
+            reader.warn("road left out: geometry is not finite")
+            return None
+        place = {"s": s, "x": x, "y": y, "hdg": heading, "length": length}
+        if not all(OPENDRIVE[f"geometry {key}"].holds(value) for key, value in place.items()):
+            reader.warn("road left out: geometry is out of this world")
+            return None
+        if length < TINY_LENGTH:
+            reader.warn("geometry without length, skipped")
+            tiny.append(records.Geometry(s, x, y, heading, max(length, 0.0), records.LINE))
+        else:
+            geometries.append(records.Geometry(s, x, y, heading, length, kind, coefficients, p_end))
+    geometries = geometries or tiny[:1]  # a road without length still links its neighbours
+    if not geometries:
+        reader.warn("road left out: no geometry")
+        return None
+    if any(a.s > b.s for a, b in pairwise(geometries)):
+        reader.warn("records out of order")
+    return tuple(sorted(geometries, key=lambda record: record.s))
+
+
+def _read_shape(shape: Any, length: float, reader: Reader) -> tuple[tuple[float, ...], float]:
+    if shape is None or shape.tag == records.LINE:
+        return (), 0.0
+    names = {
+        records.ARC: ("curvature",),
+        records.SPIRAL: ("curvStart", "curvEnd"),
+        records.POLY3: CUBIC,
+    }
+    values = tuple(reader.number(shape, k) for k in names.get(shape.tag, _PARAM_CUBIC))
+    return values, length if shape.get("pRange") == "arcLength" else 1.0
+
+
+def _read_link(link: Any, name: str) -> records.RoadLink | None:
+    found = None if link is None else link.find(name)
+    if found is None or found.get("elementId") is None:
+        return None
+    return records.RoadLink(
+        found.get("elementType", "road"), found.get("elementId"), _contact(found)
+    )
+
+
+def _contact(element: Any) -> str | None:
+    contact = element.get("contactPoint")
+    return contact if contact in ("start", "end") else None
+
+
+def _read_types(elements: list[Any], reader: Reader) -> tuple[records.RoadType, ...]:
+    types = []
+    for element in elements:
+        s, speed = reader.finite(element, "s"), element.find("speed")
+        limit = None if speed is None else _read_speed(speed, reader)
+        types.append(
+            records.RoadType(s, element.get("type", "unknown"), element.get("country", ""), limit)
+        )
+    return tuple(sorted(types, key=lambda record: record.s))
+
+
+def _read_speed(element: Any, reader: Reader) -> records.Speed:
+    unit = element.get("unit", "")
+    reader.counts[f"speed {unit or 'm/s'}"] += 1
+    begin = reader.finite(element, "sOffset")
+    text = element.get("max", "undefined")
+    if text in ("no limit", "undefined"):
+        return records.Speed(begin, None)
+    # nuPlan rule 508: without a unit in m/s
+    limit = reader.number(element, "max") * records.SPEED_UNITS.get(unit or "m/s", np.nan)
+    if not (np.isfinite(limit) and limit > 0):
+        reader.warn("speed limit that is not a positive number in a known unit")
+        return records.Speed(begin, None)
+    return records.Speed(begin, limit)
+
+
+def _read_section(element: Any, reader: Reader) -> records.LaneSection:
+    lanes: dict[int, records.Lane] = {}
+    reader.counts["lane section"] += 1
+    for child in element.iter("lane"):
+        number = reader.integer(child, "id")
+        if number is None:
+            raise reader.error(
+                f"lane (line {child.sourceline}) has id={child.get('id', '')[:40]!r}",
+                "number the lanes",
+            )
+        if number == 0:
+            continue
+        if number in lanes:
+            reader.warn("lane id twice in a section, the first holds")
+            continue
+        lanes[number] = _read_lane(child, number, reader)
+    numbers = sorted(lanes)
+    steps = [b - a - (a < 0 < b) for a, b in pairwise(numbers)]
+    nearest = [min((abs(n) for n in numbers if n * sign > 0), default=1) for sign in (-1, 1)]
+    if any(step != 1 for step in steps) or nearest != [1, 1]:
+        reader.warn("lane numbers with holes")
+    return records.LaneSection(max(reader.finite(element, "s"), 0.0), lanes)
+
+
+def _read_lane(element: Any, number: int, reader: Reader) -> records.Lane:
+    link = element.find("link")
+    widths, borders = element.findall("width"), element.findall("border")
+    reader.counts["width"] += len(widths)
+    reader.counts["border"] += len(borders)
+    kind = element.get("type", "")
+    reader.counts[f"lane type {kind or 'none'}"] += 1
+    if not widths and not borders:
+        reader.warn("lane without width and border")
+    lane = records.Lane(
+        id=number,
+        type=kind or "none",
+        widths=reader.cubics(widths, "sOffset"),
+        borders=reader.cubics(borders, "sOffset"),
+        predecessors=_lane_ids(link, "predecessor", reader),
+        successors=_lane_ids(link, "successor", reader),
+        speeds=tuple(
+            sorted((_read_speed(e, reader) for e in element.findall("speed")), key=lambda r: r.s)
+        ),
+        access=tuple(
+            (e.get("rule", "deny"), e.get("restriction", "")) for e in element.findall("access")
+        ),
+        direction=element.get("direction", "standard"),
+    )
+    cubics = lane.widths if len(lane.widths) else lane.borders
+    if len(cubics) and cubics[0, 0] > 1e-6:
+        reader.warn("lane width begins after its section")
+    return lane
+
+
+def _lane_ids(link: Any, name: str, reader: Reader) -> tuple[int, ...]:
+    found = [] if link is None else [reader.integer(e, "id") for e in link.findall(name)]
+    return tuple(i for i in found if i is not None)
+
+
+def _read_junction(element: Any, name: str, reader: Reader) -> records.Junction:
+    kind = element.get("type", "default")
+    reader.counts[f"junction type {kind}"] += 1
+    connections = []
+    for child in element.findall("connection"):
+        links = reader.pairs(child, "laneLink", ("from", "to"))
+        reader.counts["connection"] += 1
+        reader.counts["lane link in a junction"] += len(links)
+        into = child.get("connectingRoad") or child.get("linkedRoad") or ""
+        connections.append(
+            records.Connection(child.get("incomingRoad", ""), into, _contact(child), links)
+        )
+    if not connections:
+        reader.warn("junction without connections")
+    return records.Junction(name, kind, tuple(connections))

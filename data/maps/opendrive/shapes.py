@@ -1,0 +1,268 @@
+"""Borders, centre lines and polygons of lanes, from exact curves.
+
+Borders of a lane section share their sample places, so that neighbouring lanes share vertices; the
+places are refined until every border stays within the chord error. Baselines are sampled anew after
+lanes were joined, evenly in arc length, and small jumps between pieces are spread over some metres.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import shapely
+
+from shiftsim.data.maps.opendrive.curves import ReferenceLine
+from shiftsim.data.maps.opendrive.graph import LaneSegment
+from shiftsim.data.maps.opendrive.lanes import BEFORE_END, LaneKey, section_borders
+from shiftsim.data.maps.opendrive.records import OpenDrive, Road
+from shiftsim.data.polygons import largest_part
+from shiftsim.kernels import FloatArray
+
+CHORD_ERROR = 0.05  # m
+BASELINE_STEP = 0.25  # m, nuPlan rule 510: PLUTO takes every fourth vertex as 1 m
+_DENSE_STEP = 0.1  # m, of exact points a baseline is drawn through: 0.4 mm on a radius of 3 m
+_TARGET_ERROR = 0.02  # m at the middle of a chord; the largest error may lie beside it
+_MAX_STEP = 10.0  # m
+_MIN_STEP = 0.01  # m
+_ROUNDS = 12
+_STEP = 0.01  # m, beyond which a jump of the middle of a lane is spread
+_CORNER, _MIN_STRETCH = 0.3, 0.7  # rad, and m between corners, to be kept as vertices
+_KINK, _BEND = 0.1, 5.0  # rad, and m, of ends that are bent into the direction of a neighbour
+_BLEND = 10.0  # m over which a jump between pieces is spread
+_NARROW = 2.5  # m, nuPlan rule 511: connectors below it are widened
+
+
+@dataclass(frozen=True)
+class SectionShape:
+    """Borders of one lane section at common places."""
+
+    s: FloatArray  # (K,) places on the road, ascending [m]
+    inner: dict[int, FloatArray]  # per lane, (K, 2) border next to the centre [m]
+    outer: dict[int, FloatArray]  # per lane, (K, 2) other border [m]
+
+
+class Shapes:
+    """Samples the lanes of a file; sections are evaluated once."""
+
+    def __init__(self, od: OpenDrive, pieces: Iterable[LaneSegment]) -> None:
+        self._od = od
+        self._lines = {road.id: ReferenceLine(road.geometries) for road in od.roads.values()}
+        self._stops: dict[tuple[str, int], set[float]] = defaultdict(set)
+        self._sections: dict[tuple[str, int], SectionShape] = {}
+        for piece in pieces:
+            self._stops[piece.key.road, piece.key.section].update((piece.begin, piece.end))
+
+    def line(self, road: str) -> ReferenceLine:
+        """Reference line of a road."""
+        return self._lines[road]
+
+    def section(self, road: str, section: int) -> SectionShape:
+        """Borders of all lanes of a section."""
+        key = road, section
+        if key not in self._sections:
+            place = self._od.roads[road], section, self._lines[road]
+            self._sections[key] = _sample_section(*place, self._stops.get(key, set()))
+        return self._sections[key]
+
+    def borders(self, piece: LaneSegment) -> tuple[FloatArray, FloatArray]:
+        """(K, 2) left and right border of a piece in the direction of travel [m]."""
+        shape = self.section(piece.key.road, piece.key.section)
+        low, high = min(piece.begin, piece.end), max(piece.begin, piece.end)
+        kept = (shape.s >= low - 1e-9) & (shape.s <= high + 1e-9)
+        inner, outer = shape.inner[piece.key.lane][kept], shape.outer[piece.key.lane][kept]
+        forward = piece.end >= piece.begin
+        if not forward:
+            inner, outer = inner[::-1], outer[::-1]
+        return (inner, outer) if (piece.key.lane < 0) == forward else (outer, inner)
+
+    def joined_borders(self, pieces: Sequence[LaneSegment]) -> tuple[FloatArray, FloatArray]:
+        """Borders of a chain of pieces; ends that nearly meet become one vertex."""
+        left, right = zip(*map(self.borders, pieces), strict=True)
+        return join_lines(left), join_lines(right)
+
+    def centers(self, piece: LaneSegment, s: FloatArray) -> FloatArray:
+        """(K, 2) points midway between the borders at `s` (K,) [m]."""
+        low, high = min(piece.begin, piece.end), max(piece.begin, piece.end)
+        return self._middles(piece.key, np.clip(s, low, max(high - BEFORE_END, low)))
+
+    def _middles(self, key: LaneKey, s: FloatArray) -> FloatArray:
+        borders = section_borders(self._od.roads[key.road], key.section, s, repair=True, look_up=s)
+        middle = 0.5 * (borders.inner[key.lane] + borders.outer[key.lane])
+        return self._lines[key.road].evaluate(s).offset(middle)
+
+    def baseline(
+        self,
+        pieces: Sequence[LaneSegment],  # in the direction of travel
+        start: FloatArray | None = None,  # (2,) where it must begin, near its own start [m]
+        end: FloatArray | None = None,  # (2,) where it must end [m]
+    ) -> FloatArray:
+        """Centre line of a chain of pieces with a vertex about every 0.25 m."""
+        pieces = [part for piece in pieces for part in self._without_steps(piece)]
+        firsts = [self.centers(p, np.array([p.begin, p.end])) for p in pieces]
+        jumps = np.zeros((len(pieces) + 1, 2))
+        for number, (before, after) in enumerate(pairwise(firsts), start=1):
+            jumps[number] = after[0] - before[1]
+        shifts = [(-0.5 * jumps[i], 0.5 * jumps[i + 1]) for i in range(len(pieces))]
+        if start is not None:
+            shifts[0] = (start - firsts[0][0], shifts[0][1])
+        if end is not None:
+            shifts[-1] = (shifts[-1][0], end - firsts[-1][1])
+        return divide(np.concatenate(list(map(self._shifted, pieces, shifts))))
+
+    def _without_steps(self, piece: LaneSegment) -> list[LaneSegment]:
+        """The piece, cut where the middle of the lane jumps."""
+        road = self._od.roads[piece.key.road]
+        low, high = min(piece.begin, piece.end), max(piece.begin, piece.end)
+        places = np.array(_breakpoints(road, piece.key.section, low, high))
+        if len(places) == 0:
+            return [piece]
+        jumps = self._middles(piece.key, places) - self._middles(piece.key, places - BEFORE_END)
+        cuts = np.unique(places[np.hypot(*jumps.T) > _STEP]).tolist()
+        stops = [low, *cuts, high]
+        if piece.end < piece.begin:
+            stops.reverse()
+        return [replace(piece, begin=a, end=b) for a, b in pairwise(stops)]
+
+    def _shifted(self, piece: LaneSegment, shift: tuple[FloatArray, FloatArray]) -> FloatArray:
+        """Dense centre points of a piece, its two ends moved by `shift` (2,), (2,)."""
+        share = np.linspace(0.0, 1.0, max(int(np.ceil(piece.length / _DENSE_STEP)), 2) + 1)
+        points = self.centers(piece, piece.begin + share * (piece.end - piece.begin))
+        room = 0.5 if shift[0].any() and shift[1].any() else 1.0
+        reach = min(_BLEND / piece.length, room) if piece.length > 0 else room
+        points += _ramp(share / reach)[:, None] * shift[0]
+        points += _ramp((1.0 - share) / reach)[:, None] * shift[1]
+        return points
+
+    def widths(self, pieces: Sequence[LaneSegment]) -> tuple[float, float]:
+        """Width at the start and at the end of a chain of pieces [m]."""
+        out = []
+        for piece, s in ((pieces[0], pieces[0].begin), (pieces[-1], pieces[-1].end)):
+            road = self._od.roads[piece.key.road]
+            borders = section_borders(road, piece.key.section, np.array([s]), repair=True)
+            out.append(float(abs(borders.outer[piece.key.lane] - borders.inner[piece.key.lane])[0]))
+        return out[0], out[1]
+
+
+def divide(dense: FloatArray) -> FloatArray:
+    """A line through dense points with a vertex about every 0.25 m; sharp corners stay vertices."""
+    steps = np.diff(dense, axis=0)
+    lengths = np.hypot(*steps.T)
+    arc = np.concatenate([[0.0], np.cumsum(lengths)])
+    moving = np.flatnonzero(lengths > 1e-6)
+    headings = np.arctan2(steps[moving, 1], steps[moving, 0])
+    turns = np.abs((np.diff(headings) + np.pi) % (2 * np.pi) - np.pi)
+    stops = [0.0]
+    for corner in arc[moving[1:][turns > _CORNER]]:
+        if min(corner - stops[-1], arc[-1] - corner) > _MIN_STRETCH:
+            stops.append(float(corner))
+    parts = [
+        np.linspace(a, b, max(round((b - a) / BASELINE_STEP), 1), endpoint=False)
+        for a, b in pairwise([*stops, float(arc[-1])])
+    ]
+    at = np.concatenate([*parts, arc[-1:]])
+    line = np.stack([np.interp(at, arc, dense[:, 0]), np.interp(at, arc, dense[:, 1])], axis=1)
+    line[0], line[-1] = dense[0], dense[-1]
+    return line
+
+
+def bend_ends(line: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
+    """A line (K, 2) whose ends leave and arrive in the directions of the lines before and after.
+
+    Only where they differ enough to be a kink; the line moves aside by some centimetres.
+    """
+    bent = _bend_start(line, before[-1] - before[-2])
+    return _bend_start(bent[::-1], after[0] - after[1])[::-1]
+
+
+def _bend_start(line: FloatArray, direction: FloatArray) -> FloatArray:
+    own, wanted = (v / max(float(np.hypot(*v)), 1e-9) for v in (line[1] - line[0], direction))
+    if own @ wanted > np.cos(_KINK) or own @ wanted < np.cos(1.0):
+        return line
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    reach = min(_BEND, 0.5 * float(arc[-1]))
+    if reach < 2 * BASELINE_STEP:
+        return line
+    share = np.clip(arc / reach, 0.0, 1.0)
+    return line + (arc * (1.0 - share) ** 2)[:, None] * (wanted - own)
+
+
+def lane_polygon(left: FloatArray, right: FloatArray) -> shapely.Polygon:
+    """The area between two borders of one direction; the largest part where they cross."""
+    return largest_part(shapely.Polygon(np.concatenate([left, right[::-1]])))
+
+
+def widen(left: FloatArray, right: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
+    """Spread two borders about their middle to `width` where they are closer than 2.5 m."""
+    if len(left) != len(right):
+        return left, right
+    across = left - right
+    wide = np.hypot(*across.T)
+    factor = np.where(
+        (wide < min(width, _NARROW)) & (wide > 1e-3), width / np.maximum(wide, 1e-3), 1.0
+    )
+    middle, half = 0.5 * (left + right), 0.5 * across * factor[:, None]
+    return middle + half, middle - half
+
+
+def _ramp(x: FloatArray) -> FloatArray:
+    """1 at 0, 0 from 1 on, flat at both."""
+    x = np.clip(x, 0.0, 1.0)
+    return 1.0 - x**3 * (10.0 + x * (6.0 * x - 15.0))
+
+
+def join_lines(lines: Sequence[FloatArray]) -> FloatArray:
+    """One line of lines (K, 2) that follow each other; ends that nearly meet become one vertex."""
+    out = [lines[0]]
+    for line in lines[1:]:
+        if np.hypot(*(out[-1][-1] - line[0])) < CHORD_ERROR:
+            out[-1] = np.concatenate([out[-1][:-1], 0.5 * (out[-1][-1:] + line[:1])])
+            line = line[1:]
+        out.append(line)
+    return np.concatenate(out)
+
+
+def _sample_section(
+    road: Road, section: int, line: ReferenceLine, stops: set[float]
+) -> SectionShape:
+    begin, end = road.sections[section].s, road.section_end(section)
+    s = np.array(sorted({begin, end, *stops, *_breakpoints(road, section, begin, end)}))
+    steps = np.maximum(np.ceil(np.diff(s) / _MAX_STEP).astype(np.int64), 1)
+    s = np.concatenate(
+        [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(s[:-1], s[1:], steps, strict=True)]
+        + [s[-1:]]
+    )
+    shape = _evaluate_section(road, section, line, s)
+    for _ in range(_ROUNDS):
+        middles = 0.5 * (s[1:] + s[:-1])
+        if len(middles) == 0:
+            break
+        exact = _evaluate_section(road, section, line, middles)
+        bad = np.diff(s) > 2 * _MIN_STEP
+        error = np.zeros(len(middles))
+        for number, outer in shape.outer.items():
+            for points, truth in ((outer, exact.outer), (shape.inner[number], exact.inner)):
+                chord = 0.5 * (points[1:] + points[:-1]) - truth[number]
+                error = np.maximum(error, np.hypot(*chord.T))
+        bad &= error > _TARGET_ERROR
+        if not bad.any():
+            break
+        s = np.sort(np.concatenate([s, middles[bad]]))
+        shape = _evaluate_section(road, section, line, s)
+    return shape
+
+
+def _evaluate_section(road: Road, section: int, line: ReferenceLine, s: FloatArray) -> SectionShape:
+    borders, poses = section_borders(road, section, s, repair=True), line.evaluate(s)
+    sides = borders.inner, borders.outer
+    points = {id(t): poses.offset(t) for side in sides for t in side.values()}
+    return SectionShape(s, *({n: points[id(t)] for n, t in side.items()} for side in sides))
+
+
+def _breakpoints(road: Road, section: int, begin: float, end: float) -> list[float]:
+    places = [g.s for g in road.geometries] + road.offsets[:, 0].tolist()
+    for lane in road.sections[section].lanes.values():
+        for records in (lane.widths, lane.borders):
+            places += (road.sections[section].s + records[:, 0]).tolist()
+    return [s for s in places if begin + _MIN_STEP < s < end - _MIN_STEP]

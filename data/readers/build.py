@@ -1,0 +1,271 @@
+"""From columns of a source to `TrackSamples`: sorted, checked, with velocities and headings.
+
+Rows may come in any order and at any rate, and every object may have times of its own. What cannot
+be is an error; what can be repaired is repaired and counted.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from shiftsim.data.readers.codes import CATEGORIES, KIND_NAMES, SIZES
+from shiftsim.data.readers.motion import (
+    believed_velocities,
+    contradiction,
+    fitted_velocities,
+    headings_of_motion,
+    held_headings,
+    track_medians,
+)
+from shiftsim.data.readers.samples import (
+    ROW_S,
+    ROW_US,
+    TrackSamples,
+    find_runs,
+    rows_between,
+    sample_run,
+)
+from shiftsim.errors import ConversionError
+from shiftsim.kernels import FloatArray, IntArray
+from shiftsim.world.state import AgentKind
+
+MAX_HOLE_S = 0.5  # s, longest hole of a track that is filled
+MAX_PAUSE_S = 3600.0  # s without a row of any object within one recording
+MAX_SPAN_S = 1e5  # s from the first row to the last one
+
+
+def make_samples(
+    name: str,
+    *,
+    time_us: IntArray,
+    ids: NDArray[Any],
+    category: IntArray,
+    categories: Sequence[str] = tuple(KIND_NAMES),
+    xy: FloatArray,
+    headings: FloatArray | None = None,
+    velocities: FloatArray | None = None,
+    sizes: FloatArray | None = None,
+    derived: FloatArray | None = None,
+    kind_of: Mapping[str, AgentKind] = CATEGORIES | KIND_NAMES,
+) -> TrackSamples:
+    """A recording from its columns. A rows, one per object and time, in any order.
+
+    Args:
+        name: Name of the recording.
+        time_us: (A,) time stamps [us].
+        ids: (A,) integers or texts that name the objects.
+        category: (A,) index into `categories`.
+        categories: Names of categories; by default `category` holds AgentKind codes.
+        xy: (A, 2) box centre [m].
+        headings: (A,) [rad]; the direction of motion where it is not given.
+        velocities: (A, 2) in the frame of `xy` [m/s], NaN where unknown. Derived from the positions
+            where they are not given, and for tracks where they contradict the positions.
+        sizes: (A, 2) length, width [m]; the usual size of a kind (`SIZES`) where it is not given,
+            NaN or 0. A track gets the median.
+        derived: (A, 2) `fitted_velocities` of rows sorted by id and time, where they are known.
+        kind_of: AgentKind by name of a category.
+
+    Raises:
+        ConversionError: A value is not finite, a category is unknown, or an object has two rows at
+            one time. Nothing is seen for an hour, or the rows span more than a day.
+    """
+    warnings: Counter[str] = Counter()
+    for what, values in (("position", xy), ("heading", headings)):
+        bad = 0 if values is None else int((~np.isfinite(values)).sum())
+        if bad:
+            raise ConversionError(
+                f"{name}: {bad} values of {what} are not finite", "leave those rows out"
+            )
+    if len(time_us) < 2 or time_us.min() == time_us.max():
+        raise ConversionError(
+            f"{name}: {len(time_us)} rows at one time", "give rows at two times or more"
+        )
+    track_ids, track = index_ids(ids)
+    order = order_of_rows(track, time_us)
+    if order is not None:
+        time_us, track, category, xy = time_us[order], track[order], category[order], xy[order]
+        headings, velocities, sizes = (
+            None if part is None else part[order] for part in (headings, velocities, sizes)
+        )
+        derived = None
+    if fault := find_twice(track_ids, track, time_us) or find_pause(time_us):
+        raise ConversionError(f"{name}: {fault[0]}", fault[1])
+    stamps, frame = index_ids(time_us)
+    time = (time_us - stamps[0]) / 1e6
+    step = np.diff(time)[track[1:] == track[:-1]]
+    period = float(np.median(step)) if len(step) else ROW_S
+    most = most_frequent(category, len(categories), track, warnings)
+    names = tuple(categories[code] for code in most)
+    if unknown := sorted(set(names) - set(kind_of)):
+        raise ConversionError(
+            f"{name}: category {unknown[0]!r} is unknown",
+            f"map it to one of {', '.join(sorted(kind_of))}",
+        )
+    kinds = np.array([kind_of[category] for category in names], np.int64)
+    if derived is None:
+        derived = fitted_velocities(xy, time, track, period)
+    contradicts = None
+    if velocities is not None:
+        contradicts = contradiction(velocities, derived, time, track)[0]
+    speeds = believed_velocities(velocities, derived, contradicts, track, warnings)
+    raw = headings_of_motion(speeds, track, warnings) if headings is None else headings
+    samples = TrackSamples(
+        name=name,
+        start_us=int(stamps[0]),
+        period=period,
+        clock=(stamps - stamps[0]) / 1e6,
+        frame=frame,
+        track=track,
+        centers=np.pad(xy, ((0, 0), (0, 1))),
+        raw_headings=raw,
+        headings=held_headings(raw, speeds, time, track, warnings),
+        velocities=speeds,
+        track_ids=track_ids,
+        categories=names,
+        kinds=kinds,
+        sizes=_sizes(sizes, kinds, track, warnings),
+        warnings=dict(+warnings),
+    )
+    if float(np.median(np.diff(samples.clock))) < 0.5 * period:
+        return on_common_clock(samples)
+    return samples
+
+
+Fault = tuple[str, str] | None  # what is wrong, and the remedy
+
+
+def find_pause(time_us: IntArray) -> Fault:
+    """Times (A,) [us] that span too long, or with too long a pause: every row takes memory."""
+    stamps = np.unique(time_us)
+    first = int(np.diff(stamps).argmax())
+    begin, end, span = ((stamps[[first, first + 1, -1]] - stamps[0]) / 1e6).tolist()
+    if end - begin > MAX_PAUSE_S:
+        return (
+            f"no object has a row between {begin:g} s and {end:g} s, at most {MAX_PAUSE_S:g} s",
+            "leave out rows with a wrong time; if the clock begins anew at midnight, add a day to"
+            " the times after it; if two recordings were joined, convert each by itself",
+        )
+    if span > MAX_SPAN_S:
+        return (
+            f"the rows span {span:g} s, more than {MAX_SPAN_S:g} s",
+            "leave out rows with a wrong time, check its unit, or convert parts by themselves",
+        )
+    return None
+
+
+def find_twice(ids: NDArray[Any], track: IntArray, time_us: IntArray) -> Fault:
+    """Two rows of one object at one time; rows (A,) are sorted by track and time."""
+    twice = np.flatnonzero((np.diff(track) == 0) & (np.diff(time_us) == 0))
+    if not len(twice):
+        return None
+    name, when = ids[track[twice[0]]].item(), (time_us[twice[0]] - time_us.min()) / 1e6
+    return (
+        f"object {name!r} has two rows at {when:g} s ({len(twice)} such rows): rows are repeated,"
+        " or one id names two objects",
+        "leave repeated rows out, give objects ids of their own, and check the unit of time",
+    )
+
+
+def on_common_clock(samples: TrackSamples) -> TrackSamples:
+    """The same recording with a row every 0.05 s, where objects have times of their own."""
+    runs = find_runs(samples, MAX_HOLE_S)
+    first, last = rows_between(samples.time[runs.first], samples.time[runs.last])
+    # what is seen at an end of the recording is seen at its first or last row, too
+    first[samples.time[runs.first] < samples.period] = 0
+    at_end = samples.time[runs.last] > samples.duration - samples.period
+    last[at_end] = int(samples.duration / ROW_S + 1e-9)
+    long = np.flatnonzero(last >= first).tolist()
+    rows = [np.arange(first[run], last[run] + 1) for run in long]
+    parts = [
+        sample_run(samples, runs, run, row * ROW_S) for run, row in zip(long, rows, strict=True)
+    ]
+    poses, velocities, heights = map(np.concatenate, zip(*parts, strict=True))
+    frame = np.concatenate(rows)
+    track_of_row = np.repeat(runs.track[long], [len(row) for row in rows])
+    present, track = np.unique(track_of_row, return_inverse=True)
+    warnings = Counter(samples.warnings)
+    lost = len(samples.track_ids) - len(present)
+    warnings["tracks too short for a row every 0.05 s (left out)"] += lost
+    return replace(
+        samples,
+        period=ROW_S,
+        clock=np.arange(int(frame.max()) + 1) * ROW_US / 1e6,
+        frame=frame,
+        track=track,
+        centers=np.column_stack([poses[:, :2], heights]),
+        raw_headings=poses[:, 2],
+        headings=poses[:, 2],
+        velocities=velocities,
+        track_ids=samples.track_ids[present],
+        categories=tuple(samples.categories[i] for i in present.tolist()),
+        kinds=samples.kinds[present],
+        sizes=samples.sizes[present],
+        warnings=dict(+warnings),
+    )
+
+
+def index_ids(ids: Any) -> tuple[NDArray[Any], IntArray]:
+    """Distinct ids, ascending, and (A,) the index of each row's among them.
+
+    `ids` (A,) are integers or texts, as an array of numpy or pyarrow.
+    """
+    array = ids if isinstance(ids, pa.ChunkedArray | pa.Array) else pa.array(ids)
+    encoded = pa.chunked_array(array.chunks if isinstance(array, pa.ChunkedArray) else [array])
+    if not pa.types.is_dictionary(encoded.type):
+        encoded = encoded.dictionary_encode()  # far faster than sorting texts
+    names, number = dictionary_codes(encoded)
+    distinct, rank = np.unique(names.to_numpy(zero_copy_only=False), return_inverse=True)
+    return distinct.astype(str) if distinct.dtype == object else distinct, rank[number]
+
+
+def dictionary_codes(column: pa.ChunkedArray) -> tuple[pa.Array, IntArray]:
+    """The values of a dictionary column, and (A,) the index of each row's; nulls get the last."""
+    encoded = column.unify_dictionaries().combine_chunks()
+    encoded = encoded.chunk(0) if isinstance(encoded, pa.ChunkedArray) else encoded
+    codes = encoded.indices.fill_null(len(encoded.dictionary))
+    return encoded.dictionary, codes.to_numpy().astype(np.int64, copy=False)
+
+
+def order_of_rows(track: IntArray, time_us: IntArray) -> IntArray | None:
+    """(A,) rows in the order of tracks and times; nothing where they have it."""
+    later = time_us[1:] >= time_us[:-1]
+    if ((track[1:] > track[:-1]) | ((track[1:] == track[:-1]) & later)).all():
+        return None
+    return np.lexsort((time_us, track))
+
+
+def most_frequent(
+    category: IntArray, num_categories: int, track: IntArray, warnings: Counter[str]
+) -> list[int]:
+    """N most frequent category of every track; category and track: (A,)."""
+    votes = np.zeros((int(track[-1]) + 1, num_categories), np.int64)
+    np.add.at(votes, (track, category), 1)
+    changing = int(((votes > 0).sum(axis=1) > 1).sum())
+    warnings["tracks of changing category (most frequent taken)"] += changing
+    most: list[int] = votes.argmax(axis=1).tolist()
+    return most
+
+
+def _sizes(
+    sizes: FloatArray | None, kinds: IntArray, track: IntArray, warnings: Counter[str]
+) -> FloatArray:
+    """(N, 2) median of the sizes of every track, the usual one of its kind where it has none."""
+    usual = np.array([SIZES[AgentKind(kind)] for kind in kinds.tolist()])
+    if sizes is None:
+        warnings["tracks without size (that of their kind)"] += len(kinds)
+        return usual
+    known = (sizes > 0.0).all(axis=1)
+    if not known.all():  # rows without a size say nothing of it
+        sizes, track = sizes[known], track[known]
+    medians = np.zeros_like(usual)
+    if len(track):
+        for axis in (0, 1):
+            medians[: int(track[-1]) + 1, axis] = track_medians(sizes[:, axis], track)
+    lacking = ~np.all(medians > 0.0, axis=1)
+    warnings["tracks without size (that of their kind)"] += int(lacking.sum())
+    return np.where(np.expand_dims(lacking, 1), usual, medians)

@@ -1,0 +1,225 @@
+"""Reader of logs that py123d has converted: Waymo, nuScenes, Argoverse 2 Sensor, nuPlan and others.
+
+py123d itself is not needed: its files are Arrow tables whose objects are packed with msgpack. They
+have no version of their own, so every column is checked; tested with files of py123d 0.7.0.
+"""
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from shiftsim.data.maps.build import PieceMap, build_lane_map
+from shiftsim.data.maps.lights import LightStates, states_of_lists
+from shiftsim.data.maps.segments import MapSource, StopArea
+from shiftsim.data.readers import codes
+from shiftsim.data.readers.build import make_samples
+from shiftsim.data.readers.codes import LaneNames
+from shiftsim.data.readers.files import SceneFolder, SourceFile, items, vectors
+from shiftsim.data.readers.reader import SourceRecording
+from shiftsim.data.readers.samples import TrackSamples
+from shiftsim.errors import import_extra
+from shiftsim.kernels import FloatArray, IntArray
+from shiftsim.world.state import AgentKind
+
+EGO = "ego"
+_FILES = ("sync", "ego_state_se3", "box_detections_se3", "traffic_light_detections")
+# columns of these files, beside their time stamps, and of maps
+_EGO = dict(imu_se3=items(pa.float64(), 7))
+_BOXES = dict(
+    bounding_box_se3=items(items(pa.float64(), 10)),
+    track_token=items(pa.string()),
+    velocity_3d=pa.list_(items(pa.float64(), 3)),  # null where it is unknown
+    label=items(pa.uint16()),
+)
+_LIGHTS = dict(lane_id=items(pa.int32()), status=items(pa.uint8()))
+_MAP = dict(map_layer=pa.int8(), object_id=pa.int64(), features=pa.binary(), wkb=pa.binary())
+_LANE = LaneNames(
+    line=np.ndarray,
+    borders=("left_boundary", "right_boundary"),
+    center="centerline",
+    successors="successor_ids",
+    neighbors=("left_lane_id", "right_lane_id"),
+    speed_limit="speed_limit_mps",
+)
+_FEATURES = {  # of the elements of a map, by layer
+    "lane": {**_LANE.form, "lane_type": (int,), "lane_group_id": (int,)},
+    "lane group": {"intersection_id": (int,)},
+    "stop zone": {"stop_zone_type": (int,)},
+}
+_DRIVABLE = ("lane group", "intersection", "car park", "drivable area")
+
+
+class Py123dReader(SceneFolder):
+    """Logs of py123d; a scene is named by the folder of its log."""
+
+    name = "py123d"
+    pattern = "ego_state_se3.arrow"
+    hint = "give the folder that py123d wrote, with logs/ and maps/"
+
+    def recordings(self) -> list[str]:
+        """Folders of the logs, sorted."""
+        return [str(Path(file).parent) for file in super().recordings()]
+
+    def files(self, recording: str) -> list[Path]:
+        """Tracks, lights, and the map of the log or of its city."""
+        path = Path(recording)
+        files = [*(path / f"{name}.arrow" for name in _FILES), _read_sync(path)[1]]
+        return [file for file in files if file.is_file()]
+
+    def read(self, recording: str) -> SourceRecording:
+        """One log."""
+        path = Path(recording)
+        about, map_path = _read_sync(path)
+        dataset, split = about["dataset"], about["split"]
+        if dataset.startswith("wod") and split.endswith("test"):
+            raise SourceFile(path).fault(
+                f"split {split!r} hides the future", "convert train or val"
+            )
+        with SourceFile(path).naming():
+            samples = _read_tracks(path)
+        lights = _read_lights(path)
+        city = path.name if map_path.parent == path else about.get("location")
+        road = _read_map(map_path, f"{dataset}-{city}", lights.names if lights else ())
+        source = f"{dataset} {split}, through py123d {about.get('version')}"
+        licences = (text for name, text in codes.LICENCES.items() if dataset.startswith(name))
+        metadata = {"source": source, "licence": next(licences, "that of the source")}
+        return SourceRecording(
+            samples, road, lights=lights, metadata=metadata, **self.recorded_ego(EGO)
+        )
+
+
+class _File(SourceFile):
+    """An Arrow file, and what msgpack packed in its metadata and cells."""
+
+    remedy = "convert the log again with py123d 0.7.0"  # the version that is tested
+
+    def steps(self, columns: dict[str, Any], form: Any) -> tuple[IntArray, pa.Table, Any]:
+        """(R,) time stamps [us] of a file of a log, other columns, and its metadata."""
+        kinds = {"timestamp_us": pa.int64(), **columns}
+        table = self.columns({f"{self.path.stem}.{name}": kind for name, kind in kinds.items()})
+        stamps = self.numbers(table, table.column_names[0], "time").astype(np.int64)
+        packed = (table.schema.metadata or {}).get(b"metadata")
+        return stamps, table.remove_column(0), self.unpack(packed, _load, form, "'metadata'")
+
+    def boxes(self, found: FloatArray) -> FloatArray:
+        """(R, 3 or 5) x, y, heading and sizes, if any, of rows x, y, z, quaternion and sizes."""
+        for field, part in ("position", slice(2)), ("rotation", slice(3, 7)), ("size", slice(7, 9)):
+            self.require(field, found[:, part], "box")
+        w, x, y, z = found[:, 3:7].T
+        headings = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        return np.column_stack([found[:, :2], headings, found[:, 7:9]])
+
+
+def _load(data: bytes) -> Any:
+    """What msgpack packed: plain values and arrays of float64, nothing else."""
+    msgpack = import_extra("msgpack", "py123d")
+    return msgpack.unpackb(data, strict_map_key=False, object_hook=_array)
+
+
+def _array(found: dict[Any, Any]) -> Any:
+    if b"__ndarray__" not in found:
+        return found
+    if found[b"dtype"] != "<f8":
+        raise ValueError(f"an array of {found[b'dtype']!r}, need '<f8'")
+    return np.frombuffer(found[b"data"], "<f8").reshape(found[b"shape"])
+
+
+def _read_sync(log: Path) -> tuple[dict[str, Any], Path]:
+    """What a log says of itself; its map, beside it or in the folder `maps`."""
+    place = {"dataset": str, "location": (str,)}
+    form = {**place, "split": str, "version": (str,), "map_metadata": (place,)}
+    *_, about = _File(log / "sync.arrow").steps({}, form)
+    city = about.get("map_metadata") or about
+    shared = f"maps/{city['dataset']}/{city['dataset']}_{city.get('location')}.arrow"
+    places = (log / "map.arrow", *(folder / shared for folder in log.parents))
+    return about, next(filter(Path.is_file, places), places[0])
+
+
+def _read_tracks(log: Path) -> TrackSamples:
+    """The boxes of all steps, and the box of the recording car."""
+    ego_us, ego = _read_ego(log)
+    file = _File(log / "box_detections_se3.arrow")
+    stamps, table, about = file.steps(_BOXES, {"box_detection_label_class": str})
+    rows, (boxes, tokens, velocities, labels) = file.lists(table)
+    name = about["box_detection_label_class"].rpartition(".")[2]
+    kinds = codes.LABELS[file.known(name, codes.LABELS, "label class")]
+    category = [kinds[file.known(i, kinds, f"{name}: label")] for i in labels.to_pylist()]
+    every = np.concatenate([file.boxes(vectors(boxes, 9)), ego])
+    return make_samples(
+        log.name,
+        time_us=np.concatenate([stamps[rows], ego_us]),
+        ids=np.array([*tokens.to_pylist(), *[EGO] * len(ego)]),
+        category=np.array([*category, *[AgentKind.VEHICLE] * len(ego)]),
+        xy=every[:, :2],
+        headings=every[:, 2],
+        velocities=np.concatenate([vectors(velocities, 2), np.full((len(ego), 2), np.nan)]),
+        sizes=every[:, 3:],
+    )
+
+
+def _read_ego(log: Path) -> tuple[IntArray, FloatArray]:
+    """Time stamps [us], and rows x, y, heading of the box centre, length, width of the ego.
+
+    Stored velocities of egos are 0 in many rows in which the car moves, and are not used.
+    """
+    file = _File(log / "ego_state_se3.arrow")
+    form = {"center_to_imu_se3": [float], "length": float, "width": float}
+    stamps, table, about = file.steps(_EGO, form)
+    center, *size = (about[name] for name in form)
+    if len(center) != 7:
+        raise file.fault(f"'center_to_imu_se3' has {len(center)} numbers, need 7")
+    ((ahead, left, turn, *size),) = file.boxes(np.array([[*center, *size]], np.float64))
+    stamps, first = np.unique(stamps, return_index=True)  # of equal stamps the first is kept
+    x, y, heading = file.boxes(vectors(table["ego_state_se3.imu_se3"], 7)[first]).T
+    cos, sin = np.cos(heading), np.sin(heading)
+    moved = x + cos * ahead - sin * left, y + sin * ahead + cos * left
+    return stamps, np.column_stack([*moved, heading + turn, np.tile(size, (len(x), 1))])
+
+
+def _read_lights(log: Path) -> LightStates | None:
+    file = _File(log / "traffic_light_detections.arrow")
+    if not file.path.is_file():
+        return None
+    stamps, table, _ = file.steps(_LIGHTS, {})
+    rows, (lanes, shown) = file.lists(table)
+    return states_of_lists(stamps, rows, lanes.to_numpy(), shown.to_numpy(), codes.LIGHTS)
+
+
+@lru_cache(maxsize=1)  # logs of one city follow each other
+def _read_map(path: Path, name: str, lit: tuple[str, ...]) -> PieceMap:
+    """A map; `lit` are the lanes that have a light."""
+    file = _File(path)
+    elements: dict[str, list[Any]] = {layer: [] for layer in _FEATURES}
+    areas: dict[str, list[Any]] = {layer: [] for layer in codes.LAYERS.values() if layer != "lane"}
+    for code, number, packed, wkb in zip(*file.columns(_MAP).to_pydict().values(), strict=True):
+        layer = codes.LAYERS.get(code, "")
+        place = f"{layer} {number}"
+        if layer in elements:
+            elements[layer].append((number, file.unpack(packed, _load, _FEATURES[layer], place)))
+        if layer in areas:
+            areas[layer].append(file.area(wkb, f"wkb of {place}"))
+    inside = {n for n, group in elements["lane group"] if group.get("intersection_id") is not None}
+    pieces = []
+    for number, lane in elements["lane"]:
+        if lane.get("lane_type") != codes.BIKE_LANE:
+            light = str(number) if str(number) in lit else None
+            inner = lane.get("lane_group_id") in inside
+            pieces.append(_LANE.piece(file, lane, str(number), light=light, is_connector=inner))
+    drivable = _DRIVABLE if areas["drivable area"] else ()  # Waymo has none
+    source = MapSource(
+        name=name,
+        pieces=pieces,
+        drivable_areas=[area for layer in drivable for area in areas[layer]],
+        stop_areas=[
+            StopArea(area, codes.STOPS.get(zone.get("stop_zone_type"), codes.OTHER_STOP))
+            for area, (_, zone) in zip(areas["stop zone"], elements["stop zone"], strict=True)
+        ],
+        crosswalks=areas["crosswalk"],
+        walkways=areas["walkway"],
+        car_parks=areas["car park"],
+    )
+    with file.naming():
+        return build_lane_map(source)

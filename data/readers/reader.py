@@ -1,0 +1,81 @@
+"""What a source of recordings offers to the converter, and what it hands over of each."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from shiftsim.data.maps.build import PieceMap
+from shiftsim.data.maps.lights import LightStates
+from shiftsim.data.readers.samples import TrackSamples
+from shiftsim.data.readers.windows import ConversionConfig, Span
+from shiftsim.kernels import FloatArray
+from shiftsim.world.map import VectorMap
+
+
+@dataclass(frozen=True)
+class SourceRecording:
+    """One recording with its map, and how scenarios are made of it (`make_scenarios`)."""
+
+    samples: TrackSamples
+    map: PieceMap
+    config: ConversionConfig | None = None
+    scenario_type: str = "unknown"
+    egos: Sequence[str] | None = None  # ids of the egos; None for every vehicle that can be one
+    spans: Sequence[Span] | None = None  # windows; None for all that fit
+    offset: FloatArray | None = None  # (2,) what brings places into the frame of the map [m]
+    left_out_s: float = 0.0  # time at its end that no scenario reaches [s]
+    needs_scenario: bool = False  # whether it is an error if none is left
+    lights: LightStates | None = None
+    metadata: Mapping[str, object] = field(default_factory=dict)  # source, licence and so on
+    warnings: Mapping[str, int] = field(default_factory=dict)  # what the reader left out, by kind
+    details: Mapping[str, Any] = field(default_factory=dict)  # for the report, JSON values only
+
+
+class Reader(Protocol):
+    """A source of recordings. It must pickle."""
+
+    @property
+    def name(self) -> str:
+        """Name of the site or of the data set."""
+
+    @property
+    def source(self) -> Path:
+        """Where it is."""
+
+    @property
+    def site(self) -> PieceMap | None:
+        """The map that all recordings share, whose report the store gets; None without one."""
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """What the result depends on beside the files, JSON values only."""
+
+    def recordings(self) -> Sequence[str]:
+        """Names of the recordings, in the order in which they are reported.
+
+        Raises:
+            ConversionError: There is none.
+        """
+
+    def files(self, recording: str) -> Sequence[Path]:
+        """The files that a recording is read from."""
+
+    def read(self, recording: str) -> SourceRecording:
+        """One recording.
+
+        Raises:
+            DataError: A file is missing or broken, or contradicts itself.
+        """
+
+    def summarise(self, entries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        """What the report says of all recordings, from the entry of each, details included.
+
+        Raises:
+            ConversionError: They and the map contradict each other; nothing is written then.
+        """
+
+
+def site_map(road: VectorMap, warnings: Mapping[str, int]) -> PieceMap:
+    """The map that all recordings of a site share; none of its connectors has a known light."""
+    return PieceMap(road, dict(warnings), {}, {})

@@ -1,0 +1,308 @@
+"""A recording as Parquet files, a row per track and time; and the part that a window needs."""
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+import pyarrow as pa
+
+from shiftsim.data.recording import EgoTrace, Recording, Window, visible_columns
+from shiftsim.data.store import schema
+from shiftsim.data.store.tables import (
+    FRAMES,
+    LIGHTS,
+    REPAIR,
+    TRACKS,
+    Table,
+    column,
+    ego_file,
+    require_ranges,
+    write_blocks,
+)
+from shiftsim.errors import DataError
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.world.state import NUM_STATE, LightStatus, Tracks, TrafficLights
+
+# which of some tracks are wanted, in order, from when they are there, their kinds and tokens
+_Choice: TypeAlias = Callable[[BoolArray, IntArray, Sequence[str]], IntArray]
+
+
+def write_recording(folder: Path, recording: Recording) -> None:
+    """Write frames, lights and tracks of a recording.
+
+    Raises:
+        DataError: Its arrays do not fit together, or hold a number outside of its range.
+    """
+    count, tracks = len(recording.time_us), recording.tracks
+    shape = (count, len(tracks.tokens))
+    _require(tracks.valid.shape == shape and tracks.kinds.shape == shape[1:], folder / TRACKS)
+    for values, width in ((tracks.poses, 3), (tracks.velocities, 2), (tracks.sizes, 2)):
+        _require(values.shape == (*shape, width), folder / TRACKS)
+    lights = recording.lights
+    _require(lights.status.shape == (count, len(lights.connector_ids)), folder / LIGHTS)
+    tables = {
+        FRAMES: [frames_table(recording.time_us)],
+        LIGHTS: list(_parts(count, partial(lights_table, lights))),
+        TRACKS: list(_parts(count, partial(tracks_table, tracks))),
+    }
+    for name, blocks in tables.items():
+        for block in blocks:
+            require_ranges(block, str(folder / name))
+    if (np.diff(recording.time_us) < 0).any():  # they may repeat, nuPlan rule 431
+        raise DataError(f"{folder / FRAMES}: column 'time_us' does not increase", REPAIR)
+    tables[FRAMES] = _split(tables[FRAMES][0])
+    for name, blocks in tables.items():
+        write_blocks(folder / name, blocks)
+
+
+def write_ego(folder: Path, ego: EgoTrace) -> None:
+    """Write the states of one ego.
+
+    Raises:
+        DataError: A number is outside of its range.
+    """
+    path = ego_file(folder, ego.name)
+    _require(ego.states.ndim == 2 and ego.states.shape[1] == NUM_STATE, path)
+    table = ego_table(ego.states, ego.first_row)
+    require_ranges(table, str(path))
+    write_blocks(path, _split(table))
+
+
+def _require(fits: object, path: Path) -> None:
+    if not fits:
+        raise DataError(f"{path}: the arrays do not fit together", REPAIR)
+
+
+def _split(table: pa.Table) -> list[pa.Table]:
+    starts = range(0, max(len(table), 1), schema.FRAME_BLOCK)
+    return [table.slice(start, schema.FRAME_BLOCK) for start in starts]
+
+
+def _parts(count: int, make: Callable[[slice], pa.Table]) -> Iterator[pa.Table]:
+    """Tables of a recording of so many rows, of about `BLOCK_ROWS` rows each."""
+    num_blocks = max(1, round(count / schema.BLOCK_ROWS))
+    size = max(1, -(-count // num_blocks))
+    return (make(slice(at * size, (at + 1) * size)) for at in range(num_blocks))
+
+
+def frames_table(time_us: IntArray) -> pa.Table:
+    """Rows of `schema.FRAMES`."""
+    return _table(schema.FRAMES, np.arange(len(time_us)), time_us)
+
+
+def ego_table(states: FloatArray, first_row: int) -> pa.Table:
+    """Rows of `schema.EGO`."""
+    rows = np.arange(first_row, first_row + len(states))
+    return _table(schema.EGO, rows, *np.ascontiguousarray(states.T))
+
+
+def lights_table(lights: TrafficLights, rows: slice) -> pa.Table:
+    """Rows of `schema.LIGHTS` for the lights that some rows list, light by light."""
+    status = lights.status[rows]
+    light, row = np.nonzero(status.T != LightStatus.ABSENT)
+    connectors = pa.array(lights.connector_ids, pa.string()).take(pa.array(light))
+    return _table(schema.LIGHTS, row + rows.start, light, connectors, status[row, light])
+
+
+def tracks_table(tracks: Tracks, rows: slice) -> pa.Table:
+    """Rows of `schema.TRACKS`, track by track: neighbours in time compress well."""
+    part = tracks.rows(rows)
+    track, row = np.nonzero(part.valid.T)
+    tokens = pa.array(tracks.tokens, pa.string()).take(pa.array(track))
+    numbers = [
+        values[row, track, axis]
+        for values in (part.poses, part.velocities, part.sizes)
+        for axis in range(values.shape[-1])
+    ]
+    kinds = tracks.kinds[track]
+    return _table(schema.TRACKS, row + rows.start, track, tokens, kinds, *numbers)
+
+
+def _table(described: pa.Schema, *columns: np.ndarray | pa.Array) -> pa.Table:
+    """A table of some columns; numbers that its types cannot hold are errors of their range."""
+    arrays = [
+        values if isinstance(values, pa.Array) else pa.array(_as_type(values, field.type))
+        for field, values in zip(described, columns, strict=True)
+    ]
+    return pa.Table.from_arrays(arrays, schema=described)
+
+
+def _as_type(values: np.ndarray, kind: pa.DataType) -> np.ndarray:
+    wanted = np.dtype(kind.to_pandas_dtype())
+    limits = np.iinfo(wanted) if wanted.kind == "i" else None
+    return (np.clip(values, limits.min, limits.max) if limits else values).astype(wanted)
+
+
+class StoredRecording:
+    """Open files of one recording; its rows are read when asked for.
+
+    Attributes:
+        log_name: Its name.
+        city: Map it was recorded on.
+        tracks: Rows of `schema.TRACKS`.
+    """
+
+    def __init__(self, folder: Path, log_name: str, city: str) -> None:
+        """Open the files.
+
+        Raises:
+            DataError: A file or a column is missing, or is damaged.
+        """
+        self.log_name, self.city = log_name, city
+        self.frames = Table(folder / FRAMES, schema.FRAMES)
+        self.lights = Table(folder / LIGHTS, schema.LIGHTS)
+        self.tracks = Table(folder / TRACKS, schema.TRACKS)
+
+    @property
+    def num_rows(self) -> int:
+        """Number of rows in time."""
+        return self.frames.num_rows
+
+    def read(self, first: int, last: int) -> Recording:
+        """The rows first … last - 1, as a recording of its own.
+
+        Raises:
+            DataError: A file is damaged or does not have the rows.
+        """
+        return self._read(first, last, lambda valid, *_: np.flatnonzero(valid.any(axis=0)), False)
+
+    def read_window(self, window: Window, *, plausible: bool) -> Recording:
+        """The rows of a window, and the tracks that it shows.
+
+        Raises:
+            DataError: A file is damaged or does not have the rows, or, where `plausible` is asked
+                for, a box holds a number outside of its range.
+        """
+        choose = partial(visible_columns, without=window.ego)
+        return self._read(window.first_row, window.last_row, choose, plausible)
+
+    def _read(self, first: int, last: int, choose: _Choice, plausible: bool) -> Recording:
+        frames = _rows(self.frames, first, last, plausible)
+        time_us = column(frames, "time_us")
+        if plausible and (np.diff(time_us) < 0).any():
+            raise DataError(f"{self.frames.path}: column 'time_us' does not increase", REPAIR)
+        lights = self._lights(first, last, plausible)
+        tracks = self._tracks(first, last, choose, plausible)
+        return Recording(self.log_name, self.city, time_us, tracks, lights)
+
+    def _lights(self, first: int, last: int, plausible: bool) -> TrafficLights:
+        found = self.lights.read(self.lights.blocks(first, last), plausible=plausible)
+        row = column(found, "row")
+        found = found.filter(pa.array((row >= first) & (row < last)))
+        light, each = _columns(found, "light")
+        status = np.full((last - first, len(each)), LightStatus.ABSENT, np.int8)
+        status[column(found, "row") - first, light] = column(found, "status")
+        return TrafficLights(tuple(found["connector"].take(each).to_pylist()), status)
+
+    def _tracks(self, first: int, last: int, choose: _Choice, plausible: bool) -> Tracks:
+        found = self.tracks.read(self.tracks.blocks(first, last), plausible=plausible)
+        row = column(found, "row") - first
+        track, each = _columns(found, "track")
+        tokens: list[str] = found["token"].take(each).to_pylist()
+        kinds = column(found, "kind")[each].astype(np.int64)
+        valid = np.zeros((last - first, len(each)), np.bool_)
+        _mark(row, track, valid)
+        order = choose(valid, kinds, tokens)
+        place = np.full(len(each), -1)
+        place[order] = np.arange(len(order))
+        if len(order) < len(each) or (order != np.arange(len(each))).any():
+            valid, kinds, tokens = valid.take(order, 1), kinds[order], [tokens[i] for i in order]
+        poses, velocities, sizes = (np.full((*valid.shape, n), np.nan) for n in (3, 2, 2))
+        numbers = tuple([column(found, name) for name in schema.BOX])
+        _scatter(numbers, row, track, place, poses, velocities, sizes)
+        return Tracks(valid, poses, velocities, sizes, kinds, tuple(tokens))
+
+
+def _columns(found: pa.Table, name: str) -> tuple[IntArray, pa.Array]:
+    """Columns in dense arrays of what the rows of a table are about.
+
+    Args:
+        found: The table, of A rows; it has few runs of equal numbers, as files are written.
+        name: Column with the number of a track or light.
+
+    Returns:
+        Column (A,) of each row, in the order of the numbers; and the index (N,) of a row of the
+        table for each column.
+    """
+    numbers = column(found, name)
+    begins = np.ones(len(numbers), np.bool_)
+    begins[1:] = numbers[1:] != numbers[:-1]
+    starts = np.flatnonzero(begins)
+    _, each, place = np.unique(numbers[starts], return_index=True, return_inverse=True)
+    lengths = np.diff(starts, append=len(numbers))
+    return np.repeat(place, lengths), starts[each]
+
+
+@kernel
+def _mark(row: IntArray, track: IntArray, valid: BoolArray) -> None:
+    """Mark in `valid` (R, N) which tracks have a box in which row; other rows are left out."""
+    for box in range(len(row)):
+        if 0 <= row[box] < len(valid):
+            valid[row[box], track[box]] = True
+
+
+@kernel
+def _scatter(
+    numbers: tuple[FloatArray, ...],
+    row: IntArray,
+    track: IntArray,
+    place: IntArray,
+    poses: FloatArray,
+    velocities: FloatArray,
+    sizes: FloatArray,
+) -> None:
+    """Spread `schema.BOX` of rows of a table over dense arrays (R, N, ...).
+
+    `place` is the column of each track, -1 where it is left out; so are other rows.
+    """
+    x, y, heading, vx, vy, length, width = numbers
+    for box in range(len(row)):
+        t, n = row[box], place[track[box]]
+        if n >= 0 and 0 <= t < len(poses):
+            poses[t, n, 0], poses[t, n, 1], poses[t, n, 2] = x[box], y[box], heading[box]
+            velocities[t, n, 0], velocities[t, n, 1] = vx[box], vy[box]
+            sizes[t, n, 0], sizes[t, n, 1] = length[box], width[box]
+
+
+def _rows(table: Table, first: int, last: int, plausible: bool) -> pa.Table:
+    """The rows first … last - 1 of a recording, of a table that has one row for each.
+
+    Raises:
+        DataError: It is damaged or does not have them.
+    """
+    found = table.read(table.blocks(first, last), plausible=plausible)
+    row = column(found, "row")
+    start = int(np.searchsorted(row, first))
+    rows = row[start : start + last - first]
+    if not first < last or not np.array_equal(rows, np.arange(first, last)):
+        raise DataError(f"{table.path}: no rows {first} … {last - 1}", hint=REPAIR)
+    return found.slice(start, last - first)
+
+
+def open_ego(folder: Path, name: str) -> Table:
+    """Open the file of an ego's states."""
+    return Table(ego_file(folder, name), schema.EGO)
+
+
+def ego_span(table: Table) -> tuple[int, int]:
+    """Row of the recording of an ego's first state, and one past that of its last.
+
+    Raises:
+        DataError: The file is damaged.
+    """
+    rows = column(table.read(columns=["row"]), "row")
+    if not len(rows):
+        raise DataError(f"{table.path}: there are no states", hint=REPAIR)
+    return int(rows[0]), int(rows[-1]) + 1
+
+
+def ego_states(table: Table, first: int, last: int, *, plausible: bool = True) -> FloatArray:
+    """(R, 11) states of an ego over the rows first … last - 1 of the recording.
+
+    Raises:
+        DataError: The file is damaged or does not have the rows.
+    """
+    found = _rows(table, first, last, plausible)
+    return np.column_stack([column(found, name) for name in schema.EGO_COLUMNS])

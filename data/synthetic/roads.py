@@ -1,0 +1,294 @@
+"""Roads of generated towns: reference lines from a few pieces, written as OpenDRIVE.
+
+A road is a start pose and a list of pieces (line, arc, clothoid, cubic); what the traffic drives on
+is sampled from the same pieces that go into the file.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from shiftsim.kernels import FloatArray
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One geometry record: a clothoid from `start` to `end` curvature, or a cubic."""
+
+    length: float  # [m]
+    start: float = 0.0  # curvature at the start [1/m]
+    end: float = 0.0  # curvature at the end [1/m]
+    cubic: tuple[float, ...] = ()  # (8,) aU bU cU dU aV bV cV dV over p in [0, 1], or empty
+
+    def xml(self) -> str:
+        """The shape element."""
+        if self.cubic:
+            names = ("aU", "bU", "cU", "dU", "aV", "bV", "cV", "dV")
+            values = " ".join(f'{n}="{v!r}"' for n, v in zip(names, self.cubic, strict=True))
+            return f'<paramPoly3 pRange="normalized" {values}/>'
+        if self.start == self.end == 0.0:
+            return "<line/>"
+        if self.start == self.end:
+            return f'<arc curvature="{self.start!r}"/>'
+        return f'<spiral curvStart="{self.start!r}" curvEnd="{self.end!r}"/>'
+
+
+@dataclass(frozen=True)
+class LaneSpec:
+    """One lane of a road: type, width at both ends [m], lanes before and after."""
+
+    id: int
+    type: str
+    width: float
+    end_width: float
+    predecessor: int | None = None
+    successor: int | None = None
+
+
+@dataclass(frozen=True)
+class CrosswalkSpec:
+    """A crosswalk across a road from `first` to `last` along s, `half` to both sides [m]."""
+
+    name: str
+    first: float
+    last: float
+    half: float
+
+
+@dataclass(frozen=True)
+class RoadSpec:
+    """One road."""
+
+    id: int  # road id
+    start: tuple[float, float, float]  # x [m], y [m], heading [rad]
+    pieces: tuple[Piece, ...]  # geometry
+    lanes: tuple[LaneSpec, ...]  # all lanes except the centre one
+    limit_kmh: float  # speed limit [km/h]
+    junction: int = -1  # junction id, -1 for none
+    predecessor: tuple[str, int, str] | None = None  # element type and id, contact point
+    successor: tuple[str, int, str] | None = None  # likewise
+    crosswalks: tuple[CrosswalkSpec, ...] = ()  # on this road
+    stop_sign: float | None = None  # s of a stop sign for traffic against s; None for none [m]
+    # s of traffic lights, and the direction that they are for, + along s, - against it
+    lights: tuple[tuple[float, str], ...] = ()
+
+    @property
+    def length(self) -> float:
+        """Length of the reference line [m]."""
+        return sum(piece.length for piece in self.pieces)
+
+    def at(self, s: FloatArray, t: FloatArray | float = 0.0) -> FloatArray:
+        """(n, 3) x [m], y [m], heading [rad] at road coordinates (s, t)."""
+        out = np.empty((len(s), 3))
+        begin, pose = 0.0, self.start
+        last = len(self.pieces) - 1
+        for number, piece in enumerate(self.pieces):
+            end = begin + piece.length
+            inside = (s >= begin) & ((s < end) | (number == last))
+            out[inside] = _along(piece, pose, np.minimum(s[inside] - begin, piece.length))
+            pose = tuple(_along(piece, pose, np.array([piece.length]))[0].tolist())
+            begin = end
+        out[:, 0] -= t * np.sin(out[:, 2])
+        out[:, 1] += t * np.cos(out[:, 2])
+        return out
+
+    def center_of(self, lane: int, s: FloatArray) -> FloatArray:
+        """(n, 3) centre of a lane at s; the heading is that of the road."""
+        share = s / self.length
+
+        inner, own = np.zeros(len(s)), np.zeros(len(s))
+        for spec in self.lanes:
+            width = spec.width + share * (spec.end_width - spec.width)
+            if spec.id * lane > 0 and abs(spec.id) < abs(lane):
+                inner = inner + width
+            own = width if spec.id == lane else own
+        return self.at(s, np.sign(lane) * (inner + 0.5 * own))
+
+
+@dataclass
+class RoadNetwork:
+    """All roads of a town, in the order of the file."""
+
+    name: str
+    roads: dict[int, RoadSpec] = field(default_factory=dict)
+    # connections of junctions: incoming road, connecting road, lane of the incoming road
+    links: list[tuple[int, int, int]] = field(default_factory=list)
+
+    def xml(self) -> str:
+        """The OpenDRIVE file."""
+        parts = [
+            '<?xml version="1.0" encoding="UTF-8"?>\n<OpenDRIVE>',
+            f'<header revMajor="1" revMinor="7" name="{self.name}" version="1"/>',
+            *(_road_xml(road) for road in self.roads.values()),
+        ]
+        for junction in sorted({self.roads[road].junction for _, road, _ in self.links}):
+            parts.append(f'<junction id="{junction}" name="{self.name}{junction}">')
+            inside = (link for link in self.links if self.roads[link[1]].junction == junction)
+            for number, (incoming, connecting, lane) in enumerate(inside):
+                parts.append(
+                    f'<connection id="{number}" incomingRoad="{incoming}" '
+                    f'connectingRoad="{connecting}" contactPoint="start">'
+                    f'<laneLink from="{lane}" to="-1"/></connection>'
+                )
+            parts.append("</junction>")
+        return "\n".join([*parts, "</OpenDRIVE>", ""])
+
+
+def connect(start: Sequence[float], end: Sequence[float], *, ease: bool) -> tuple[Piece, ...]:
+    """Pieces from one pose to another: a line, a turn, or a cubic where neither fits.
+
+    A turn is clothoid-arc-clothoid with `ease`, else line-arc-line.
+    """
+    dx, dy = end[0] - start[0], end[1] - start[1]
+    cos, sin = np.cos(start[2]), np.sin(start[2])
+    u, v = dx * cos + dy * sin, dy * cos - dx * sin
+    turn = float((end[2] - start[2] + np.pi) % (2 * np.pi) - np.pi)
+    if abs(turn) < 1e-9 and abs(v) < 1e-9:
+        return (Piece(float(u)),)
+    if abs(turn) < 0.5:
+        return (_cubic(float(u), float(v), turn),)
+    after = v / np.sin(turn)  # from the corner of the two tangents to the end
+    before = u - after * np.cos(turn)
+    tangent = float(min(before, after))
+    shape = _turn(turn, tangent, ease)
+    head, tail = float(before) - tangent, float(after) - tangent
+    return tuple(piece for piece in (Piece(head), *shape, Piece(tail)) if piece.length > 1e-6)
+
+
+def _turn(turn: float, tangent: float, ease: bool) -> list[Piece]:
+    if not ease:
+        radius = tangent / np.tan(abs(turn) / 2)
+        curvature = float(np.sign(turn) / radius)
+        return [Piece(float(radius * abs(turn)), curvature, curvature)]
+    unit = [Piece(1.0, 0.0, turn / 2), Piece(1.0, turn / 2, turn / 2), Piece(1.0, turn / 2, 0.0)]
+    pose = (0.0, 0.0, 0.0)
+    for piece in unit:
+        pose = tuple(_along(piece, pose, np.array([piece.length]))[0].tolist())
+    scale = float(tangent * 2 * np.cos(turn / 2) / np.hypot(pose[0], pose[1]))
+    return [Piece(p.length * scale, p.start / scale, p.end / scale) for p in unit]
+
+
+def _cubic(u: float, v: float, turn: float) -> Piece:
+    """A Hermite cubic from the origin along u to (u, v), turned by `turn`."""
+    reach = float(np.hypot(u, v))
+    end_u, end_v = reach * np.cos(turn), reach * np.sin(turn)
+    along = (0.0, reach, float(3 * u - 2 * reach - end_u), float(reach + end_u - 2 * u))
+    aside = (0.0, 0.0, float(3 * v - end_v), float(end_v - 2 * v))
+    return Piece(float(_cubic_arc(along + aside)[1][-1]), cubic=along + aside)
+
+
+def _cubic_arc(c: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
+    """Parameters, and the arc length up to each."""
+    p = np.linspace(0.0, 1.0, 401)
+    step = p[1] * 0.5 * (_NODES + 1.0)
+    at = p[:-1, None] + step
+    rate = np.hypot(
+        c[1] + 2 * c[2] * at + 3 * c[3] * at**2, c[5] + 2 * c[6] * at + 3 * c[7] * at**2
+    )
+    return p, np.r_[0.0, np.cumsum(rate @ _WEIGHTS * 0.5 * p[1])]
+
+
+def _along(piece: Piece, pose: Sequence[float], d: FloatArray) -> FloatArray:
+    """(n, 3) poses at distances d along a piece that starts at `pose`."""
+    if piece.cubic:
+        p_grid, arc_grid = _cubic_arc(piece.cubic)
+        p = np.interp(d, arc_grid, p_grid)
+        c = piece.cubic
+        u = c[0] + p * (c[1] + p * (c[2] + p * c[3]))
+        v = c[4] + p * (c[5] + p * (c[6] + p * c[7]))
+        turn = np.arctan2(
+            c[5] + p * (2 * c[6] + 3 * p * c[7]), c[1] + p * (2 * c[2] + 3 * p * c[3])
+        )
+    else:
+        change = (piece.end - piece.start) / piece.length
+        at = d[:, None] * 0.5 * (_NODES + 1.0)
+        angle = piece.start * at + 0.5 * change * at**2
+        u = (np.cos(angle) @ _WEIGHTS) * 0.5 * d
+        v = (np.sin(angle) @ _WEIGHTS) * 0.5 * d
+        turn = piece.start * d + 0.5 * change * d**2
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    return np.column_stack(
+        [pose[0] + u * cos - v * sin, pose[1] + u * sin + v * cos, pose[2] + turn]
+    )
+
+
+def _road_xml(road: RoadSpec) -> str:
+    geometry = []
+    begin, pose = 0.0, road.start
+    for piece in road.pieces:
+        x, y, heading = pose
+        geometry.append(
+            f'<geometry s="{begin!r}" x="{x!r}" y="{y!r}" hdg="{heading!r}" '
+            f'length="{piece.length!r}">{piece.xml()}</geometry>'
+        )
+        pose = tuple(_along(piece, pose, np.array([piece.length]))[0].tolist())
+        begin += piece.length
+    ends = "".join(
+        f'<{name} elementType="{end[0]}" elementId="{end[1]}"'
+        + (f' contactPoint="{end[2]}"/>' if end[2] else "/>")
+        for name, end in (("predecessor", road.predecessor), ("successor", road.successor))
+        if end
+    )
+    lanes = sorted(road.lanes, key=lambda lane: -lane.id)
+    left = "".join(_lane_xml(lane, road) for lane in lanes if lane.id > 0)
+    right = "".join(_lane_xml(lane, road) for lane in lanes if lane.id < 0)
+    return (
+        f'<road id="{road.id}" length="{road.length!r}" junction="{road.junction}" rule="RHT">'
+        f"<link>{ends}</link>"
+        f'<type s="0" type="town"><speed max="{road.limit_kmh:g}" unit="km/h"/></type>'
+        f"<planView>{''.join(geometry)}</planView>"
+        f'<lanes><laneSection s="0">'
+        + (f"<left>{left}</left>" if left else "")
+        + '<center><lane id="0" type="none" level="false"/></center>'
+        + (f"<right>{right}</right>" if right else "")
+        + f"</laneSection></lanes>{_objects_xml(road)}{_signals_xml(road)}</road>"
+    )
+
+
+def _lane_xml(lane: LaneSpec, road: RoadSpec) -> str:
+    links = "".join(
+        f'<{name} id="{target}"/>'
+        for name, target in (("predecessor", lane.predecessor), ("successor", lane.successor))
+        if target is not None
+    )
+    slope = (lane.end_width - lane.width) / road.length
+    return (
+        f'<lane id="{lane.id}" type="{lane.type}" level="false"><link>{links}</link>'
+        f'<width sOffset="0" a="{lane.width!r}" b="{slope!r}" c="0" d="0"/></lane>'
+    )
+
+
+def _objects_xml(road: RoadSpec) -> str:
+    objects = []
+    for walk in road.crosswalks:
+        half = 0.5 * (walk.last - walk.first)
+        corners = "".join(
+            f'<cornerLocal u="{u * half!r}" v="{v * walk.half!r}" z="0" height="0"/>'
+            for u, v in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+        )
+        objects.append(
+            f'<object id="{walk.name}" type="crosswalk" name="{walk.name}" '
+            f's="{0.5 * (walk.first + walk.last)!r}" t="0" zOffset="0" hdg="0" '
+            f'orientation="none" length="{2 * half!r}" width="{2 * walk.half!r}">'
+            f"<outline>{corners}</outline></object>"
+        )
+    return f"<objects>{''.join(objects)}</objects>" if objects else ""
+
+
+def _signals_xml(road: RoadSpec) -> str:
+    signals = []
+    if road.stop_sign is not None:
+        signals.append(
+            f'<signal id="{road.id}1" s="{road.stop_sign!r}" t="5" name="stop" dynamic="no" '
+            'orientation="-" zOffset="2" country="DE" type="206" subtype="-1" value="-1"/>'
+        )
+    for number, (s, orientation) in enumerate(road.lights, start=2):
+        signals.append(
+            f'<signal id="{road.id}{number}" s="{s!r}" t="5" name="light" dynamic="yes" '
+            f'orientation="{orientation}" zOffset="4" country="OpenDRIVE" type="1000001" '
+            'subtype="-1" value="-1"/>'
+        )
+    return f"<signals>{''.join(signals)}</signals>" if signals else ""

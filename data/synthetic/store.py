@@ -1,0 +1,150 @@
+"""Stores of synthetic towns: the demo, and as many random towns to train in as wanted."""
+
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shiftsim.data.store.reading import ScenarioStore, read_report
+from shiftsim.data.store.tables import MANIFEST
+from shiftsim.data.store.writing import StoreWriter, window_row
+from shiftsim.data.synthetic.layouts import KINDS
+from shiftsim.data.synthetic.recordings import (
+    TownSpec,
+    generate_town,
+    make_town,
+    usable,
+    write_recordings,
+)
+from shiftsim.errors import ConfigError, DataError
+
+DEMO_SPLIT = "demo-mini"
+_SPLIT_SIZE = 16
+_SPLIT_PATH = 40.0  # m, shortest way of the ego in a scenario of the split
+# names of the towns of the demo, and their kinds: those with traffic lights are `lights`
+_DEMO = {
+    "avenue": "avenue",
+    "junction": "lights",
+    "parking": "parking",
+    "roundabout": "roundabout",
+    "shared": "shared",
+    "street": "street",
+}
+DEMO_TOWNS = tuple(
+    TownSpec(name, kind, number, num_recordings=2, overlap_s=0.0, min_scenarios=6)
+    for number, (name, kind) in enumerate(_DEMO.items(), start=1)
+)
+
+
+def demo_store(path: Path) -> Path:
+    """The store of the demo at `path`, which is returned; made anew unless it is there."""
+    if (path / MANIFEST).is_file():
+        return path
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as scratch:
+        parts, store = Path(scratch) / "parts", Path(scratch) / "store"
+        for town in DEMO_TOWNS:
+            make_town(parts, town)
+        _join(parts, DEMO_TOWNS, store, {"name": "demo"})
+        tokens = _sample(ScenarioStore(store))
+        (store / "splits").mkdir(exist_ok=True)
+        listed = "".join(f'    "{token}",\n' for token in tokens)
+        text = f'name = "{DEMO_SPLIT}"\ntokens = [\n{listed}]\n'
+        (store / f"splits/{DEMO_SPLIT}.toml").write_text(text, encoding="utf-8")
+        store.rename(path)
+    return path
+
+
+def write_demo(folder: Path, only: str = "") -> None:
+    """Write the recordings of the demo, one DSC3D folder per town: all, or the one named."""
+    for town in DEMO_TOWNS:
+        if only in ("", town.name):
+            write_recordings(folder / town.name, town, *generate_town(town))
+
+
+def town_specs(towns: int, seed: int) -> list[TownSpec]:
+    """The random towns of a seed, of every kind in turn."""
+    kinds = list(KINDS)
+    return [
+        TownSpec(f"town-{seed}-{number:03d}", kinds[(number - 1) % len(kinds)], number)
+        for number in range(1, towns + 1)
+    ]
+
+
+def write_towns(
+    path: Path,
+    *,
+    towns: int,
+    seed: int,
+    spread: Callable[[Any, Sequence[TownSpec]], Iterable[Any]],
+    progress: Callable[[int, int, str], None] = lambda done, total, name: None,
+) -> ScenarioStore:
+    """A store of random towns, the same bytes for the same number and seed.
+
+    Args:
+        path: Its folder, which must not exist, or hold that store already.
+        towns: How many towns; a store of more holds those of fewer.
+        seed: Of everything that is random.
+        spread: How towns are spread over processes.
+        progress: Called with towns done, towns in all and the name of the last one.
+
+    Raises:
+        ConfigError: The folder holds something else.
+        DataError: A process died.
+    """
+    provenance = {"name": "towns", "seed": seed, "towns": towns}
+    if path.exists():
+        if (path / MANIFEST).is_file() and (found := ScenarioStore(path)).generator == provenance:
+            return found
+        raise ConfigError(
+            f"{str(path)!r} holds something else", hint="name a new folder with --out"
+        )
+    specs = town_specs(towns, seed)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    progress(0, towns, "")
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as scratch:
+        parts, store = Path(scratch).resolve() / "parts", Path(scratch) / "store"
+        parts.mkdir()
+        outcomes = spread(partial(partial, make_town, parts), specs)
+        for done, outcome in enumerate(outcomes, start=1):
+            if outcome.death:
+                raise DataError(f"town {outcome.task.name!r}: {outcome.death}", hint="start again")
+            progress(done, towns, outcome.task.name)
+        _join(parts, specs, store, provenance)
+        store.rename(path)
+    return ScenarioStore(path)
+
+
+def _join(parts: Path, towns: Sequence[TownSpec], path: Path, provenance: dict[str, Any]) -> None:
+    """Move the stores of single towns into one of all."""
+    with StoreWriter(path, provenance) as writer:
+        for town in towns:
+            part = parts / town.name
+            store = ScenarioStore(part)
+            writer.add_map(store.map(town.name))
+            rows: dict[str, list[dict[str, Any]]] = {}
+            for window in usable(store):
+                rows.setdefault(window.log_name, []).append(window_row(window, town.name))
+            for recording, windows in sorted(rows.items()):
+                writer.take_recording(store.recording_folder(recording), recording, windows)
+            writer.add_report(town.name, read_report(part, town.name))
+            shutil.rmtree(part)
+
+
+def _sample(store: ScenarioStore) -> list[str]:
+    """Tokens of some scenarios in which the ego gets on, from every town in turn."""
+    by_city: dict[str, list[str]] = {city: [] for city in store.cities}
+    for scene in store:
+        rows = scene.iteration_rows
+        steps = np.diff(scene.ego[rows[0] : rows[-1] + 1, :2], axis=0)
+        if np.hypot(*steps.T).sum() >= _SPLIT_PATH:
+            by_city[scene.city].append(scene.token)
+    turns = max(map(len, by_city.values()))
+    mixed = [
+        tokens[turn] for turn in range(turns) for tokens in by_city.values() if turn < len(tokens)
+    ]
+    return sorted(mixed[:_SPLIT_SIZE])

@@ -1,0 +1,392 @@
+"""What may be edited of a recorded scenario, as plain data: one frozen dataclass per table.
+
+The fields of a dataclass are the keys of its table in `edits.toml`, so that the file, the Python
+calls and the checks cannot differ. `docs/edits.md` explains every key.
+"""
+
+import hashlib
+import json
+import math
+import types
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass
+from functools import cached_property
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+from shiftsim.errors import ConfigError, nearest, one_of
+from shiftsim.world.state import AgentKind, LightStatus
+
+KINDS = tuple(kind.name.lower() for kind in AgentKind)
+STATUSES = ("green", "yellow", "red", "unknown")
+BEHAVIORS = ("idm", "stopped", "cautious")  # of a spawned vehicle
+MANNERS = ("assertive", "cautious", "mixed", "default")  # of all agents, towards the ego
+LEVELS = {"low": (10.0, 100.0), "medium": (10.0, 50.0), "high": (10.0, 33.0)}  # m between vehicles
+COMMANDS = ("left", "right", "straight")
+PROFILES = ("shiftsim", "interplan")
+_CHOICES: dict[str, Sequence[str]] = {
+    "kind": KINDS,
+    "kinds": KINDS,
+    "status": STATUSES,
+    "behavior": BEHAVIORS,
+    "agents": MANNERS,
+    "level": tuple(LEVELS),
+    "command": COMMANDS,
+}
+_FREE_SIGN = ("ahead_m", "left_m", "turn", "pose", "near", "goal", "also_at", "from_s")
+_MAX_NAME = 60  # characters
+
+
+@dataclass(frozen=True, slots=True)
+class At:
+    """A place beside the recorded path of the ego, counted from where it is at the start."""
+
+    ahead_m: float = 0.0  # along the path from the ego's centre, negative behind [m]
+    left_m: float = 0.0  # to the left of the path [m]
+    turn: float = 0.0  # heading against that of the path [rad]
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where something is: beside the recorded path (`at`) or in the frame of the map (`pose`)."""
+
+    at: At | None = None
+    pose: tuple[float, float, float] | None = None  # x [m], y [m], heading [rad]
+
+
+@dataclass(frozen=True, slots=True)
+class Remove:
+    """Tracks that are taken away; all conditions must hold."""
+
+    kinds: tuple[str, ...] = ()  # only these kinds; all where empty
+    tokens: tuple[str, ...] = ()  # only these tracks; all where empty
+    share: float = 1.0  # this share of them, drawn with the seed of the edit
+    near: tuple[float, float, float] | None = None  # x [m], y [m], radius [m] at the start
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """Tracks whose whole motion is shifted."""
+
+    tokens: tuple[str, ...]  # which tracks
+    ahead_m: float = 0.0  # along their own heading [m]
+    left_m: float = 0.0  # to the left of it [m]
+
+
+@dataclass(frozen=True, slots=True)
+class Slow:
+    """Tracks that go on more slowly on their recorded paths."""
+
+    factor: float  # of the recorded speed, 0 … 1
+    kinds: tuple[str, ...] = ()  # only these kinds; all that move where empty
+    tokens: tuple[str, ...] = ()  # only these tracks
+    from_s: float = 0.0  # from this time on [s]
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """Tracks that brake and stand from then on."""
+
+    tokens: tuple[str, ...]  # which tracks
+    from_s: float = 0.0  # when they begin to brake [s]
+    decel_mps2: float = 3.0  # how hard [m/s^2]
+
+
+@dataclass(frozen=True, slots=True)
+class Density:
+    """Vehicles in the lanes around the ego, and other places, at random distances."""
+
+    level: str = ""  # low, medium or high; empty where `gap_m` is given
+    gap_m: tuple[float, float] | None = None  # least and largest distance of two fronts [m]
+    also_at: tuple[tuple[float, float], ...] = ()  # lanes of the roadblocks at these points, too
+    reach_m: float = 50.0  # how far beyond the ego the lanes are filled [m]
+
+
+@dataclass(frozen=True, slots=True)
+class Spawn:
+    """One more track."""
+
+    kind: str = "vehicle"
+    at: At | None = None
+    pose: tuple[float, float, float] | None = None
+    size_m: tuple[float, float] | None = None  # length, width [m]
+    speed_mps: float = 0.0
+    behavior: str = "idm"  # idm, cautious or stopped; what is no vehicle always stands
+
+
+@dataclass(frozen=True, slots=True)
+class Walk:
+    """A pedestrian that crosses."""
+
+    start: Place
+    end: Place
+    start_s: float | None = None  # when it sets off [s]; without, when the ego is near
+    ego_within_m: float = 50.0  # distance of the ego's centre that sets it off [m]
+    speed_mps: float = 1.4
+    visible: bool = True  # whether it can be seen before it sets off
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """A lane closed by a row of cones."""
+
+    at: At | None = None
+    pose: tuple[float, float, float] | None = None
+    length_m: float = 10.0
+    spacing_m: float = 2.0
+    kind: str = "traffic_cone"
+    width_m: float = 3.0  # of what is closed, by a slanted row over `taper_m` [m]
+    taper_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Reroute:
+    """Another route: a command at every junction, a goal, or the roadblocks themselves."""
+
+    command: str = ""
+    goal: tuple[float, float] | None = None  # x [m], y [m]
+    route: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """Traffic lights that show something else for a while."""
+
+    status: str
+    connectors: tuple[str, ...] = ()
+    route: bool = False  # all connectors on the route
+    from_s: float = 0.0
+    to_s: float | None = None  # to the end where absent
+
+
+@dataclass(frozen=True, slots=True)
+class Speed:
+    """Speeds of everything."""
+
+    tracks: float = 1.0  # factor on the motion in time of recorded vehicles
+    limit: float = 1.0  # factor on the speed limits of the map
+    ego_mps: float | None = None  # the ego's at the start
+
+
+@dataclass(frozen=True)
+class Edit:
+    """Everything that makes one new scenario of each recorded one that it is for."""
+
+    name: str  # ends the id of the new scenario
+    tokens: tuple[str, ...] = ()  # recorded scenarios, or unambiguous beginnings
+    split: str = ""  # those of a split
+    types: tuple[str, ...] = ()  # those of these types
+    type: str = ""  # type of the new scenario; kept where empty
+    window_s: float | None = None  # its duration [s]; kept where absent
+    seed: int | None = None  # of what is drawn; made from the id where absent
+    agents: str = ""  # how reactive agents treat the ego; as nuPlan's do where empty
+    end_at_goal: bool | None = None  # whether a rollout ends there; true with a reroute
+    code: str = ""  # of interPlan, instead of all tables; needs `profile = "interplan"`
+    details: Mapping[str, Any] = field(default_factory=dict)  # interPlan's, of the token
+    remove: tuple[Remove, ...] = ()
+    move: tuple[Move, ...] = ()
+    reroute: Reroute | None = None
+    density: Density | None = None
+    spawn: tuple[Spawn, ...] = ()
+    block_lane: tuple[Block, ...] = ()
+    walk: tuple[Walk, ...] = ()
+    slow: tuple[Slow, ...] = ()
+    stop: tuple[Stop, ...] = ()
+    light: tuple[Light, ...] = ()
+    speed: Speed | None = None
+
+    @cached_property
+    def digest(self) -> str:
+        """What the new scenario depends on, beside the recorded one."""
+        return digest_of(asdict(self))
+
+    @property
+    def ends_at_goal(self) -> bool:
+        """Whether a rollout ends where the goal is reached."""
+        return self.reroute is not None if self.end_at_goal is None else self.end_at_goal
+
+    @cached_property
+    def words(self) -> tuple[str, ...]:
+        """What is edited, one line each."""
+        if self.code:
+            return (f"interPlan code {self.code}",)
+        out = []
+        for item in fields(self)[11:]:
+            value = getattr(self, item.name)
+            for table in value if isinstance(value, tuple) else filter(None, [value]):
+                out.append(f"{item.name.replace('_', ' ')}: {_words(table)}")
+        if self.window_s is not None:
+            out.append(f"window: {self.window_s:g} s")
+        return tuple(out)
+
+
+def edited_id(token: str, edit: Edit) -> str:
+    """Id of the scenario that an edit makes of a recorded one; never parsed back."""
+    return f"{token}-{edit.name}"
+
+
+def digest_of(content: Any) -> str:
+    """Digest of JSON values; the order of keys does not matter."""
+    text = json.dumps(content, sort_keys=True, default=str)
+    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+
+
+def _words(table: Any) -> str:
+    parts = []
+    for item in fields(table):
+        value = getattr(table, item.name)
+        plain = None if item.default is MISSING else item.default
+        if value != plain:
+            if is_dataclass(value):
+                parts.append(f"{item.name} ({_words(value)})")
+            else:
+                parts.append(f"{item.name} {_plain(value)}")
+    return ", ".join(parts) or "everything"
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, (tuple, list)):
+        return " ".join(map(_plain, value))
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def make_edit(table: Mapping[str, Any], where: str) -> Edit:
+    """An edit from its table; `where` is for messages.
+
+    Raises:
+        ConfigError: A key is unknown or missing, or a value is wrong.
+    """
+    edit: Edit = _make(Edit, _renamed(table), where)
+    where = f"{where} {edit.name!r}"
+    good = edit.name and len(edit.name) <= _MAX_NAME and edit.name.replace("_", "").isalnum()
+    if not good or not edit.name.isascii():
+        raise ConfigError(
+            f"{where}: name is not of up to {_MAX_NAME} letters, digits and underscores",
+            hint='for example name = "closed_lane"',
+        )
+    edits = [item.name for item in fields(edit)[11:] if getattr(edit, item.name)]
+    if edit.code and edits:
+        raise ConfigError(
+            f"{where}: code and {edits[0]} exclude each other", hint="write an edit for each"
+        )
+    if not edit.code and not edits and edit.window_s is None:
+        raise ConfigError(f"{where}: nothing is edited", hint="add a table, such as spawn")
+    for name in ("spawn", "block_lane"):
+        for item in getattr(edit, name):
+            _one_place(item, f"{where}, {name}")
+    for walk in edit.walk:
+        _one_place(walk.start, f"{where}, walk from")
+        _one_place(walk.end, f"{where}, walk to")
+    if edit.density and bool(edit.density.level) == bool(edit.density.gap_m):
+        raise ConfigError(f"{where}, density: give either level or gap_m")
+    if (
+        edit.density
+        and edit.density.gap_m
+        and not 1 <= edit.density.gap_m[0] < edit.density.gap_m[1]
+    ):
+        raise ConfigError(f"{where}, density: gap_m is not [least, largest], from 1 m on")
+    route = edit.reroute
+    if route and sum(map(bool, (route.command, route.goal, route.route))) != 1:
+        raise ConfigError(f"{where}, reroute: give one of command, goal and route")
+    if edit.split and edit.tokens:
+        raise ConfigError(f"{where}: give either tokens or a split")
+    for light in edit.light:
+        if bool(light.connectors) == light.route:
+            raise ConfigError(f"{where}, light: give either connectors or route = true")
+    for name in ("slow", "stop"):
+        for item in getattr(edit, name):
+            if not item.tokens and not getattr(item, "kinds", ()):
+                raise ConfigError(f"{where}, {name}: say which tracks, by tokens or kinds")
+    if any(not slow.factor <= 1.0 for slow in edit.slow):
+        raise ConfigError(f"{where}, slow: factor is above 1", hint="a recording cannot be sped up")
+    if any(not remove.share <= 1.0 for remove in edit.remove):
+        raise ConfigError(f"{where}, remove: share is above 1")
+    return edit
+
+
+def _one_place(item: Any, where: str) -> None:
+    if (item.at is None) == (item.pose is None):
+        raise ConfigError(
+            f"{where}: give either pose or a place by the recorded path",
+            hint="pose = [x, y, heading], or at = {ahead_m = 30, left_m = -2}",
+        )
+
+
+def _renamed(table: Mapping[str, Any]) -> dict[str, Any]:
+    """`from` and `to` are no names in Python; places of a walk may be written without `at`."""
+    out = dict(table)
+    listed = out.get("walk")
+    if isinstance(listed, Mapping):
+        listed = [listed]
+    if isinstance(listed, (list, tuple)):
+        names = {"from": "start", "to": "end"}
+        walks = []
+        for walk in listed:
+            items = walk.items() if isinstance(walk, Mapping) else ()
+            named = {names.get(name, name): value for name, value in items}
+            for name in ("start", "end"):
+                place = named.get(name)
+                if isinstance(place, Mapping) and not {"at", "pose"} & set(place):
+                    named[name] = {"at": place}
+            walks.append(named if isinstance(walk, Mapping) else walk)
+        out["walk"] = walks
+    return out
+
+
+def _make(cls: Any, table: Any, where: str) -> Any:
+    if not isinstance(table, Mapping):
+        raise ConfigError(f"{where}: {table!r} is not a table")
+    known = {item.name: item for item in fields(cls)}
+    for name in table:
+        if name not in known:
+            near = nearest(str(name), list(known))
+            hint = f"did you mean {near!r}? " if near else ""
+            raise ConfigError(
+                f"{where}: key {name!r} unknown", hint=f"{hint}available: {', '.join(known)}"
+            )
+    hints = get_type_hints(cls)
+    values = {}
+    for name, item in known.items():
+        if name in table:
+            values[name] = _value(hints[name], table[name], name, where)
+        elif item.default is MISSING and item.default_factory is MISSING:
+            raise ConfigError(f"{where}: {name} is missing")
+    return cls(**values)
+
+
+def _value(kind: Any, value: Any, name: str, where: str) -> Any:
+    if get_origin(kind) in (Union, types.UnionType):
+        if value is None:
+            return None
+        kind = next(choice for choice in get_args(kind) if choice is not types.NoneType)
+    if is_dataclass(kind):
+        return value if type(value) is kind else _make(kind, value, f"{where}, {name}")
+    if get_origin(kind) is tuple:
+        return _sequence(get_args(kind), value, name, where)
+    if get_origin(kind) is not None:  # a mapping
+        return dict(value)
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+        raise ConfigError(f"{where}: {name} {value!r} is not {_KIND_WORDS[kind]}")
+    if isinstance(value, float):
+        if not math.isfinite(value) or (value < 0.0 and name not in _FREE_SIGN):
+            raise ConfigError(f"{where}: {name} {value!r} is not a number that it can be")
+    if isinstance(value, str) and value and name in _CHOICES:
+        one_of(f"{where}: {name}", value, _CHOICES[name])
+    return value
+
+
+def _sequence(kinds: tuple[Any, ...], value: Any, name: str, where: str) -> tuple[Any, ...]:
+    if isinstance(value, Mapping) or is_dataclass(value):
+        value = [value]  # one table stands for a list of one
+    if not isinstance(value, (list, tuple)):
+        raise ConfigError(f"{where}: {name} {value!r} is not a list")
+    if kinds[-1] is not Ellipsis and len(value) != len(kinds):
+        raise ConfigError(f"{where}: {name} has {len(value)} values, not {len(kinds)}")
+    each = [kinds[0]] * len(value) if kinds[-1] is Ellipsis else kinds
+    return tuple(_value(kind, item, name, where) for kind, item in zip(each, value, strict=True))
+
+
+_KIND_WORDS = {float: "a number", int: "an integer", str: "a text", bool: "true or false"}
+LIGHT_CODES = {name: LightStatus[name.upper()] for name in STATUSES}
+KIND_CODES = {name: AgentKind[name.upper()] for name in KINDS}

@@ -1,0 +1,284 @@
+"""Edits of scenarios in a file, which scenarios of a store they are for, and the store they make.
+
+The store keeps its bytes: an edited scenario is made when it is read. A run keeps the edits in its
+manifest, so that its folder alone says how to make its scenarios again.
+"""
+
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from shiftsim.data.store.reading import ScenarioStore
+from shiftsim.edits.apply import apply_edit
+from shiftsim.edits.spec import PROFILES, Edit, digest_of, edited_id, make_edit
+from shiftsim.errors import ConfigError, DataError, beginning, nearest
+from shiftsim.files import read_toml
+from shiftsim.metrics.interplan import driven_lanes
+from shiftsim.world.scenario import Scenario
+
+FOLDER = "edits"  # below that of a store
+_FORMAT = 1
+_TOP = ("format", "name", "profile", "edit")
+_KEPT = (*_TOP, "made")  # as a manifest holds them
+
+
+@dataclass(frozen=True, slots=True)
+class EditSet:
+    """The edits of a file."""
+
+    name: str  # as in tables and folder names
+    profile: str  # `shiftsim`, or `interplan` for edits that are codes
+    edits: tuple[Edit, ...]  # in the order of the file
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `make_edits` makes them of again, as JSON values."""
+        tables = [{k: v for k, v in asdict(edit).items() if v or v == 0.0} for edit in self.edits]
+        return {"name": self.name, "profile": self.profile, "edit": tables}
+
+    def words_of(self, token: str, edited: Mapping[str, Any]) -> list[str]:
+        """What is edited in a scenario, in words; `edited` is what `describe` gave for the run."""
+        found = edited.get(token, {})
+        return [
+            f"edit {edit.name} of {found['base']}: {line}"
+            for edit in self.edits
+            if edit.digest == found.get("digest")
+            for line in edit.words
+        ]
+
+    def with_splits(self, find: Callable[[str], Sequence[str]]) -> "EditSet":
+        """The same edits, splits replaced by the scenarios that they list."""
+        edits = (
+            replace(edit, split="", tokens=tuple(find(edit.split))) if edit.split else edit
+            for edit in self.edits
+        )
+        return replace(self, edits=tuple(edits))
+
+    def over(self, store: ScenarioStore) -> "EditedStore":
+        """The store that the edits make of a store."""
+        return EditedStore(store, self)
+
+    def describe(self, store: ScenarioStore, tokens: Iterable[str]) -> dict[str, Any]:
+        """For a manifest: base token and digest of the edited scenarios, by id."""
+        return describe(self.expand(store, tokens))
+
+    @property
+    def digest(self) -> str:
+        """What the edited scenarios depend on, beside the recorded ones."""
+        return digest_of([self.profile, sorted(edit.digest for edit in self.edits)])
+
+    def expand(self, store: ScenarioStore, tokens: Iterable[str]) -> "dict[str, Edited]":
+        """The edited scenarios, by id, of those of a store that are given.
+
+        Raises:
+            ConfigError: An edit names a scenario that the store does not have, or one id occurs
+                twice, or nothing is edited.
+        """
+        chosen, out = dict.fromkeys(tokens), dict[str, Edited]()
+        columns = (store.summary()[name].to_pylist() for name in ("token", "type"))
+        types = dict(zip(*columns, strict=True))
+        for edit in self.edits:
+            for token in self._of(edit, store, types):
+                if token not in chosen:
+                    continue
+                made = edited_id(token, edit)
+                if made in out or made in types:
+                    raise ConfigError(
+                        f"edits {self.name!r}: two scenarios have the id {made!r}",
+                        hint="give each edit of a scenario a name of its own",
+                    )
+                out[made] = Edited(token, edit)
+        if not out:
+            raise ConfigError(
+                f"edits {self.name!r} are for no scenario of the {len(chosen)} chosen",
+                hint="check tokens, split and types of its edits",
+            )
+        return out
+
+    def _of(self, edit: Edit, store: ScenarioStore, types: Mapping[str, str]) -> Sequence[str]:
+        """Scenarios of a store that an edit is for, sorted."""
+        where = f"edits {self.name!r}, edit {edit.name!r}: the store"
+        found = set(types)
+        if edit.tokens:
+            found = {beginning(where, "scenario", token, types) for token in edit.tokens}
+        if edit.types:
+            found = {token for token in found if types[token] in edit.types}
+        return sorted(found)
+
+    def require_traffic(self, traffic: str) -> None:
+        """Refuse traffic that cannot drive what an edit asks for.
+
+        Raises:
+            ConfigError: Replayed traffic has nothing that a spawned vehicle could do, reactive
+                traffic replays no vehicle, and interPlan's scenarios are for reactive traffic only.
+        """
+        for edit in self.edits:
+            where = f"edits {self.name!r}, edit {edit.name!r}"
+            moving = bool(edit.density) or any(
+                spawn.kind == "vehicle" and spawn.behavior != "stopped" for spawn in edit.spawn
+            )
+            if traffic == "nonreactive" and moving:
+                raise ConfigError(
+                    f"{where}: spawned vehicles that drive have no recording to be replayed",
+                    hint='--traffic reactive, or behavior = "stopped"',
+                )
+            if traffic != "reactive" and edit.code:
+                raise ConfigError(
+                    f"{where}: the code {edit.code!r} is for reactive traffic, not {traffic}",
+                    hint="--traffic reactive",
+                )
+            slowed = bool(edit.stop) or any(
+                not slow.kinds or "vehicle" in slow.kinds for slow in edit.slow
+            )
+            if traffic == "reactive" and (slowed or (edit.speed and edit.speed.tracks != 1.0)):
+                raise ConfigError(
+                    f"{where}: slower and stopping vehicles are for replayed traffic; reactive "
+                    "vehicles drive by themselves",
+                    hint="--traffic nonreactive, or slow only kinds that are replayed",
+                )
+
+
+@dataclass(frozen=True, slots=True)
+class Edited:
+    """An edited scenario."""
+
+    base: str  # token of the recorded one
+    edit: Edit
+
+
+class EditedStore(ScenarioStore):
+    """A store whose scenarios are those that edits make of its own."""
+
+    def __init__(
+        self, store: ScenarioStore, edits: EditSet, made: Mapping[str, Any] | None = None
+    ) -> None:
+        """The edited scenarios of an open store; those `made` in a run, as `describe` gave them."""
+        vars(self).update(vars(store))
+        if made is None:
+            self.edited = edits.expand(store, store.tokens)
+        else:  # a bundle need not hold what other scenarios of the run are made of
+            by_digest = {edit.digest: edit for edit in edits.edits}
+            try:
+                self.edited = {
+                    token: Edited(str(found["base"]), by_digest[found["digest"]])
+                    for token, found in made.items()
+                }
+            except (KeyError, TypeError) as error:
+                raise DataError(
+                    f"edits {edits.name!r} of the manifest do not make its scenarios",
+                    hint="make the run again",
+                ) from error
+        self.tokens = tuple(self.edited)
+
+    def __contains__(self, token: object) -> bool:
+        return token in self.edited
+
+    def base(self, token: str) -> str:
+        """Token of the recorded scenario that an edited one was made of."""
+        if token not in self.edited:
+            raise DataError(
+                f"store {self.path.name!r} has no edited scenario {token!r}",
+                hint="its `tokens` are the scenarios it has",
+            )
+        return self.edited[token].base
+
+    def read(self, token: str, *, plausible: bool = True) -> Scenario:
+        """One edited scenario.
+
+        Raises:
+            DataError: There is none of that id, or a file is missing or damaged.
+            ConfigError: The edit cannot be applied.
+        """
+        recorded = super().read(self.base(token), plausible=plausible)
+        return apply_edit(recorded, self.edited[token].edit, driven_lanes)
+
+
+def describe(edited: Mapping[str, Edited]) -> dict[str, Any]:
+    """For a manifest: base token and digest of edited scenarios, by id."""
+    return {
+        token: {"base": found.base, "edit": found.edit.name, "digest": found.edit.digest}
+        for token, found in edited.items()
+    }
+
+
+def edit_words(manifest: Mapping[str, Any], token: str) -> list[str]:
+    """What was edited in a scenario of a run, in words; empty where nothing was."""
+    table = manifest.get("edits")
+    if not table:
+        return []
+    return make_edits(table, "of the run").words_of(token, table.get("made", {}))
+
+
+def make_edits(table: Mapping[str, Any], name: str) -> EditSet:
+    """Edits from the table of a file; `name` is for messages, and theirs where they have none.
+
+    Raises:
+        ConfigError: Something in it is unknown, missing or contradictory.
+    """
+    where = f"edits {name!r}"
+    for key in table:
+        if key not in _KEPT:
+            near = nearest(key, _TOP)
+            hint = f"did you mean {near!r}? " if near else ""
+            raise ConfigError(
+                f"{where}: key {key!r} unknown", f"{hint}available: {', '.join(_TOP)}"
+            )
+    if table.get("format", _FORMAT) != _FORMAT:
+        raise ConfigError(f"{where}: format {table['format']!r} is not {_FORMAT}")
+    profile = table.get("profile", PROFILES[0])
+    if profile not in PROFILES:
+        raise ConfigError(f"{where}: profile {profile!r} is not one of {', '.join(PROFILES)}")
+    listed = table.get("edit", [])
+    if not isinstance(listed, list) or not listed:
+        raise ConfigError(f"{where} holds no edits", hint="write one or more [[edit]] tables")
+    edits = tuple(make_edit(item, f"{where}, edit {i}") for i, item in enumerate(listed, 1))
+    codes = [edit for edit in edits if edit.code]
+    if codes and profile != "interplan":
+        raise ConfigError(
+            f"{where}: the code of edit {codes[0].name!r} is interPlan's",
+            hint='write profile = "interplan" at the top of the file',
+        )
+    return EditSet(str(table.get("name", name)), profile, edits)
+
+
+def read_edits(name: str, store: Path | None = None) -> EditSet:
+    """Edits by the path of a file, or by the name of one in `edits/` of a store.
+
+    Raises:
+        ConfigError: There is no such file, or it is wrong.
+    """
+    path = Path(name)
+    if path.suffix != ".toml":
+        folder = (store or Path()) / FOLDER
+        path = folder / f"{name}.toml"
+        if not path.is_file():
+            known = sorted(found.stem for found in folder.glob("*.toml"))
+            raise ConfigError(
+                f"edits {name!r} unknown",
+                hint=f"available: {', '.join(known) or 'none'}, or the path of a .toml file",
+            )
+    return make_edits(read_toml(path), path.stem)
+
+
+def edits_text(table: Mapping[str, Any]) -> str:
+    """The table of edits as TOML; what is null is left out, or 0 in a list."""
+    top = {name: value for name, value in table.items() if name != "edit"}
+    lines = [f"{name} = {_toml(value)}" for name, value in top.items()]
+    for edit in table["edit"]:
+        lines += ["", "[[edit]]"]
+        lines += [f"{_key(name)} = {_toml(value)}" for name, value in edit.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _key(name: str) -> str:
+    return name if name.replace("_", "").isalnum() and name.isascii() else json.dumps(name)
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, Mapping):
+        pairs = (f"{_key(k)} = {_toml(v)}" for k, v in value.items() if v is not None)
+        return f"{{{', '.join(pairs)}}}"
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(_toml(0 if item is None else item) for item in value)}]"
+    return json.dumps(value)

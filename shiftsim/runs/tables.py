@@ -1,0 +1,192 @@
+"""The tables of a run: the result of a task, the rows it becomes, and reading them back.
+
+`scores.parquet` and `metrics.parquet` hold nothing but results, sorted by task and written with
+fixed settings, so that the same run gives the same bytes for any number of workers and any order.
+Timings are in `tasks.parquet`.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import groupby
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from shiftsim.errors import DataError
+from shiftsim.metrics import SHORT_NAMES
+from shiftsim.runs.rollouts import Task, describe
+from shiftsim.runs.rollouts.files import FOLDER, Place, part_file
+from shiftsim.world.ranges import RUN, require
+
+OK, FAILED, TIMEOUT, MISSING = STATUSES = ("ok", "failed", "timeout", "missing")
+
+_TEXT, _NUMBER, _INTEGER = pa.string(), pa.float64(), pa.int64()
+_KEY = {"planner": _TEXT, "noise": _TEXT, "seed": _INTEGER, "token": _TEXT}
+_PROFILE = {"thresholds": _TEXT, "metric_version": _TEXT}
+_TEXTS = ("scenario_type", "status", "error", "hint", "traceback")
+_DURATIONS = (
+    "read_seconds",
+    "simulate_seconds",
+    "planner_seconds",
+    "planning_ms_mean",
+    "planning_ms_p95",
+    "metrics_seconds",
+)
+# file below rollouts/, first row there, rows
+LOCATION = {"rollout": _TEXT, "rollout_row": _INTEGER, "rollout_rows": _INTEGER}
+TABLES = {
+    "tasks": pa.schema(
+        _KEY | dict.fromkeys(_TEXTS, _TEXT) | dict.fromkeys(_DURATIONS, _NUMBER) | LOCATION
+    ),
+    "scores": pa.schema(
+        {
+            **_KEY,
+            **dict.fromkeys(("scenario_type", "city", "log_name", "traffic"), _TEXT),
+            "duration_class": _TEXT,
+            "cls": _NUMBER,
+            **dict.fromkeys((name for name in SHORT_NAMES if name != "score"), _NUMBER),
+            "degraded_steps": _INTEGER,
+            **_PROFILE,
+        }
+    ),
+    "metrics": pa.schema(
+        {
+            **_KEY,
+            "metric": _TEXT,
+            "value": _NUMBER,
+            "unit": _TEXT,
+            "threshold": _NUMBER,
+            "score": _NUMBER,
+            "first_violation_iteration": _INTEGER,
+            "first_violation_time_us": _INTEGER,
+            "first_violation_s": _NUMBER,
+            "first_violation_value": _NUMBER,
+            "partner_token": _TEXT,
+            **_PROFILE,
+        }
+    ),
+}
+_RANGES = {  # by column
+    **dict.fromkeys(("cls", *SHORT_NAMES), "score"),
+    **dict.fromkeys(_DURATIONS, "duration"),
+    **{name: name for name in ("degraded_steps", "rollout_row", "rollout_rows")},
+}
+
+
+@dataclass(frozen=True, slots=True)
+class TaskResult:
+    """What became of one task, from the worker that did it to the tables."""
+
+    task: Task  # the task
+    status: str  # one of `STATUSES`
+    scenario_type: str = ""  # type of the scenario, where it could be read
+    error: str = ""  # what went wrong, empty for `ok`
+    hint: str = ""  # what to do about it
+    traceback: str = ""  # where it went wrong
+    # durations by column name of `tasks.parquet` [s], or [ms] where the name says so
+    seconds: dict[str, float] = field(default_factory=dict)
+    # the row of `scores.parquet` beyond the key; empty unless `ok`
+    scores: dict[str, Any] = field(default_factory=dict)
+    # the rows of `metrics.parquet` beyond the key
+    metrics: list[dict[str, Any]] = field(default_factory=list)
+    rollout: bytes = b""  # the rollout, encoded; empty where it is not stored, or stored elsewhere
+    location: Place | None = None  # where the rollout is stored, where it is in a file already
+    warning: str = ""  # why the first plan is most likely not what was meant
+
+    def to_json(self) -> dict[str, Any]:
+        """All but the task, the rollout and the warning, as JSON values."""
+        values = {name: getattr(self, name) for name in (*_TEXTS, "seconds", "scores", "metrics")}
+        return values | {
+            "location": self.location and (self.location.file.name, *self.location[1:])
+        }
+
+    @staticmethod
+    def from_json(task: Task, values: dict[str, Any], folder: Path) -> "TaskResult":
+        """A result from JSON values; `folder` is that of its rollout."""
+        found = values["location"]
+        location = found and Place(part_file(folder, found[0]), *found[1:])
+        return TaskResult(task, **{**values, "location": location})
+
+    def rows(self) -> dict[str, list[dict[str, Any]]]:
+        """Its rows by table."""
+        key = self.task._asdict()
+        place = self.location
+        stored = (place.file.name, place.row, place.rows) if place else (None, None, None)
+        row = key | {name: getattr(self, name) for name in _TEXTS} | self.seconds
+        return {
+            "tasks": [row | dict(zip(LOCATION, stored, strict=True))],
+            "scores": [key | self.scores] if self.status == OK else [],
+            "metrics": [key | metric for metric in self.metrics],
+        }
+
+
+def stored_location(run: Path, rollout: str | None, row: Any, rows: Any) -> Place | None:
+    """Where a rollout of a run is, by the columns of `tasks.parquet`."""
+    return Place(part_file(run / FOLDER, rollout), row, rows) if rollout else None
+
+
+def stored_results(run: Path) -> Iterator[TaskResult]:
+    """The results that the tables of a run hold, in their order, without those that are missing."""
+    files = [run / f"{name}.parquet" for name in ("scores", "metrics")]
+    scores, metrics = map(_rows_by_task, files)
+    for key, (row,) in _rows_by_task(run / "tasks.parquet"):
+        if row["status"] == MISSING:
+            continue
+        is_done = row["status"] == OK
+        yield TaskResult(
+            Task(*key),
+            **{name: row[name] for name in _TEXTS},
+            seconds={name: row[name] for name in _DURATIONS if row[name] is not None},
+            scores=_next_rows(key, scores, files[0])[0] if is_done else {},
+            metrics=_next_rows(key, metrics, files[1]) if is_done else [],
+            location=stored_location(run, *(row[name] for name in LOCATION)),
+        )
+
+
+def _rows_by_task(path: Path) -> Iterator[tuple[tuple[Any, ...], list[dict[str, Any]]]]:
+    rows = (row for batch in _batches(path) for row in batch.to_pylist())
+    for key, group in groupby(rows, itemgetter(*Task._fields)):
+        yield key, [{n: v for n, v in row.items() if n not in Task._fields} for row in group]
+
+
+def _next_rows(key: tuple[Any, ...], rows: Iterator[Any], path: Path) -> list[dict[str, Any]]:
+    found, values = next(rows, (None, []))
+    if found != key:
+        raise damaged(path, f"the rows of {describe(Task(*key))} are missing")
+    return list(values)
+
+
+def read_table(path: Path) -> pa.Table:
+    """A table of a run.
+
+    Raises:
+        DataError: It is missing or damaged.
+    """
+    schema = TABLES[path.stem]
+    return pa.Table.from_batches((batch.select(schema.names) for batch in _batches(path)), schema)
+
+
+def _batches(path: Path) -> Iterator[pa.RecordBatch]:
+    """A table part by part, with columns of the right types and numbers within their ranges."""
+    try:
+        file = pq.ParquetFile(path)
+        types = {column.name: column.type for column in file.schema_arrow}
+        for column in TABLES[path.stem]:
+            if types.get(column.name) != column.type:
+                raise damaged(path, f"column {column.name!r} is missing or not {column.type}")
+        for batch in file.iter_batches(batch_size=4096):
+            batch.validate(full=True)  # that texts are UTF-8
+            for name in set(_RANGES) & set(batch.schema.names):
+                values = batch[name].drop_null().to_numpy()
+                require(RUN, _RANGES[name], values, f"{path}: column {name!r} as")
+            yield batch
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise damaged(path, str(error)) from error
+
+
+def damaged(path: Path, what: str) -> DataError:
+    """The error that a file of a run cannot be read."""
+    return DataError(f"{str(path)!r} cannot be read: {what}", hint="make the run again")

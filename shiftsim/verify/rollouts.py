@@ -1,0 +1,170 @@
+"""Rollouts in the words of nuPlan's tables: columns, tolerances, and what a planner saw."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from shiftsim.errors import DataError
+from shiftsim.kernels import FloatArray, IntArray
+from shiftsim.planners.registry import load_planner
+from shiftsim.sim.log import SimulationLog, as_recorded
+from shiftsim.sim.planner import Observation, observe_log, scene_info
+from shiftsim.sim.traffic.idm.agents import order_observed
+from shiftsim.verify.tables import TOLERANCE, Source
+from shiftsim.world import state
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import AgentKind, Tracks, Trajectory, tracks_of_boxes
+
+Bounds: TypeAlias = dict[str, ArrayLike]  # tolerance by column, "" being that of all others
+
+# Columns of an ego state in the words of the official tables, in the order of `state.STATE_COLUMNS`
+_STEERING = ("tire_steering_angle", "tire_steering_rate")
+EGO_COLUMNS = (*state.STATE_COLUMNS[:7], *_STEERING, "angular_velocity", "angular_acceleration")
+CENTER_COLUMNS = ("center_x", "center_y", "center_heading")
+BOX_COLUMNS = ("x", "y", "heading", "vx", "vy", "length", "width")
+_SHORT = {"omega": "angular_velocity", "alpha": "angular_acceleration"}
+
+# Tolerances [m, rad, m/s, ...]
+SIMULATED: Bounds = {"heading": 1e-7, "center_heading": 1e-7, "": 1e-6}  # ego states
+LOGGED: Bounds = {
+    **{"x": 1e-6, "y": 1e-6, "heading": 1e-7},
+    **{"center_x": 1e-6, "center_y": 1e-6, "center_heading": 1e-7},
+}
+REACTIVE: Bounds = {"x": 1e-4, "y": 1e-4, "heading": 1e-5, "vx": 1e-4, "vy": 1e-4}
+# what follows from recorded states; coordinates near 4e6 are spaced 5e-10
+DERIVED: Bounds = {"center_x": 2e-9, "center_y": 2e-9, "center_heading": 1e-9}
+# the other scores are 0 or 1
+SCORES = dict.fromkeys(
+    ("ego_progress_along_expert_route", "speed_limit_compliance", "score"), TOLERANCE
+)
+CHALLENGES = {  # controller and traffic
+    "NR": ("lqr", "nonreactive"),
+    "PT": ("perfect", "nonreactive"),
+    "R": ("lqr", "reactive"),
+}
+CATEGORIES = {  # as the devkit files metrics; the others are of `Planning`
+    **dict.fromkeys(("speed_limit_compliance", "ego_is_comfortable"), "Violations"),
+    **dict.fromkeys(("ego_jerk", "ego_lat_acceleration", "ego_lon_acceleration"), "Dynamics"),
+    **dict.fromkeys(("ego_lon_jerk", "ego_yaw_acceleration", "ego_yaw_rate"), "Dynamics"),
+    "no_ego_at_fault_collisions": "Dynamics",
+}
+UNITS = {  # of scores that have one
+    **dict.fromkeys(("drivable_area_compliance", "driving_direction_compliance"), "bool"),
+    **dict.fromkeys(("ego_is_comfortable", "ego_is_making_progress"), "bool"),
+    "time_to_collision_within_bound": "bool",
+    **dict.fromkeys(("no_ego_at_fault_collisions", "speed_limit_compliance"), "float"),
+}
+
+
+def ego_states(columns: Mapping[str, Any]) -> FloatArray:
+    """(R, 11) ego states from columns by name; what has no column is 0."""
+    out = np.zeros((len(next(iter(columns.values()))), state.NUM_STATE))
+    for name, values in columns.items():
+        out[:, EGO_COLUMNS.index(_SHORT.get(name, name))] = values
+    return out
+
+
+def read_ego(rows: Source) -> FloatArray:
+    """(R, 11) ego states of a table."""
+    return ego_states({name: rows[name] for name in EGO_COLUMNS})
+
+
+def ego_columns(states: FloatArray) -> dict[str, FloatArray]:
+    """Columns of the official tables by name, from (R, 11) ego states: rear axle and centre."""
+    columns = np.concatenate([states, state.center_poses(states[:, :3])], axis=1)
+    return dict(zip((*EGO_COLUMNS, *CENTER_COLUMNS), columns.T, strict=True))
+
+
+def object_columns(tracks: Tracks, rows: IntArray, index: IntArray) -> dict[str, Any]:
+    """Columns of a table of objects but for heights: tracks at rows, both (R,)."""
+    kinds = tracks.kinds[index]
+    # the official table shows static objects, which have no velocity, as standing
+    moves = tracks.velocities[rows, index]
+    moves = np.where(kinds[:, None] > state.LAST_AGENT_KIND, np.nan_to_num(moves), moves)
+    values = [tracks.poses[rows, index], moves, tracks.sizes[rows, index]]
+    return {
+        "iteration": rows,
+        "track_token": [tracks.tokens[i] for i in index.tolist()],
+        "type": [AgentKind(kind).name for kind in kinds.tolist()],
+        **dict(zip(BOX_COLUMNS, np.concatenate(values, axis=1).T, strict=True)),
+    }
+
+
+def observed_columns(tracks: Tracks, challenge: str) -> dict[str, Any]:
+    """Objects of every sample in the order of observation, without heights."""
+    listed = (lambda kinds, row: np.flatnonzero(row)) if challenge != "R" else order_observed
+    orders = [listed(tracks.kinds, row) for row in tracks.valid]
+    iteration = np.repeat(np.arange(len(orders)), [len(order) for order in orders])
+    return object_columns(tracks, iteration, np.concatenate(orders))
+
+
+def light_columns(scenario: Scenario) -> dict[str, Any]:
+    """Lights of every sample that are listed."""
+    rows, lights = scenario.iteration_rows[:-1].tolist(), scenario.traffic_lights
+    listed = [(i, *light) for i, row in enumerate(rows) for light in lights.listed(row)]
+    return {
+        "iteration": [i for i, _, _ in listed],
+        "lane_connector_id": [int(name) for _, name, _ in listed],
+        "status": [status.name for _, _, status in listed],
+        "timestamp": [int(scenario.time_us[rows[i]]) for i, _, _ in listed],
+    }
+
+
+def tracks_of(rows: Source, count: int) -> Tracks:
+    """Dense tracks over `count` iterations from rows of a table of objects."""
+    names, iteration = rows["track_token"].tolist(), rows["iteration"].astype(np.int64)
+    kinds = dict(zip(names, rows["type"].tolist(), strict=True))
+    column = {token: index for index, token in enumerate(kinds)}
+    track = [column[token] for token in names]
+    if not ((iteration >= 0) & (iteration < count)).all():
+        raise DataError(f"objects at iterations which the ego does not have, of {count}")
+    if len({*zip(iteration.tolist(), track, strict=True)}) != len(track):
+        raise DataError("an object occurs twice at one iteration")
+    if [kinds[token] for token in names] != rows["type"].tolist():
+        raise DataError("an object changes its type")
+    boxes = np.full((count, len(kinds), len(BOX_COLUMNS)), np.nan)
+    boxes[iteration, track] = np.column_stack([rows[n].astype(np.float64) for n in BOX_COLUMNS])
+    return tracks_of_boxes(boxes, [AgentKind[kind] for kind in kinds.values()], list(kinds))
+
+
+def recorded_log(scenario: Scenario, ego: FloatArray) -> SimulationLog:
+    """A rollout of which only the ego states (K, 11) are known; the scenario has the expert's."""
+    log = as_recorded(scenario)
+    if len(ego) != len(log.ego):
+        raise DataError(f"{len(ego)} ego states, {len(log.ego) + 1} of the expert")
+    return replace(log, ego=ego)
+
+
+class RecordedRun:
+    """What a planner saw in a recorded run, from its ego states and its own objects.
+
+    A run that is not reactive shows the objects of the log.
+    """
+
+    def __init__(self, scenario: Scenario, ego: Source, objects: Source, challenge: str) -> None:
+        self.scenario, self.ego = scenario, read_ego(ego)
+        self._tracks = tracks_of(objects, len(self.ego)) if challenge == "R" else None
+
+    def at(self, iteration: int) -> Observation:
+        """The present alone; the rule-based planners look at nothing else."""
+        row = slice(iteration, iteration + 1)
+        tracks = None if self._tracks is None else self._tracks.rows(row)
+        ego = self.ego[iteration]
+        return observe_log(self.scenario, iteration, ego=ego, tracks=tracks, samples=1)
+
+
+def compare_plans(where: str, spec: str, run: RecordedRun, rows: Source) -> None:
+    """Compare the recorded plans, a row per state, with those of our planner."""
+    recorded, planner = rows["iteration"], load_planner(spec)
+    planner.reset(scene_info(run.scenario, planner=planner))
+    for iteration in sorted({0, *recorded.tolist()}):
+        plan = planner.plan(run.at(iteration))
+        if iteration in recorded and isinstance(plan, Trajectory):
+            ours = {"index": np.arange(len(plan.time_us)), "time_us": plan.time_us}
+            columns = zip(EGO_COLUMNS, plan.states.T, strict=True)
+            ours |= {name: values for name, values in columns if name in rows}
+            here, at = rows.at(recorded == iteration), f"{where} iteration {iteration}"
+            here.match(at, ours, TOLERANCE, quantity=f"{spec} plan")

@@ -1,0 +1,46 @@
+"""The lead of the IDM planner: the gap to it, and which one of several that are touched."""
+
+import numpy as np
+import pytest
+import shapely
+from corridors import bent_band, some_boxes
+
+from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.geometry.corridor import CLEAR, HIT
+from shiftsim.planners.routes.lead import (
+    OVERLAPPING,
+    find_lead,
+    keep_one_overlap,
+    make_objects,
+)
+
+
+def objects_of(rings):
+    nothing, ptr = np.zeros(len(rings)), np.cumsum([0, *map(len, rings)])
+    return make_objects(np.concatenate(rings), ptr, nothing, nothing)
+
+
+def test_the_gap_to_the_lead_is_the_distance_between_the_polygons(rng):
+    footprint = boxes_to_corners(np.array([0.0, 0.0, 0.3]), np.array([5.176, 2.297]))
+    rings = [*some_boxes(rng, rng.uniform(-12, 12, (400, 2)))]
+    rings += [bent_band(rng, start) for start in rng.uniform(-15, 15, (100, 2))]
+    objects = objects_of(rings)
+    truth = shapely.distance([*map(shapely.Polygon, rings)], shapely.Polygon(footprint))
+    for index in range(500):
+        occupancy = np.full(500, CLEAR)
+        occupancy[index] = HIT if truth[index] > 0.0 else OVERLAPPING
+        found, gap = find_lead(footprint, objects, occupancy)
+        assert found == index
+        assert gap == pytest.approx(truth[index], abs=1e-12)
+    found, gap = find_lead(footprint, objects, np.where(truth > 3.0, HIT, CLEAR))
+    assert found == np.flatnonzero(truth > 3.0)[truth[truth > 3.0].argmin()]
+    assert gap == pytest.approx(truth[truth > 3.0].min(), abs=1e-12)
+
+
+def test_of_two_objects_that_are_touched_the_lower_one_leads_whatever_their_order():
+    footprint = boxes_to_corners(np.zeros(3), np.array([5.176, 2.297]))
+    low, high, far = (footprint + shift for shift in ((1.0, -1.0), (-1.0, 1.0), (30.0, -9.0)))
+    for rings, lead in (([high, far, low], 2), ([low, far, high], 0)):
+        occupancy = np.array([OVERLAPPING, HIT, OVERLAPPING])
+        keep_one_overlap(objects_of(rings), occupancy, footprint, {})
+        assert occupancy.tolist() == [{1: HIT, lead: OVERLAPPING}.get(i, CLEAR) for i in range(3)]
