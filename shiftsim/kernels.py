@@ -7,8 +7,10 @@ starts a fresh cache.
 
 import hashlib
 import logging
+import os
 import shutil
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -66,11 +68,14 @@ def _cache_folder() -> str:
             copy = own / path.relative_to(shipped)
             copy.parent.mkdir(exist_ok=True)
             if not copy.exists():
-                shutil.copyfile(path, copy)
-    caches = sorted(folder.parent.iterdir(), key=lambda path: path.stat().st_mtime, reverse=True)
-    for old in caches[_CACHES_KEPT:]:
-        if old != folder:
-            shutil.rmtree(old, ignore_errors=True)
+                partial = copy.with_name(f".{copy.name}.{os.getpid()}")  # others may copy it, too
+                shutil.copyfile(path, partial)
+                partial.replace(copy)
+    with suppress(OSError):  # another process may remove them at the same time
+        caches = sorted(folder.parent.iterdir(), key=lambda cache: cache.stat().st_mtime)
+        for old in caches[:-_CACHES_KEPT]:
+            if old != folder:
+                shutil.rmtree(old, ignore_errors=True)
     return str(folder)
 
 

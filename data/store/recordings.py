@@ -130,7 +130,7 @@ def _table(described: pa.Schema, *columns: np.ndarray | pa.Array) -> pa.Table:
 
 
 def _as_type(values: np.ndarray, kind: pa.DataType) -> np.ndarray:
-    wanted = np.dtype(kind.to_pandas_dtype())
+    wanted = pa.nulls(0, kind).to_numpy(zero_copy_only=False).dtype
     limits = np.iinfo(wanted) if wanted.kind == "i" else None
     return (np.clip(values, limits.min, limits.max) if limits else values).astype(wanted)
 
