@@ -95,10 +95,7 @@ def machine_code() -> list[Path]:
 
 
 def readonly(array: Any) -> Any:
-    """The same memory as an array that nobody can make writeable, and whose `base` is no array.
-
-    Before NumPy 2.1 it is a copy.
-    """
+    """The same memory, before NumPy 2.1 a copy, never writeable again; its `base` is no array."""
     view = array.view() if _KEEPS_READ_ONLY else array.copy()
     view.flags.writeable = False
     return np.from_dlpack(view) if _KEEPS_READ_ONLY else view

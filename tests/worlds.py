@@ -10,7 +10,23 @@ from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
 from shiftsim.world.layers import Layer, make_layer
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import HEADING, NUM_STATE, VX, AgentKind, Tracks, TrafficLights, X, Y
+from shiftsim.world.state import (
+    AX,
+    HEADING,
+    NUM_STATE,
+    PACIFICA,
+    VX,
+    VY,
+    YAW_ACCEL,
+    YAW_RATE,
+    AgentKind,
+    Tracks,
+    TrafficLights,
+    VehicleParameters,
+    X,
+    Y,
+    rear_poses,
+)
 
 LANE_WIDTH = 3.5  # m
 
@@ -186,3 +202,17 @@ def with_velocities(scenario, columns, velocities):
     every = scenario.tracks.velocities.copy()
     every[:, columns] = velocities
     return replace(scenario, tracks=replace(scenario.tracks, velocities=every))
+
+
+def rear_states(center_states: np.ndarray, vehicle: VehicleParameters = PACIFICA) -> np.ndarray:
+    """States at the rear axle from states at the box centre, both (..., 11) with the same columns.
+
+    The inverse of `center_poses`, `center_velocities` and `center_accelerations`.
+    """
+    out = np.array(center_states, np.float64)
+    distance = vehicle.rear_axle_to_center
+    out[..., :3] = rear_poses(center_states[..., :3], vehicle)
+    out[..., VY] -= distance * center_states[..., YAW_RATE]
+    out[..., AX] -= distance * center_states[..., YAW_RATE] ** 2
+    out[..., AX] -= distance * center_states[..., YAW_ACCEL]
+    return out

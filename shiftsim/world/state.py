@@ -412,20 +412,6 @@ def center_accelerations(states: FloatArray, vehicle: VehicleParameters = PACIFI
     return out
 
 
-def rear_states(center_states: FloatArray, vehicle: VehicleParameters = PACIFICA) -> FloatArray:
-    """States at the rear axle from states at the box centre, both (..., 11) with the same columns.
-
-    The inverse of `center_poses`, `center_velocities` and `center_accelerations`.
-    """
-    out = np.array(center_states, np.float64)
-    distance = vehicle.rear_axle_to_center
-    out[..., :3] = rear_poses(center_states[..., :3], vehicle)
-    out[..., VY] -= distance * center_states[..., YAW_RATE]
-    out[..., AX] -= distance * center_states[..., YAW_RATE] ** 2
-    out[..., AX] -= distance * center_states[..., YAW_ACCEL]
-    return out
-
-
 def speeds(states: FloatArray) -> FloatArray:
     """(...) speed at the rear axle [m/s], from (..., 11) states."""
     return np.hypot(states[..., VX], states[..., VY])

@@ -10,6 +10,7 @@ import numpy as np
 import places
 import pytest
 from parity_cases import Cases, File, change_array, name_unknown, noticed, read_file, tracked
+from worlds import rear_states
 
 from shiftsim.errors import DataError
 from shiftsim.geometry.boxes import boxes_to_corners
@@ -196,7 +197,7 @@ def test_ego_frames(path: Path, cases: Cases) -> None:
         ours = {
             "centre": centers(states),
             "corners": boxes_to_corners(state.center_poses(states[:3]), size),
-            "from_centre_rear_state": state.rear_states(built),
+            "from_centre_rear_state": rear_states(built),
         }
         # coordinates near 4e6 are spaced 5e-10
         case.match(f"case {number}", ours, {"": ATOL, "corners": 2e-9})

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from parity_cases import Cases, change_column, change_json, name_unknown, noticed, read_file
 
-from shiftsim.data.maps.opendrive.areas import is_crosswalk, object_origin, object_rings
+from shiftsim.data.maps.opendrive.areas import is_crosswalk, object_rings
 from shiftsim.data.maps.opendrive.curves import ReferenceLine, arc_length_deviation
 from shiftsim.data.maps.opendrive.lanes import LaneKey, lane_links, section_borders
 from shiftsim.data.maps.opendrive.reading import read_opendrive
@@ -129,7 +129,10 @@ def test_crosswalks(path: Path, maps: Path, cases: Cases) -> None:
         line, outline = ReferenceLine(road.geometries), "box"
         if thing.outlines:
             outline = "cornerRoad" if thing.outlines[0].on_road else "cornerLocal"
-        ours = {"outline": outline, "centre": object_origin(line, thing)}
+        ours = {
+            "outline": outline,
+            "centre": line.evaluate(np.array([thing.s])).offset(np.array([thing.t]))[0],
+        }
         ours["polygon"] = object_rings(line, thing)[0]
         gap, _ = bounds(line, np.array([thing.s]))
         rows[key].match(f"{source.stem} object {key}", ours, {"": gap}, quantity="crosswalk")

@@ -196,11 +196,6 @@ def rings_of(
     ]
 
 
-def object_origin(line: ReferenceLine, thing: RoadObject) -> FloatArray:
-    """(2,) where an object stands [m]."""
-    return line.evaluate(np.array([thing.s])).offset(np.array([thing.t]))[0]
-
-
 def _repeated(repeat: Repeat) -> list[tuple[float, float]]:
     count = int(min(repeat.length / repeat.distance, 1000)) + 1 if repeat.distance > 0 else 1
     share = np.arange(count) * repeat.distance / repeat.length if repeat.length > 0 else np.zeros(1)

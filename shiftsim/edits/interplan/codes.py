@@ -49,15 +49,6 @@ def parse_code(code: str) -> dict[str, Any]:
     return out
 
 
-def code_name(changes: Mapping[str, Any]) -> str:
-    """The canonical code: letters in the order a, d, g, o; a special scenario alone."""
-    if (number := changes.get("special_scenario")) is not None:
-        return f"s{number}"
-    return "".join(
-        f"{letter}{changes[name]}" for letter, name in LETTERS.items() if name in changes
-    )
-
-
 def edits_agents(changes: Mapping[str, Any]) -> bool:
     """Whether agents are changed, and not the goal alone."""
     return any(name in changes for name in _EDITS_AGENTS)

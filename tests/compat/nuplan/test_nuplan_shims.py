@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from worlds import rear_states
 
 from shiftsim.compat.nuplan.bridge.world import (
     ObservedTracks,
@@ -24,7 +25,6 @@ from shiftsim.world.state import (
     center_accelerations,
     center_poses,
     center_velocities,
-    rear_states,
 )
 
 from nuplan.common.actor_state.agent import Agent  # isort: skip  # the names exist now
