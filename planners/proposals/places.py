@@ -9,7 +9,7 @@ import numpy as np
 
 from shiftsim.geometry.boxes import box_corners
 from shiftsim.geometry.polylines import RUN
-from shiftsim.geometry.rings import ray_crossings, ring_bounds
+from shiftsim.geometry.rings import ray_crosses, ring_bounds
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.proposals.areas import Areas
 from shiftsim.world.state import HEADING, VehicleParameters, X, Y
@@ -166,16 +166,7 @@ def _locate(
                             for vertex in range(start, stop):
                                 qx, qy = xy[vertex, 0], xy[vertex, 1]
                                 if not (min(py, qy) > y or max(py, qy) < y or max(px, qx) < x):
-                                    is_odd, on_edge = (py > y) != (qy > y), False
-                                    if not is_odd or min(px, qx) <= x:
-                                        is_odd, on_edge = ray_crossings(
-                                            xy,
-                                            before if vertex == start else vertex - 1,
-                                            vertex,
-                                            vertex + 1,
-                                            x,
-                                            y,
-                                        )
+                                    is_odd, on_edge = ray_crosses(px, py, qx, qy, x, y)
                                     if on_edge:
                                         on_boundary |= 1 << point
                                     elif is_odd:

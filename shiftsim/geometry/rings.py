@@ -122,6 +122,28 @@ def locate_in_ring(ring: FloatArray, x: float, y: float) -> int:
 
 
 @kernel
+def ray_crosses(
+    px: float, py: float, qx: float, qy: float, x: float, y: float
+) -> tuple[bool, bool]:
+    """Whether a ray from (x, y) to +x crosses the segment p-q, and whether it starts on it.
+
+    The lower end counts, the upper one does not; it starts at q, but not at p.
+    """
+    crosses, on_edge = False, qx == x and qy == y
+    if on_edge:
+        pass
+    elif py == y and qy == y:
+        on_edge = min(px, qx) <= x <= max(px, qx)
+    elif (py > y) != (qy > y) and (px >= x or qx >= x):
+        if px > x and qx > x:
+            crosses = True
+        else:
+            side = orientation(px, py, qx, qy, x, y)
+            on_edge, crosses = side == 0, (side > 0) == (qy > py)
+    return crosses, on_edge
+
+
+@kernel
 def ray_crossings(
     xy: FloatArray, before: int, start: int, stop: int, x: float, y: float
 ) -> tuple[bool, bool]:
@@ -129,24 +151,14 @@ def ray_crossings(
 
     The chain goes from the vertex `before` (of a whole ring the last one) to `start` … `stop` - 1.
     """
-    parity = on_edge = False
+    parity, on_edge = False, False
     px, py = xy[before, 0], xy[before, 1]
     for index in range(start, stop):
         qx, qy = xy[index, 0], xy[index, 1]
-        if qx == x and qy == y:
-            on_edge = True
-        elif py == y and qy == y:
-            on_edge = min(px, qx) <= x <= max(px, qx)
-        elif (py > y) != (qy > y) and (px >= x or qx >= x):
-            if px > x and qx > x:
-                parity = not parity
-            else:
-                side = orientation(px, py, qx, qy, x, y)
-                on_edge = side == 0
-                if (side > 0) == (qy > py):
-                    parity = not parity
+        crosses, on_edge = ray_crosses(px, py, qx, qy, x, y)
         if on_edge:
             break  # a single return: numba then needs no count of references
+        parity ^= crosses
         px, py = qx, qy
     return parity and not on_edge, on_edge
 
