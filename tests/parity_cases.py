@@ -25,6 +25,7 @@ NETS = ("carl", "diffusion_planner", "plantf", "pluto", "route_correction")
 # kinds of folders: patterns that must all match something (`a|b`: either), in this order
 KINDS = {
     "nuplan": ["scenes.json", "expected/*.parquet"],
+    "idm_ties": ["scenes.json", "official/ties.json"],
     "nuplan_format": ["devkit_readback.json"],
     "metric_worlds": ["metric_world_*.json"],
     "pdm": ["kernels/*.npz|kernels/*.json|routes.json|idm_calls.json|loop/steps.parquet"],

@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from parity_cases import (
     EXACT,
+    TABLES,
     Cases,
     File,
     Rows,
@@ -21,6 +22,7 @@ from parity_cases import (
     noticed,
     open_scenes,
     open_tables,
+    read_file,
 )
 
 from shiftsim.metrics import MetricResult, evaluate, measure
@@ -91,6 +93,16 @@ def test_simulations_end_alike(folder: Path, tables: Any, run_scenes: Scenes, ca
 @pytest.mark.reference("nuplan")
 def test_plans_are_made_alike(folder: Path, run_scenes: Scenes, cases: Cases) -> None:
     compare_recorded_plans(folder / "expected", run_scenes, cases)
+
+
+@pytest.mark.reference("idm_ties")
+def test_agents_that_touch_several_follow_the_same_one(folder: Path, cases: Cases) -> None:
+    scenes, table = Scenes(folder, cases, (4.0, 0.0, 0.5)), "official/objects_a_0.parquet"
+    objects = Rows(read_file(folder / table, cases, "objects"), *TABLES["objects"])
+    for scene in scenes.entries:
+        log = simulate(scenes[scene], load_planner("constant-velocity"), traffic="reactive")
+        rows = objects[scene, "R", "simple"]
+        objects.match((scene, "R", "simple"), reactive_objects(log, rows), quantity="reactive")
 
 
 def compare_metrics(expected: Path, logged: Path, scenes: Scenes, cases: Cases) -> None:

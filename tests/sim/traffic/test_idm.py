@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from worlds import cruise_scenario, standing_tracks, straight_road
 
 from shiftsim.errors import TrafficError
+from shiftsim.sim.traffic.idm.lead import comes_first
 from shiftsim.sim.traffic.idm.model import IdmTraffic
 from shiftsim.sim.traffic.idm.scene import IdmParameters
 from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
@@ -251,3 +252,11 @@ def test_order_of_replayed_objects_does_not_matter(order: list[int]) -> None:
     other = drive(scene([poses[i] for i in shuffled], [kinds[i] for i in shuffled], speed=4.0))
 
     np.testing.assert_array_equal(usual.poses[:, :3], other.poses[:, :3])
+
+
+def test_of_two_that_an_agent_touches_the_lower_one_in_y_leads() -> None:
+    """nuPlan rule 131; whole scenes are compared by tests/parity."""
+    assert comes_first(0.0, 3.0, 0.0, 4.0)
+    assert not comes_first(0.0, 4.0, 0.0, 3.0)
+    assert comes_first(1.0, 4.0, 2.0, 3.0)  # elsewhere the nearer one leads
+    assert not comes_first(1.0, 3.0, 1.0, 4.0)  # the first one on ties

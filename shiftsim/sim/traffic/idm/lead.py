@@ -36,18 +36,18 @@ def corridor_ahead(
 @kernel
 def find_lead(
     footprints: Footprints, agent: int, ignored: int, corridor: Corridor, scratch: Scratch
-) -> tuple[int, float]:
-    """The nearest footprint in the corridor ahead of an agent, the first one on ties, and the gap.
+) -> tuple[int, float, float]:
+    """The footprint in the corridor ahead of an agent that `comes_first`; not the `ignored` one.
 
     Returns:
-        Its index, or FREE; the gap between the footprints [m]. The footprint `ignored` is left out.
+        Its index, or FREE; the gap between the footprints, and the middle of its bounds in y [m].
     """
     present, bounds = footprints.present, footprints.bounds
     reach = _OUTER * corridor.half_width
     low_x, low_y, high_x, high_y = ring_bounds(corridor.xy)
     own_x, own_y = bounds[agent, 0], bounds[agent, 1]
     own_end_x, own_end_y = bounds[agent, 2], bounds[agent, 3]
-    best, lead = np.inf, FREE
+    best, lead, lead_y = np.inf, FREE, np.inf
     for other in range(len(present)):
         is_near = (
             present[other]
@@ -60,27 +60,44 @@ def find_lead(
             continue
         apart_x = max(own_x - bounds[other, 2], bounds[other, 0] - own_end_x)
         apart_y = max(own_y - bounds[other, 3], bounds[other, 1] - own_end_y)
-        if max(apart_x, apart_y) < best and in_corridor(footprints, other, corridor, scratch):
-            gap = best
+        if max(apart_x, apart_y) <= best and in_corridor(footprints, other, corridor, scratch):
+            gap = max(best, _TOUCH)
             if other < len(footprints.curve) and footprints.curve_size[other]:
                 curve = footprints.curve[other, : footprints.curve_size[other]]
                 gap = _gap_to(footprints, agent, curve, gap)
             gap = _gap_to(footprints, agent, footprints.box[other], gap)
-            if gap < best:
-                best, lead = gap, other
-    return lead, best
+            middle_y = 0.5 * (bounds[other, 1] + bounds[other, 3])
+            if comes_first(gap, middle_y, best, lead_y):
+                best, lead, lead_y = gap, other, middle_y
+    return lead, best, lead_y
 
 
 @kernel
-def stop_line_gap(scene: Scene, agent: int, edge: int, corridor: Corridor, limit: float) -> float:
-    """Distance from an agent to the stop lines of an edge in its corridor, at most `limit` [m]."""
-    stops, stop_lines, gap = scene.graph.stops, scene.graph.stop_lines, limit
+def comes_first(gap: float, y: float, best: float, best_y: float) -> bool:
+    """Whether what is at a gap and has the middle of its bounds at y precedes the best so far."""
+    # nuPlan rule 131: of what is touched, the spatial index answers with the lowest in y
+    return gap < best or (gap == 0.0 and best == 0.0 and y < best_y)
+
+
+@kernel
+def stop_line_ahead(
+    scene: Scene, agent: int, edge: int, corridor: Corridor, best: float, best_y: float
+) -> tuple[bool, float, float]:
+    """Whether a stop line of an edge, in the corridor of an agent, precedes the best so far.
+
+    With it, the gap to the best one now, and the middle of its bounds in y [m].
+    """
+    stops, stop_lines, is_first = scene.graph.stops, scene.graph.stop_lines, False
     for entry in range(stop_lines.ptr[edge], stop_lines.ptr[edge + 1]):
         shell = stops.poly_ptr[stop_lines.items[entry]]
         ring = stops.xy[stops.ring_ptr[shell] : stops.ring_ptr[shell + 1]]
-        if _touches_corridor(corridor, ring, ring_bounds(ring), scene.scratch):
-            gap = _gap_to(scene.footprints, agent, ring, gap)
-    return gap
+        bounds = ring_bounds(ring)
+        if _touches_corridor(corridor, ring, bounds, scene.scratch):
+            gap = _gap_to(scene.footprints, agent, ring, max(best, _TOUCH))
+            middle_y = 0.5 * (bounds[1] + bounds[3])
+            if comes_first(gap, middle_y, best, best_y):
+                is_first, best, best_y = True, gap, middle_y
+    return is_first, best, best_y
 
 
 @kernel

@@ -10,7 +10,7 @@ from shiftsim.sim.traffic.idm.lead import (
     corridor_ahead,
     find_lead,
     in_corridor,
-    stop_line_gap,
+    stop_line_ahead,
 )
 from shiftsim.sim.traffic.idm.paths import (
     extend_route,
@@ -78,13 +78,13 @@ def advance(scene: Scene, row: Row, ego: FloatArray, span: float) -> tuple[int, 
             and ignores_ego_ahead(scene, agent)
         ):
             ignored = ahead
-        lead, gap = find_lead(footprints, agent, ignored, corridor, scratch)
+        lead, gap, lead_y = find_lead(footprints, agent, ignored, corridor, scratch)
         for segment in range(fleet.route_size[agent]):
             edge = fleet.route[agent, segment]
             if graph.lights[edge] & RED:
-                stop_gap = stop_line_gap(scene, agent, edge, corridor, gap)
-                if stop_gap < gap:
-                    lead, gap = len(footprints.present), stop_gap
+                is_first, gap, lead_y = stop_line_ahead(scene, agent, edge, corridor, gap, lead_y)
+                if is_first:
+                    lead = len(footprints.present)
         heading = fleet.pose[agent, 2]
         lead_speed, lead_heading = 0.0, heading
         if lead == FREE:
