@@ -95,7 +95,12 @@ def machine_code() -> list[Path]:
 
 
 def readonly(array: Any) -> Any:
-    """The same memory, before NumPy 2.1 a copy, never writeable again; its `base` is no array."""
-    view = array.view() if _KEEPS_READ_ONLY else array.copy()
-    view.flags.writeable = False
-    return np.from_dlpack(view) if _KEEPS_READ_ONLY else view
+    """The same memory, never writeable again; its `base` is no array.
+
+    NumPy before 2.1 is given a copy of what could be written.
+    """
+    if _KEEPS_READ_ONLY:
+        view = array.view()
+        view.flags.writeable = False
+        return np.from_dlpack(view)
+    return np.asarray(memoryview(array.copy() if array.flags.writeable else array).toreadonly())

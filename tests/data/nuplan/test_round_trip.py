@@ -144,7 +144,10 @@ def test_headings_come_back_to_the_bit(rng):
             rng.normal(0.0, 1e-5, 2000),
         ]
     )
-    np.testing.assert_array_equal(yaw_of(quaternions_of(headings)), headings)
+    # the arctan2 of NumPy 1 does not return every float
+    last_bit = 0.0 if np.lib.NumpyVersion(np.__version__) >= "2.0.0" else np.spacing(np.pi) / 2.0
+    found = yaw_of(quaternions_of(headings))
+    np.testing.assert_allclose(found, headings, rtol=0.0, atol=last_bit)
 
 
 # A recording that goes on where the window ends, as those of drones do.
