@@ -99,8 +99,6 @@ def readonly(array: Any) -> Any:
 
     NumPy before 2.1 is given a copy of what could be written.
     """
-    if _KEEPS_READ_ONLY:
-        view = array.view()
-        view.flags.writeable = False
-        return np.from_dlpack(view)
-    return np.asarray(memoryview(array.copy() if array.flags.writeable else array).toreadonly())
+    view = array.view() if _KEEPS_READ_ONLY or not array.flags.writeable else array.copy()
+    view.flags.writeable = False
+    return np.from_dlpack(view) if _KEEPS_READ_ONLY else np.asarray(memoryview(view))
