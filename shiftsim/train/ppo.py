@@ -11,22 +11,16 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from torch import Tensor
 
-from shiftsim.env.driving import DrivingEnv, ProcessVectorEnv
+from shiftsim.env.driving import DrivingEnv, vector_env
 from shiftsim.files import write_text
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.planners.learned.carl.network import CarlNetwork, Policy
-from shiftsim.train.folder import (
-    OnMessage,
-    Settings,
-    Weights,
-    read_state,
-    write_state,
-    write_table,
-)
+from shiftsim.train import folder
+from shiftsim.train.folder import OnMessage, Settings, Weights
 from shiftsim.train.jobs import NOISES, Towns
 from shiftsim.train.learning import (
     UNITS,
@@ -62,13 +56,6 @@ class RolloutBuffer(NamedTuple):
     values: Values  # (M,) what the critic expected
     returns: Values  # (M,)
     advantages: Values  # (M,)
-
-
-class UpdateResult(NamedTuple):
-    """What an update came to."""
-
-    loss: float
-    clipped: float  # share of the steps at which the ratio was cut
 
 
 def advantages_of(
@@ -116,7 +103,7 @@ def reinforce(
     state: dict[str, Any] = {"rows": [], "best": weights, "highest": -np.inf, "seconds": 0.0}
     path = settings.out / "ppo.pt"
     if path.exists():
-        state = read_state(path)
+        state = folder.read_state(path)
         trainer.restore(state.pop("trainer"))
     began, written = monotonic() - state["seconds"], monotonic()
     with trainer:
@@ -128,16 +115,16 @@ def reinforce(
                 best = {name: v.clone() for name, v in trainer.network.state_dict().items()}
                 state |= {"best": to_official(best), "highest": mean}
             steps, seconds = trainer.update * ROLLOUT, monotonic() - began
-            state["rows"].append({"samples": steps, "return": mean, **result._asdict()})
-            left = seconds / trainer.update * (trainer.total - trainer.update)
+            state["rows"].append({"samples": steps, "return": mean, **result})
+            left = seconds / 60.0 / trainer.update * (trainer.total - trainer.update)
             on_message(
                 f"PPO: {steps} of {trainer.total * ROLLOUT} samples  {steps / seconds:.0f} "
-                f"samples/s  return {mean:.1f}  loss {result.loss:.3f}  {left / 60.0:.0f} min left"
+                f"samples/s  return {mean:.1f}  loss {result['loss']:.3f}  {left:.0f} min left"
             )
-            write_table(settings.out / "ppo.parquet", state["rows"])
+            folder.write_table(settings.out / "ppo.parquet", state["rows"])
             if monotonic() - written > _WRITE_EVERY or trainer.update == trainer.total:
                 written, state["seconds"] = monotonic(), seconds
-                write_state(path, state | {"trainer": trainer.state()})
+                folder.write_state(path, state | {"trainer": trainer.state()})
     best_weights: Weights = state["best"]
     return best_weights
 
@@ -162,11 +149,7 @@ class Trainer:
     def __enter__(self) -> "Trainer":
         makers = [partial(_make, self._settings, number) for number in range(ENVS)]
         mode = AutoresetMode.SAME_STEP
-        self._envs = (
-            SyncVectorEnv(makers, autoreset_mode=mode)
-            if self._settings.workers == 1
-            else ProcessVectorEnv(makers, autoreset_mode=mode)
-        )
+        self._envs = vector_env(makers, self._settings.workers, autoreset_mode=mode)
         seeds = np.random.default_rng([self._settings.seed, 4, self.update])
         numbers = seeds.integers(2**31, size=ENVS).tolist()
         self._seen, _ = self._envs.reset(seed=numbers)
@@ -176,8 +159,8 @@ class Trainer:
     def __exit__(self, *_: object) -> None:
         self._envs.close()
 
-    def improve(self) -> UpdateResult:
-        """Drive one rollout, and learn from it."""
+    def improve(self) -> dict[str, float]:
+        """Drive one rollout and learn from it: mean loss, share of steps with a clipped ratio."""
         random = np.random.default_rng([self._settings.seed, 5, self.update])
         torch.manual_seed(int(random.integers(2**31)))
         buffer = self._drive(ROLLOUT // ENVS)
@@ -190,7 +173,7 @@ class Trainer:
                 done, clipped = self._learn(buffer, rows, critic_only=critic_only)
                 loss, cut = loss + done * len(rows), cut + clipped
         self.update += 1
-        return UpdateResult(loss / EPOCHS / len(order), cut / EPOCHS / len(order))
+        return {"loss": loss / EPOCHS / len(order), "clipped": cut / EPOCHS / len(order)}
 
     def _drive(self, steps: int) -> RolloutBuffer:
         """Act in all environments for so many steps."""
@@ -230,17 +213,18 @@ class Trainer:
     def _learn(
         self, buffer: RolloutBuffer, order: IntArray, *, critic_only: bool
     ) -> tuple[float, float]:
-        names = ("measurements", "critic", "actions", "density", "values", "returns", "advantages")
-        chosen = {name: torch.from_numpy(getattr(buffer, name)[order]) for name in names}
+        arrays = buffer._asdict()
+        pictures = arrays.pop("pictures")
+        chosen = {name: torch.from_numpy(values[order]) for name, values in arrays.items()}
         chosen["measurements"] /= torch.from_numpy(UNITS)
         gain = chosen["advantages"]
         chosen["advantages"] = (gain - gain.mean()) / (gain.std() + 1e-8)
 
         def loss_of_rows(rows: IntArray) -> tuple[Tensor, Tensor]:
-            rasters = np.stack([read_raster(buffer.pictures[index]) for index in order[rows]])
+            rasters = np.stack([read_raster(pictures[index]) for index in order[rows]])
             part = {name: value[rows].to(self._device) for name, value in chosen.items()}
-            pictures = torch.from_numpy(rasters).to(self._device)
-            features = self.network.features_extractor(pictures, part["measurements"])
+            shown = torch.from_numpy(rasters).to(self._device)
+            features = self.network.features_extractor(shown, part["measurements"])
             policy = self.network.policy(features)
             read = features.detach() if critic_only else features
             values = self.network.value(read, part["critic"])[:, 0]
