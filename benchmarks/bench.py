@@ -93,16 +93,16 @@ def plan_bench(
             hint="`shiftsim bench edits --edits FILE` drives edited ones",
         )
     runs = _prepared(track, sets, modes, folder)
-    whole = _whole(next(iter(runs.values())))
+    unlimited = _without_limit(next(iter(runs.values())))
     if track.drawn is None:
-        return Plan(track, folder, runs, (_list_of(whole),))
-    edits, text = _edits(track.drawn, whole, edits_of, folder)
+        return Plan(track, folder, runs, (_list_of(unlimited),))
+    edits, text = _edits(track.drawn, unlimited, edits_of, folder)
     rules = {"thresholds": INTERPLAN_THRESHOLDS} if edits.profile == "interplan" else {}
     changed = {EDITED: sets[OWN] | {"edits": edits_of or str(folder / EDITS)} | rules}
     # where no mode can drive them, the reason is said when the first one is checked
     drivable = [mode for mode in modes if _drives(edits, mode)] or modes[:1]
     edited = _prepared(track, changed, drivable, folder, edits)
-    lists = (_list_of(whole), _list_of(_whole(next(iter(edited.values())))))
+    lists = (_list_of(unlimited), _list_of(_without_limit(next(iter(edited.values())))))
     return Plan(track, folder, runs | edited, lists, text)
 
 
@@ -169,7 +169,7 @@ def _check_folder(folder: Path, track: Track) -> None:
         )
 
 
-def _whole(run: RunPlan) -> RunPlan:
+def _without_limit(run: RunPlan) -> RunPlan:
     """The run on the whole list, where it is limited to its first scenarios."""
     if not run.config.limit:
         return run

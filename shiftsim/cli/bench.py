@@ -79,8 +79,8 @@ def bench(
     announce(plans, _plan_lines(plan), dry_run=dry_run, as_json=as_json)
     if dry_run:
         return
-    with progress_of(plans, plan.folder, sys.argv[1:], live, quiet or as_json) as shown:
-        runs = run_bench(plan, on_progress=shown, argv=sys.argv)
+    with progress_of(plans, plan.folder, sys.argv[1:], live, quiet or as_json) as on_progress:
+        runs = run_bench(plan, on_progress=on_progress, argv=sys.argv)
     allow_partial = settings.get("allow_partial", False)
     _report(plan, published=published, allow_partial=allow_partial, as_json=as_json)
     if not all(run.is_complete for run in runs):
@@ -113,8 +113,8 @@ def _plan_lines(plan: "Plan") -> "Iterator[str]":
         )
     yield f"noise       {' '.join(config.noise)}   seeds {' '.join(map(str, config.seeds))}"
     if config.limit:
-        whole = ", ".join(f"{own.count} of {own.name}" for own in plan.own)
-        yield f"partial     the first {config.limit} scenarios of {whole}"
+        lists = ", ".join(f"{listed.count} of {listed.name}" for listed in plan.own)
+        yield f"partial     the first {config.limit} scenarios of {lists}"
     yield f"tasks       {plan.num_tasks}   workers {first.workers}   → {plan.folder}"
 
 
@@ -128,7 +128,7 @@ def _report(plan: "Plan", *, published: bool, allow_partial: bool, as_json: bool
 
     opened = open_runs([plan.folder])
     options = Options(TABLES, None, published, allow_partial)
-    groups, tables = read_tables(opened, options, whole=True)
+    groups, tables = read_tables(opened, options, with_coverage=True)
     try:
         drawn = figures(groups, allow_partial=allow_partial)
     except MissingExtraError as error:

@@ -63,7 +63,7 @@ def report(
     kind = (style or ["text"])[0]
     default = TABLES if out or site else ("scores",) if kind == "csv" else BRIEF
     options = Options(tuple(table or default), by, published, allow_partial)
-    groups, tables = read_tables(opened, options, whole=not table)
+    groups, tables = read_tables(opened, options, with_coverage=not table)
     drawn = draw(groups, allow_partial=allow_partial) if figures or site else []
     title = f"Report on {', '.join(folder.resolve().name for folder in folders)}"
     if out is not None:
@@ -81,9 +81,9 @@ def report(
 
 
 def read_tables(
-    opened: "OpenedRuns", options: "Options", *, whole: bool
+    opened: "OpenedRuns", options: "Options", *, with_coverage: bool
 ) -> "tuple[list[Group], list[Table]]":
-    """The scores of runs by planner and noise, and tables; a `whole` report has the benchmark's."""
+    """The scores of runs by planner and noise, and tables, also those of benchmarks if asked."""
     from shiftsim.benchmarks import known_sets
     from shiftsim.benchmarks import published as published_figures
     from shiftsim.report.build import make_tables
@@ -91,7 +91,7 @@ def read_tables(
 
     groups = read_groups(opened.runs, (*known_sets(), *opened.own))
     tables = make_tables(groups, published_figures(), options)
-    if whole and options.tables != ("scores",):
+    if with_coverage and options.tables != ("scores",):
         tables = [*opened.coverage(groups), *tables]
     return groups, tables
 

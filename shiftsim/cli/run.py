@@ -88,8 +88,10 @@ def run_settings(
     if dry_run:
         return
     words = [word for word in sys.argv[1:] if word not in ("--resume", "--retry-failed")]
-    with progress_of([plan], plan.folder, [*words, "--resume"], live, quiet or as_json) as shown:
-        finished = execute(plan, on_progress=shown, argv=sys.argv)
+    with progress_of(
+        [plan], plan.folder, [*words, "--resume"], live, quiet or as_json
+    ) as on_progress:
+        finished = execute(plan, on_progress=on_progress, argv=sys.argv)
     leave_with(finished, allow_partial=plan.config.allow_partial, as_json=as_json)
 
 
@@ -106,10 +108,10 @@ def progress_of(
         with stdout_to_stderr(), progress_bar(quiet=quiet) as advance:
 
             def show(progress: "Progress") -> None:
-                advance(progress.done, progress.total, _note(progress))
+                advance(progress.done, progress.total, _time_shares(progress))
 
-            shown = _live_page(plans, folder, show) if live else nullcontext(show)
-            with _compiling_shown(partial(advance, 0, 0)), shown as on_progress:
+            page = _live_page(plans, folder, show) if live else nullcontext(show)
+            with _compiling_shown(partial(advance, 0, 0)), page as on_progress:
                 yield on_progress
     except KeyboardInterrupt:
         command = shlex.join(["shiftsim", *words])
@@ -168,8 +170,8 @@ def _live_page(
         yield add
 
 
-def _note(progress: "Progress") -> str:
-    """Where the time goes."""
+def _time_shares(progress: "Progress") -> str:
+    """Which shares of the time planning, simulation, scoring and reading take."""
     parts = dict(progress.seconds)
     planner = parts.get("planner_seconds", 0.0)
     times = {

@@ -79,20 +79,19 @@ def advantages_of(
 def ppo_loss(
     policy: Policy, values: Tensor, part: dict[str, Tensor], *, critic_only: bool
 ) -> tuple[Tensor, Tensor]:
-    """Sum of losses over some steps of a `RolloutBuffer`, and of the steps that were cut (1,)."""
+    """Loss summed over some steps of a `RolloutBuffer`; (1,) those with a clipped ratio."""
     x = part["actions"].clamp(_EDGE, 1.0 - _EDGE)
     density = log_density(policy.alpha, policy.beta, x).sum(1)
     ratio = (density - part["density"]).exp()
-    gain, near = part["advantages"], ratio.clamp(1.0 - CLIP, 1.0 + CLIP)
-    wanted, before = part["returns"], part["values"]
-    close = before + (values - before).clamp(-CLIP, CLIP)
-    off = (values - wanted).square()
+    advantages, clipped_ratio = part["advantages"], ratio.clamp(1.0 - CLIP, 1.0 + CLIP)
+    clipped_values = part["values"] + (values - part["values"]).clamp(-CLIP, CLIP)
+    errors = (values - part["returns"]).square()
     if critic_only:
-        return VALUE_WEIGHT * 0.5 * off.sum(), torch.zeros(1)  # nothing was cut
-    acting = -torch.minimum(ratio * gain, near * gain).sum()
-    critic = 0.5 * torch.maximum(off, (close - wanted).square()).sum()
-    cut = ((ratio - 1.0).abs() > CLIP).sum().detach().float().reshape(1)
-    return acting + VALUE_WEIGHT * critic, cut
+        return VALUE_WEIGHT * 0.5 * errors.sum(), torch.zeros(1)  # nothing was clipped
+    acting = -torch.minimum(ratio * advantages, clipped_ratio * advantages).sum()
+    critic = 0.5 * torch.maximum(errors, (clipped_values - part["returns"]).square()).sum()
+    num_clipped = ((ratio - 1.0).abs() > CLIP).sum().detach().float().reshape(1)
+    return acting + VALUE_WEIGHT * critic, num_clipped
 
 
 def reinforce(
@@ -152,7 +151,7 @@ class Trainer:
         self._envs = vector_env(makers, self._settings.workers, autoreset_mode=mode)
         seeds = np.random.default_rng([self._settings.seed, 4, self.update])
         numbers = seeds.integers(2**31, size=ENVS).tolist()
-        self._seen, _ = self._envs.reset(seed=numbers)
+        self._observations, _ = self._envs.reset(seed=numbers)
         self._sums = np.zeros(ENVS)
         return self
 
@@ -164,16 +163,16 @@ class Trainer:
         random = np.random.default_rng([self._settings.seed, 5, self.update])
         torch.manual_seed(int(random.integers(2**31)))
         buffer = self._drive(ROLLOUT // ENVS)
-        loss = cut = 0.0
+        loss = clipped = 0.0
         for _ in range(EPOCHS):
             order = random.permutation(len(buffer.pictures))
             for first in range(0, len(order), MINIBATCH):
                 rows = order[first : first + MINIBATCH]
                 critic_only = self.update / self.total < ALONE
-                done, clipped = self._learn(buffer, rows, critic_only=critic_only)
-                loss, cut = loss + done * len(rows), cut + clipped
+                mean_loss, count = self._learn(buffer, rows, critic_only=critic_only)
+                loss, clipped = loss + mean_loss * len(rows), clipped + count
         self.update += 1
-        return {"loss": loss / EPOCHS / len(order), "clipped": cut / EPOCHS / len(order)}
+        return {"loss": loss / EPOCHS / len(order), "clipped": clipped / EPOCHS / len(order)}
 
     def _drive(self, steps: int) -> RolloutBuffer:
         """Act in all environments for so many steps."""
@@ -183,32 +182,32 @@ class Trainer:
         density, values, rewards = np.zeros((3, steps, ENVS))
         with torch.no_grad():
             for step in range(steps):
-                seen = self._seen
-                policy, value = self._ask(seen)
+                batch = self._observations
+                policy, value = self._evaluate(*_inputs(batch))
                 x = torch.distributions.Beta(policy.alpha, policy.beta).sample()
                 x = x.clamp(_EDGE, 1.0 - _EDGE)
                 density[step] = log_density(policy.alpha, policy.beta, x).sum(1).cpu()
                 actions[step], values[step] = x.cpu(), value.cpu()
-                pictures += [compress_raster(raster) for raster in seen["raster"]]
-                measured[step], critic[step] = seen["measurements"], seen["value_measurements"]
-                asked = (2.0 * actions[step] - 1.0).astype(np.float32)
-                self._seen, reward, infraction, is_over, _ = self._envs.step(asked)
+                pictures += [compress_raster(raster) for raster in batch["raster"]]
+                measured[step], critic[step] = batch["measurements"], batch["value_measurements"]
+                sent = (2.0 * actions[step] - 1.0).astype(np.float32)
+                self._observations, reward, infraction, is_over, _ = self._envs.step(sent)
                 rewards[step], ended[step] = reward / PERCENT, infraction | is_over
                 self._sums += reward
                 self.returns += self._sums[ended[step]].tolist()
                 self._sums[ended[step]] = 0.0
-            last = self._ask(self._seen)[1].cpu().numpy().astype(np.float64)
+            last = self._evaluate(*_inputs(self._observations))[1].cpu().numpy().astype(np.float64)
         gains = advantages_of(rewards, values, ended, last)
         numbers = (measured, critic, actions, density, values, gains + values, gains)
         flat = [found.reshape(-1, *found.shape[2:]).astype(np.float32) for found in numbers]
         return RolloutBuffer(pictures, *flat)
 
-    def _ask(self, seen: dict[str, Any]) -> tuple[Policy, Tensor]:
-        """The policy and what the critic expects (ENVS,)."""
-        arrays = (seen["raster"], seen["measurements"] / UNITS, seen["value_measurements"])
-        pictures, measured, critic = (torch.from_numpy(a).to(self._device) for a in arrays)
-        features = self.network.features_extractor(pictures, measured)
-        return self.network.policy(features), self.network.value(features, critic)[:, 0]
+    def _evaluate(self, *inputs: Any, critic_only: bool = False) -> tuple[Policy, Tensor]:
+        """The policy and what the critic expects (B,); alone it does not change the features."""
+        rasters, measured, critic = (torch.as_tensor(a, device=self._device) for a in inputs)
+        features = self.network.features_extractor(rasters, measured)
+        read = features.detach() if critic_only else features
+        return self.network.policy(features), self.network.value(read, critic)[:, 0]
 
     def _learn(
         self, buffer: RolloutBuffer, order: IntArray, *, critic_only: bool
@@ -223,11 +222,8 @@ class Trainer:
         def loss_of_rows(rows: IntArray) -> tuple[Tensor, Tensor]:
             rasters = np.stack([read_raster(pictures[index]) for index in order[rows]])
             part = {name: value[rows].to(self._device) for name, value in chosen.items()}
-            shown = torch.from_numpy(rasters).to(self._device)
-            features = self.network.features_extractor(shown, part["measurements"])
-            policy = self.network.policy(features)
-            read = features.detach() if critic_only else features
-            values = self.network.value(read, part["critic"])[:, 0]
+            inputs = (rasters, part["measurements"], part["critic"])
+            policy, values = self._evaluate(*inputs, critic_only=critic_only)
             return ppo_loss(policy, values, part, critic_only=critic_only)
 
         parameters: list[Tensor] = list(self.network.parameters())
@@ -251,6 +247,11 @@ class Trainer:
         self.network.load_state_dict(state["network"])
         self._optimiser.load_state_dict(state["optimiser"])
         self.update, self.returns = state["update"], list(state["returns"])
+
+
+def _inputs(batch: dict[str, Any]) -> tuple[Values, ...]:
+    """What the network reads of observations."""
+    return batch["raster"], batch["measurements"] / UNITS, batch["value_measurements"]
 
 
 def _make(settings: Settings, number: int) -> gymnasium.Env[Any, Any]:

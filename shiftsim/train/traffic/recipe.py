@@ -77,18 +77,11 @@ def _collected(
     store: ScenarioStore, tokens: Iterable[str], file: Path, seed: int, number: int
 ) -> States:
     """States of a round; from the second one on the network drives."""
-    traffic = LearnedTraffic(file)
-    return join(
-        [
-            states_of(
-                store.read(token),
-                traffic,
-                np.random.default_rng([seed, number, place]),
-                drives=number > 0,
-            )
-            for place, token in enumerate(tokens)
-        ]
-    )
+    traffic, found = LearnedTraffic(file), list[States]()
+    for place, token in enumerate(tokens):
+        random = np.random.default_rng([seed, number, place])
+        found.append(states_of(store.read(token), traffic, random, drives=number > 0))
+    return join(found)
 
 
 def write_weights(path: Path, weights: Weights) -> None:
