@@ -6,12 +6,12 @@ to it, and `report/`.
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,8 +36,6 @@ EDITS = "edits.toml"  # what was edited, in the folder of the benchmark
 OWN, EDITED = "own", "edited"  # beginnings of names of runs
 DEFAULT_SPLIT = "demo-mini"  # of the demo store, where nothing is said
 _FORMAT = 1
-
-Extra = Callable[[Sequence[Group]], list[Table]]
 
 
 @dataclass(frozen=True)
@@ -95,16 +93,16 @@ def plan_bench(
             hint="`shiftsim bench edits --edits FILE` drives edited ones",
         )
     runs = _prepared(track, sets, modes, folder)
-    whole = _whole(next(iter(runs.values())))
+    unlimited = _without_limit(next(iter(runs.values())))
     if track.drawn is None:
-        return Plan(track, folder, runs, (_list_of(whole),))
-    edits, text = _edits(track.drawn, whole, edits_of, folder)
+        return Plan(track, folder, runs, (_list_of(unlimited),))
+    edits, text = _edits(track.drawn, unlimited, edits_of, folder)
     rules = {"thresholds": INTERPLAN_THRESHOLDS} if edits.profile == "interplan" else {}
     changed = {EDITED: sets[OWN] | {"edits": edits_of or str(folder / EDITS)} | rules}
     # where no mode can drive them, the reason is said when the first one is checked
     drivable = [mode for mode in modes if _drives(edits, mode)] or modes[:1]
     edited = _prepared(track, changed, drivable, folder, edits)
-    lists = (_list_of(whole), _list_of(_whole(next(iter(edited.values())))))
+    lists = (_list_of(unlimited), _list_of(_without_limit(next(iter(edited.values())))))
     return Plan(track, folder, runs | edited, lists, text)
 
 
@@ -171,7 +169,7 @@ def _check_folder(folder: Path, track: Track) -> None:
         )
 
 
-def _whole(run: RunPlan) -> RunPlan:
+def _without_limit(run: RunPlan) -> RunPlan:
     """The run on the whole list, where it is limited to its first scenarios."""
     if not run.config.limit:
         return run
@@ -212,57 +210,53 @@ def run_bench(
         write_text(plan.folder / EDITS, plan.edits)
     text = json.dumps(manifest, indent=1, ensure_ascii=False)
     write_text(plan.folder / MANIFEST, f"{text}\n")
-    total = _Total(plan.num_tasks, on_progress)
+    before = now = Progress(0, plan.num_tasks, 0)
+
+    def show(progress: Progress) -> None:  # that of one run is added to that of those before it
+        nonlocal now
+        now = before + replace(progress, total=0)
+        on_progress(now)
+
     out = []
     for run in plan.runs.values():
         if run.before == "complete":
             out.append(open_run(run.folder))
-            total.show(Progress(len(run.tasks), 0, 0, news=stored_results(run.folder)))
+            show(Progress(len(run.tasks), 0, 0, news=stored_results(run.folder)))
         else:
-            out.append(execute(run, on_progress=total.show, argv=argv))
-        total.before = total.now
+            out.append(execute(run, on_progress=show, argv=argv))
+        before = now
     return out
 
 
-class _Total:
-    """The progress of runs that follow one another, as that of one."""
+class OpenedRuns(NamedTuple):
+    """The runs of folders."""
 
-    def __init__(self, num_tasks: int, on_progress: Callable[[Progress], None]) -> None:
-        self.before = self.now = Progress(0, num_tasks, 0)
-        self._on_progress = on_progress
+    runs: list[Run]
+    own: list[KnownSet]  # lists of scenarios that benchmarks name
+    tracks: list[Track]  # of the benchmarks
 
-    def show(self, progress: Progress) -> None:
-        """Add the progress of a run to that of the runs before it."""
-        self.now = self.before + replace(progress, total=0)
-        self._on_progress(self.now)
+    def coverage(self, groups: Sequence[Group]) -> list[Table]:
+        """The tables that only a benchmark has."""
+        return [coverage(track, groups) for track in dict.fromkeys(self.tracks)]
 
 
-def open_runs(folders: Sequence[Path]) -> tuple[list[Run], list[KnownSet], Extra]:
+def open_runs(folders: Iterable[Path]) -> OpenedRuns:
     """The runs of folders, where the folder of a benchmark stands for all of its runs.
-
-    Returns the runs, the lists of scenarios that benchmarks name, and a function that makes the
-    tables which only a benchmark has.
 
     Raises:
         ShiftsimError: A folder is neither, or damaged.
     """
-    runs: list[Run] = []
-    own: list[KnownSet] = []
-    tracks: list[Track] = []
+    out = OpenedRuns([], [], [])
     for folder in folders:
         found = _read_manifest(folder)
         if found is None:
-            runs.append(open_run(folder))
+            out.runs.append(open_run(folder))
             continue
-        runs += [open_run(folder / name) for name in found["runs"]]
+        out.runs.extend(open_run(folder / name) for name in found["runs"])
         for one in (found["own"], *found.get("edited", ())):
-            own.append(KnownSet(label=one["name"], thresholds="", **one))
-        tracks.append(load_track(found["track"]))
-
-    def extra(groups: Sequence[Group]) -> list[Table]:
-        return [coverage(track, groups) for track in dict.fromkeys(tracks)]
-
-    return runs, own, extra
+            out.own.append(KnownSet(label=one["name"], thresholds="", **one))
+        out.tracks.append(load_track(found["track"]))
+    return out
 
 
 def paired_runs(first: Path, second: Path) -> list[tuple[Run, Run]]:
@@ -271,7 +265,7 @@ def paired_runs(first: Path, second: Path) -> list[tuple[Run, Run]]:
     Raises:
         ShiftsimError: A folder is neither, or there is no such pair.
     """
-    ours, theirs = (open_runs([folder])[0] for folder in (first, second))
+    ours, theirs = (open_runs([folder]).runs for folder in (first, second))
     if len(ours) == len(theirs) == 1:
         return [(ours[0], theirs[0])]
     named = {run.path.name: run for run in theirs}

@@ -7,7 +7,7 @@ compiles; nothing is kept.
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
@@ -118,8 +118,6 @@ def _time(hours: float) -> str:
 
 def as_json(plan: Plan, costs: list[Cost], *, shards: int) -> Mapping[str, object]:
     """As plain values."""
-    rows = [
-        {name: getattr(cost, name) for name in Cost.__slots__} for cost in (*costs, total(costs))
-    ]
+    rows = [asdict(cost) for cost in (*costs, total(costs))]
     workers = next(iter(plan.runs.values())).workers
     return {"track": plan.track.name, "workers": workers, "shards": shards, "costs": rows}

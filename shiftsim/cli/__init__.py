@@ -1,7 +1,8 @@
 """The command line: parse, call the API, print. Nothing heavy is imported before it is needed.
 
 First what several commands share: options, progress, JSON. Options are made from the settings of a
-run: a field of `RunConfig` is an option. Then the table of all commands and the main function.
+run or a training: a field of `RunConfig` is an option. Then the table of all commands and the main
+function.
 
 Errors are two lines, the fact and what to do; `--debug` (before or after the command) shows the
 traceback. Exit codes: 0 all well, 1 usage or settings, 2 data, 3 finished with failed or missing
@@ -17,18 +18,19 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from functools import cache, wraps
 from importlib import import_module
 from typing import Annotated, Any, TextIO, TypeAlias, get_args, get_origin
 
 import typer
+from typer import Option, echo
 
 from shiftsim.errors import DataError, ShiftsimError
 from shiftsim.runs.config import RunConfig, parse_argument
 
-Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress.")]
+Json = Annotated[bool, Option("--json", help="Print JSON.")]
+Quiet = Annotated[bool, Option("--quiet", "-q", help="Print no progress.")]
 
 
 def new_app(help: str = "", **settings: Any) -> typer.Typer:
@@ -43,14 +45,18 @@ def new_app(help: str = "", **settings: Any) -> typer.Typer:
     )
 
 
-def say(text: str = "") -> None:
-    """One line of output."""
-    typer.echo(text)
+def print_json(value: Any) -> None:
+    """Print a value as JSON; what JSON does not know becomes text."""
+    echo(json.dumps(value, indent=2, ensure_ascii=False, default=str))
 
 
-def say_json(value: Any) -> None:
-    """A value as JSON; what JSON does not know becomes text."""
-    typer.echo(json.dumps(value, indent=2, ensure_ascii=False, default=str))
+def print_result(values: Any, lines: Iterable[str], *, as_json: bool) -> None:
+    """Print a result as JSON or line by line."""
+    if as_json:
+        print_json(values)
+    else:
+        for line in lines:
+            echo(line)
 
 
 def stdout_to_stderr() -> redirect_stdout[TextIO]:
@@ -59,15 +65,6 @@ def stdout_to_stderr() -> redirect_stdout[TextIO]:
     What workers print goes there anyway.
     """
     return redirect_stdout(sys.stderr)
-
-
-def show(values: Any, lines: Iterable[str], *, as_json: bool) -> None:
-    """What was found, as JSON or line by line."""
-    if as_json:
-        say_json(values)
-    else:
-        for line in lines:
-            say(line)
 
 
 def plural(count: int, noun: str) -> str:
@@ -128,32 +125,34 @@ def _lines(quiet: bool) -> Advance:
             return
         last = tenth
         if not total:
-            typer.echo(f" {note}", err=True)
+            echo(f" {note}", err=True)
             return
         elapsed = time.monotonic() - began
         left = elapsed / done * (total - done)
         tail = f"  {note}" if note else ""
         text = f" {10 * tenth:3d} %  {done}/{total}  {elapsed:.0f} s, {left:.0f} s left{tail}"
-        typer.echo(text, err=True)
+        echo(text, err=True)
 
     return advance
 
 
 Settings: TypeAlias = dict[str, Any]
-_FIELDS = {item.name: item for item in fields(RunConfig)}
-ALL = tuple(_FIELDS)
 _KIND = inspect.Parameter.KEYWORD_ONLY  # those with a default may come first
 
 
 def with_settings(
-    *names: str, **helps: str
+    *names: str, of: Any = RunConfig, **helps: str
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Give a command the options of settings, at the place of its parameter `settings`.
 
-    The command gets those that were given, as `RunConfig` wants them; arguments of planners are
-    texts still, for `planner_arguments`. `helps` are other help texts for some of them.
+    The command gets those that were given, as the dataclass `of` settings wants them; arguments of
+    planners are texts still, for `planner_arguments`. Without `names` it has all of them. `helps`
+    are other help texts for some of them.
     """
-    options = [_option(name, helps.get(name)) for name in names]
+    known = {item.name: item for item in fields(of)}
+    items = [known[name] for name in names or known]
+    in_file = of is RunConfig  # where settings may be that are not given
+    options = [_option(item, helps.get(item.name), in_file=in_file) for item in items]
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         parameters: list[inspect.Parameter] = []
@@ -162,8 +161,11 @@ def with_settings(
 
         @wraps(command)
         def call(**values: Any) -> None:
-            raw = {name: values.pop(name) for name in names}
-            settings = {n: _parsed(n, value) for n, value in raw.items() if value not in (None, [])}
+            settings = {}
+            for item in items:
+                value, parse = values.pop(item.name), item.metadata["option"].parse
+                if value not in (None, []):
+                    settings[item.name] = parse(value) if parse else value
             command(settings=settings, **values)
 
         call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -173,22 +175,23 @@ def with_settings(
     return decorate
 
 
-def _option(name: str, text: str | None) -> inspect.Parameter:
-    item = _FIELDS[name]
-    option = item.metadata["option"]
-    kind: Any = item.type
+def _option(item: Any, text: str | None, *, in_file: bool) -> inspect.Parameter:
+    option, kind = item.metadata["option"], item.type
     if get_origin(kind) is dict or (get_origin(kind) is tuple and not option.parse):
         kind = list[get_args(kind)[0]]  # type: ignore[misc]
     elif option.parse:
         kind = str
-    flags = option.flags or ((f"--{name.replace('_', '-')}",) if kind is bool else ())
-    words = typer.Option(*flags, help=text or option.help)
-    return inspect.Parameter(name, _KIND, default=None, annotation=Annotated[kind | None, words])
+    flags = option.flags or ((f"--{item.name.replace('_', '-')}",) if kind is bool else ())
+    words = Option(*flags, help=text or option.help)
+    default = None if in_file else item.default
+    default = inspect.Parameter.empty if default is MISSING else default
+    kind = Annotated[kind | None, words]
+    return inspect.Parameter(item.name, _KIND, default=default, annotation=kind)
 
 
-def _parsed(name: str, value: Any) -> Any:
-    parse = _FIELDS[name].metadata["option"].parse
-    return parse(value) if parse else value
+def given(**values: Any) -> Settings:
+    """The values of the options that were given."""
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def planner_arguments(
@@ -202,7 +205,8 @@ def planner_arguments(
     return arguments
 
 
-_USAGE, _DATA, _INTERRUPTED = 1, 2, 130
+# exit codes
+USAGE, DATA, UNFINISHED, INTERRUPTED = 1, 2, 3, 130
 # of whichever click typer was built on
 _ClickError: Any = typer.BadParameter.__mro__[2]
 # command -> where it is: a function, or further commands; imported when it is used
@@ -277,14 +281,14 @@ app = new_app(
 
 @app.callback(invoke_without_command=True)
 def _options(
-    version: bool = typer.Option(False, "--version", help="Print the version and leave."),
-    debug: bool = typer.Option(False, "--debug", help="With any command: show tracebacks."),
+    version: bool = Option(False, "--version", help="Print the version and leave."),
+    debug: bool = Option(False, "--debug", help="With any command: show tracebacks."),
 ) -> None:
     """Closed-loop evaluation of driving planners with nuPlan's semantics."""
     if version:
         from shiftsim._version import __version__
 
-        typer.echo(__version__)
+        echo(__version__)
         raise typer.Exit
 
 
@@ -296,7 +300,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         code = _run([word for word in words if word != "--debug"], debug)
     except BrokenPipeError:  # the reader of our output has left, as `| head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        code = _USAGE
+        code = USAGE
     sys.exit(code)
 
 
@@ -305,34 +309,31 @@ def _run(words: list[str], debug: bool) -> int:
         command: Any = typer.main.get_command(app)
         code = command.main(words, prog_name="shiftsim", standalone_mode=False)
     except (KeyboardInterrupt, typer.Abort):
-        code = _INTERRUPTED
+        code = INTERRUPTED
     except Interrupted as error:
-        return _complain("interrupted", str(error), _INTERRUPTED)
-    except ShiftsimError as error:
+        return _print_error("interrupted", str(error), INTERRUPTED)
+    except (ShiftsimError, OSError) as error:
         if debug:
             raise
-        return _complain(
-            error.message, error.hint, _DATA if isinstance(error, DataError) else _USAGE
-        )
-    except OSError as error:
-        if debug:
-            raise
+        if isinstance(error, ShiftsimError):
+            code = DATA if isinstance(error, DataError) else USAGE
+            return _print_error(error.message, error.hint, code)
         where = f"{error.filename}: " if error.filename else ""
-        return _complain(f"{where}{error.strerror or error}", "check path and disk", _DATA)
+        return _print_error(f"{where}{error.strerror or error}", "check path and disk", DATA)
     except _ClickError as error:
         context = getattr(error, "ctx", None)
         path = context.command_path if context is not None else "shiftsim"
-        return _complain(error.format_message(), f"{path} --help", _USAGE)
-    if code == _INTERRUPTED:  # typer has taken the interrupt for itself
-        again = [*words, *(["--resume"] if words[:2] == ["train", "carl"] else [])]
-        hint = f"go on, or start again, with: {shlex.join(['shiftsim', *again])}"
-        return _complain("interrupted", hint, _INTERRUPTED)
+        return _print_error(error.format_message(), f"{path} --help", USAGE)
+    if code == INTERRUPTED:  # typer has taken the interrupt for itself
+        option = ["--resume"] if words[:2] == ["train", "carl"] else []
+        hint = f"go on, or start again, with: {shlex.join(['shiftsim', *words, *option])}"
+        return _print_error("interrupted", hint, INTERRUPTED)
     return code if isinstance(code, int) else 0
 
 
-def _complain(fact: str, hint: str, code: int) -> int:
-    over = "\r" if code == _INTERRUPTED and sys.stderr.isatty() else ""  # the ^C of the terminal
-    typer.echo(f"{over}error: {fact}", err=True)
+def _print_error(fact: str, hint: str, code: int) -> int:
+    over = "\r" if code == INTERRUPTED and sys.stderr.isatty() else ""  # the ^C of the terminal
+    echo(f"{over}error: {fact}", err=True)
     if hint:
-        typer.echo(f"hint: {hint}", err=True)
+        echo(f"hint: {hint}", err=True)
     return code

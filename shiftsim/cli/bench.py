@@ -1,29 +1,27 @@
 """Commands about benchmark tracks: `bench` runs and reports one, `data` says what is missing."""
 
 import sys
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
+from typer import Argument, Option, echo
 
 from shiftsim import cli
-from shiftsim.cli import Json, Quiet, plural, say, say_json, show, stdout_to_stderr
-from shiftsim.cli.run import DryRun, Live, progress_of, say_dry_run, say_provenance
+from shiftsim.cli import Json, Quiet, plural, print_json, print_result, stdout_to_stderr
+from shiftsim.cli.report import read_tables
+from shiftsim.cli.run import DryRun, Live, announce, progress_of
+from shiftsim.errors import MissingExtraError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator
 
     from shiftsim.benchmarks.bench import Plan
-    from shiftsim.report.figures import Figure
-    from shiftsim.report.groups import Group
 
-_UNFINISHED = 3
 _MAIN_TABLE = {
     "semantic-shift": "semantic-shift",
     "state-drift": "noise-robustness",
     "edits": "edits",
 }
-
-
 _SETTINGS = """planners store split edits checkpoints planner_args seeds noise traffic controller
 limit device batch_size strict workers timeout executor scheduler resume retry_failed out
 save_rollouts allow_partial""".split()
@@ -41,25 +39,15 @@ save_rollouts allow_partial""".split()
     retry_failed="Do again what failed before.",
 )
 def bench(
-    track: Annotated[
-        str,
-        typer.Argument(
-            help="semantic-shift, state-drift or edits.",
-        ),
-    ],
+    *,
+    track: str = Argument(help="semantic-shift, state-drift or edits."),
     settings: cli.Settings,
-    val14: Annotated[
-        str | None, typer.Option(help="Store, or STORE:SPLIT, with Val14 (left out).")
-    ] = None,
-    published: Annotated[
-        bool, typer.Option("--published", help="The paper's figures beside the own ones.")
-    ] = False,
-    estimate: Annotated[
-        bool, typer.Option("--estimate", help="Only say what it will cost, after a few tasks.")
-    ] = False,
-    shards: Annotated[
-        int, typer.Option(min=1, help="Machines that share the tasks, for --estimate.")
-    ] = 1,
+    val14: str = Option("", help="Store, or STORE:SPLIT, with Val14 (left out)."),
+    published: bool = Option(False, "--published", help="The paper's figures beside the own ones."),
+    estimate: bool = Option(
+        False, "--estimate", help="Only say what it will cost, after a few tasks."
+    ),
+    shards: int = Option(1, min=1, help="Machines that share the tasks, for --estimate."),
     dry_run: DryRun = False,
     live: Live = False,
     quiet: Quiet = False,
@@ -69,6 +57,7 @@ def bench(
 
     The same command again goes on where the first one ended.
     """
+    from shiftsim.benchmarks import estimate as costs_of
     from shiftsim.benchmarks import load_track
     from shiftsim.benchmarks.bench import plan_bench, run_bench
 
@@ -80,33 +69,22 @@ def bench(
     if published:  # beside the paper's figures nothing stands in for the paper's planners
         settings["checkpoints"] = (*settings.get("checkpoints", ()), *_official(settings))
     with stdout_to_stderr():
-        plan = plan_bench(chosen, settings, reference=val14 or "", out=out)
-    if estimate:
-        _estimate(plan, shards, as_json=as_json)
+        plan = plan_bench(chosen, settings, reference=val14, out=out)
+        costs = costs_of.estimate(plan, shards=shards) if estimate else None
+    if costs is not None:
+        lines = costs_of.lines(plan, costs, shards=shards)
+        print_result(costs_of.as_json(plan, costs, shards=shards), lines, as_json=as_json)
         return
     plans = list(plan.runs.values())
-    say_provenance(plans, as_json=as_json)
-    if not as_json:
-        _say_plan(plan)
+    announce(plans, _plan_lines(plan), dry_run=dry_run, as_json=as_json)
     if dry_run:
-        say_dry_run(plans, as_json=as_json)
         return
-    with progress_of(plans, plan.folder, sys.argv[1:], live, quiet or as_json) as shown:
-        runs = run_bench(plan, on_progress=shown, argv=sys.argv)
+    with progress_of(plans, plan.folder, sys.argv[1:], live, quiet or as_json) as on_progress:
+        runs = run_bench(plan, on_progress=on_progress, argv=sys.argv)
     allow_partial = settings.get("allow_partial", False)
     _report(plan, published=published, allow_partial=allow_partial, as_json=as_json)
     if not all(run.is_complete for run in runs):
-        raise typer.Exit(_UNFINISHED)
-
-
-def _estimate(plan: "Plan", shards: int, *, as_json: bool) -> None:
-    """Do a few tasks, and say what all of them cost."""
-    from shiftsim.benchmarks import estimate
-
-    with cli.stdout_to_stderr():
-        costs = estimate.estimate(plan, shards=shards)
-    lines = estimate.lines(plan, costs, shards=shards)
-    show(estimate.as_json(plan, costs, shards=shards), lines, as_json=as_json)
+        raise typer.Exit(cli.UNFINISHED)
 
 
 def _official(settings: cli.Settings) -> list[str]:
@@ -123,64 +101,49 @@ def _official(settings: cli.Settings) -> list[str]:
     return [f"{name}={OFFICIAL}" for name in names if name not in named]
 
 
-def _say_plan(plan: "Plan") -> None:
-    """What will be run."""
-    track = plan.track
+def _plan_lines(plan: "Plan") -> "Iterator[str]":
     first = next(iter(plan.runs.values()))
     config = first.config
-    say(f"track       {track.name}   planners {' '.join(config.planners)}")
+    yield f"track       {plan.track.name}   planners {' '.join(config.planners)}"
     for name, run in plan.runs.items():
         found = len({task.token for task in run.tasks})
-        say(
+        yield (
             f"run         {name}: split {run.selection.split}, {plural(found, 'scenario')}, "
             f"traffic {run.config.traffic}, thresholds {run.config.thresholds}"
         )
-    say(f"noise       {' '.join(config.noise)}   seeds {' '.join(map(str, config.seeds))}")
+    yield f"noise       {' '.join(config.noise)}   seeds {' '.join(map(str, config.seeds))}"
     if config.limit:
-        whole = ", ".join(f"{own.count} of {own.name}" for own in plan.own)
-        say(f"partial     the first {config.limit} scenarios of {whole}")
-    say(f"tasks       {plan.num_tasks}   workers {first.workers}   → {plan.folder}")
-    say()
+        lists = ", ".join(f"{listed.count} of {listed.name}" for listed in plan.own)
+        yield f"partial     the first {config.limit} scenarios of {lists}"
+    yield f"tasks       {plan.num_tasks}   workers {first.workers}   → {plan.folder}"
 
 
 def _report(plan: "Plan", *, published: bool, allow_partial: bool, as_json: bool) -> None:
     """Print the main tables, and write everything below `report/`."""
-    from shiftsim.benchmarks import known_sets
-    from shiftsim.benchmarks import published as published_figures
     from shiftsim.benchmarks.bench import open_runs
-    from shiftsim.report.build import TABLES, Options, make_tables, write_report
-    from shiftsim.report.groups import read_groups
+    from shiftsim.report.build import TABLES, Options, write_report
+    from shiftsim.report.figures import figures
     from shiftsim.report.scores import summary
     from shiftsim.report.tables import FORMATS, render
 
-    runs, own, extra = open_runs([plan.folder])
-    groups = read_groups(runs, (*known_sets(), *own))
+    opened = open_runs([plan.folder])
     options = Options(TABLES, None, published, allow_partial)
-    tables = [*extra(groups), *make_tables(groups, published_figures(), options)]
-    drawn, title = _pictures(groups, allow_partial), f"Report on {plan.folder.resolve().name}"
-    files = write_report(plan.folder / "report", title, runs, tables, drawn, FORMATS)
+    groups, tables = read_tables(opened, options, with_coverage=True)
+    try:
+        drawn = figures(groups, allow_partial=allow_partial)
+    except MissingExtraError as error:
+        echo(f" no pictures: {error.message}; {error.hint}", err=True)
+        drawn = []
+    title = f"Report on {plan.folder.resolve().name}"
+    files = write_report(plan.folder / "report", title, opened.runs, tables, drawn, FORMATS)
     if as_json:
-        say_json([summary(run) for run in runs])
+        print_json([summary(run) for run in opened.runs])
         return
     shown = ("coverage", _MAIN_TABLE[plan.track.name], "planner-comparison")
     for table in tables:
         if table.name.partition("_")[0] in shown:
-            say()
-            say(render(table, "text", width=cli.terminal_width()))
-    say()
-    say(f" report: {plan.folder / 'report'} ({plural(len(files), 'file')})")
-
-
-def _pictures(groups: "Sequence[Group]", allow_partial: bool) -> "list[Figure]":
-    """The pictures, or none where matplotlib is not installed."""
-    from shiftsim.errors import MissingExtraError
-    from shiftsim.report.figures import figures
-
-    try:
-        return figures(groups, allow_partial=allow_partial)
-    except MissingExtraError as error:
-        typer.echo(f" no pictures: {error.message}; {error.hint}", err=True)
-        return []
+            echo("\n" + render(table, "text", width=cli.terminal_width()))
+    echo(f"\n report: {plan.folder / 'report'} ({plural(len(files), 'file')})")
 
 
 def data(as_json: Json = False) -> None:
@@ -188,7 +151,7 @@ def data(as_json: Json = False) -> None:
     from shiftsim.benchmarks.inventory import list_available_data
 
     found = list_available_data()
-    show(found, _inventory_lines(found), as_json=as_json)
+    print_result(found, _inventory_lines(found), as_json=as_json)
 
 
 def _inventory_lines(found: dict[str, Any]) -> "Iterator[str]":

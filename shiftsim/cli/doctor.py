@@ -3,38 +3,39 @@
 import os
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Any
+from typing import Any
 
 import typer
+from typer import Argument, Option, echo
 
-from shiftsim.cli import Advance, Json, Quiet, progress_bar, say, show
-
-_DATA = 2
+import shiftsim
+from shiftsim import cli
+from shiftsim.cli import Advance, Json, Quiet, print_result, progress_bar
+from shiftsim.errors import ConfigError, DataError, one_of
 
 
 def verify(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of results.")],
-    experiment: Annotated[
-        bool, typer.Option("--experiment", help="DIR holds what nuPlan's run_simulation.py wrote.")
-    ] = False,
-    store: Annotated[
-        str | None, typer.Option("--store", "-s", help="Store with the scenarios of --experiment.")
-    ] = None,
-    mode: Annotated[str | None, typer.Option(help="Only runs of this mode: NR, R or PT.")] = None,
-    require_all: Annotated[
-        bool, typer.Option("--require-all", help="Exit with 3 if anything is not covered.")
-    ] = False,
+    folder: Path = Argument(metavar="DIR", help="Folder of results."),
+    experiment: bool = Option(
+        False, "--experiment", help="DIR holds what nuPlan's run_simulation.py wrote."
+    ),
+    store: str | None = Option(
+        None, "--store", "-s", help="Store with the scenarios of --experiment."
+    ),
+    mode: str | None = Option(None, help="Only runs of this mode: NR, R or PT."),
+    require_all: bool = Option(
+        False, "--require-all", help="Exit with 3 if anything is not covered."
+    ),
 ) -> None:
     """Compare results of your own from nuPlan with what shiftsim computes.
 
     Exit codes: 0 all covered cases equal, 1 a mismatch, 2 nothing covered or not recognised,
     3 not all covered (with --require-all).
     """
-    from shiftsim.errors import ConfigError, DataError, one_of
-    from shiftsim.runs.scenarios import open_named_store
     from shiftsim.verify.experiment import verify_experiment
     from shiftsim.verify.rollouts import CHALLENGES
 
@@ -53,19 +54,16 @@ def verify(
             f"{folder}: nothing says where the scenarios are",
             hint="--store NAME; shiftsim convert nuplan LOGS MAPS --store NAME makes it",
         )
-    opened = open_named_store(store)
+    opened = shiftsim.open_store(store)
     result = verify_experiment(
         folder, lambda token: opened.read_recorded(token) if token in opened else None, mode
     )
-    for line in result.lines():
-        say(line)
+    echo("\n".join(result.lines()))
     raise typer.Exit(result.exit_code(require_all=require_all))
 
 
 def doctor(
-    fills: Annotated[
-        bool, typer.Option("--compile", help="First compile all kernels that runs need.")
-    ] = False,
+    fills: bool = Option(False, "--compile", help="First compile all kernels that runs need."),
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -75,10 +73,16 @@ def doctor(
         with progress_bar(quiet=quiet or as_json) as advance:
             kernels = compile_kernels(advance)
     with progress_bar(quiet=quiet or as_json) as advance:
-        found = replace(examine(advance), kernels=kernels)
-    show(asdict(found), found.lines(), as_json=as_json)
+        found = examine(advance, kernels)
+    print_result(asdict(found), found.lines(), as_json=as_json)
     if not found.is_well:
-        raise typer.Exit(_DATA)
+        raise typer.Exit(cli.DATA)
+
+
+_COMPILED = (
+    " kernels: {files} ({bytes:.3g} bytes) in {folder}, {compiled} of them compiled in "
+    "{seconds:.0f} s"
+)
 
 
 @dataclass(frozen=True)
@@ -94,7 +98,7 @@ class Diagnosis:
     seconds: float  # how long the checks took, compilation included [s]
     cases: int  # reference values compared
     mismatches: tuple[str, ...]  # those that differ, in words
-    kernels: dict[str, Any] | None = None  # of `compile_kernels`, where it was asked for
+    kernels: dict[str, Any] | None  # of `compile_kernels`, where it was asked for
 
     @property
     def is_well(self) -> bool:
@@ -106,22 +110,20 @@ class Diagnosis:
         packages = "  ".join(f"{name} {version}" for name, version in self.versions.items())
         memory = f"{self.memory / 1e9:.1f} GB memory" if self.memory else "memory unknown"
         equal = self.cases - len(self.mismatches)
-        compiled = (
-            " kernels: {files} ({bytes:.3g} bytes) in {folder}, {compiled} of them compiled in "
-            "{seconds:.0f} s"
-        )
         return [
             f" {packages}",
             f" torch: {self.torch}",
             f" {self.cores} cores, {memory}, suggested workers {self.workers}",
             f" kernel cache: {self.kernel_cache}",
-            *([compiled.format(**self.kernels)] if self.kernels else []),
+            *([_COMPILED.format(**self.kernels)] if self.kernels else []),
             f" reference checks {equal}/{self.cases} equal in {self.seconds:.1f} s",
             *(f" MISMATCH {line}" for line in self.mismatches[:20]),
         ]
 
 
-def examine(advance: Advance = lambda *progress: None) -> Diagnosis:
+def examine(
+    advance: Advance = lambda *progress: None, kernels: dict[str, Any] | None = None
+) -> Diagnosis:
     """Examine this installation; compiles the kernels that are not in the cache yet."""
     from shiftsim.kernels import CACHE_FOLDER
     from shiftsim.runs.config import default_workers
@@ -146,6 +148,7 @@ def examine(advance: Advance = lambda *progress: None) -> Diagnosis:
         seconds=perf_counter() - began,
         cases=report.num_cases,
         mismatches=tuple(report.mismatches),
+        kernels=kernels,
     )
 
 
@@ -173,7 +176,6 @@ def compile_kernels(advance: Advance) -> dict[str, Any]:
     Raises:
         ShiftsimError: A run failed.
     """
-    from shiftsim.api import run
     from shiftsim.data.synthetic.store import demo_store
     from shiftsim.kernels import CACHE_FOLDER, machine_code
 
@@ -184,7 +186,7 @@ def compile_kernels(advance: Advance) -> dict[str, Any]:
         for number, (planners, settings) in enumerate(runs):
             advance(number, len(runs), f"{', '.join(planners)} in {settings['traffic']} traffic")
             settings |= {"store": str(store), "split": "demo-mini", "limit": 6, "workers": 1}
-            run(planners, noise="ou-high", out=f"{folder}/run-{number}", **settings)
+            shiftsim.run(planners, noise="ou-high", out=f"{folder}/run-{number}", **settings)
         advance(len(runs), len(runs))
     files = machine_code()
     return {
@@ -198,8 +200,6 @@ def compile_kernels(advance: Advance) -> dict[str, Any]:
 
 def _compiling_runs() -> Iterator[tuple[Sequence[str], dict[str, Any]]]:
     """Planners and settings of runs that together use every kernel."""
-    from importlib.util import find_spec
-
     from shiftsim.planners.table import PLANNERS
 
     learned = [name for name, entry in PLANNERS.items() if entry.kind == "learned"]

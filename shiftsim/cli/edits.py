@@ -1,39 +1,40 @@
 """`shiftsim edits`: look at edits of scenarios before they are run, and import interPlan's."""
 
+from collections import Counter
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option, echo
 
-from shiftsim.cli import Json, new_app, plural, say, say_json
+import shiftsim
+from shiftsim.cli import Json, new_app, plural, print_result
+from shiftsim.errors import ConfigError, ShiftsimError, beginning, one_of
+from shiftsim.files import write_text
 
 app = new_app("Edits of recorded scenarios: check them, look at them, import interPlan's.")
 
-File = Annotated[str, typer.Argument(metavar="FILE", help="A .toml file of edits.")]
-Store = Annotated[str, typer.Option("--store", "-s", help="Name or folder. [demo]")]
+File = Annotated[str, Argument(metavar="FILE", help="A .toml file of edits.")]
+Store = Annotated[str, Option("--store", "-s", help="Name or folder. [demo]")]
 
 
 @app.command()
 def check(
     file: File,
     store: Store = "demo",
-    traffic: Annotated[
-        str, typer.Option(help="Also whether this traffic can drive it: nr or r.")
-    ] = "",
-    avoidable: Annotated[
-        bool,
-        typer.Option("--avoidable", help="Also whether braking or PDM-Closed avoids it."),
-    ] = False,
+    traffic: str = Option("", help="Also whether this traffic can drive it: nr or r."),
+    avoidable: bool = Option(
+        False, "--avoidable", help="Also whether braking or PDM-Closed avoids it."
+    ),
     as_json: Json = False,
 ) -> None:
     """Apply every edit to its scenarios, and say which cannot be applied and why."""
-    from shiftsim.errors import ConfigError, ShiftsimError
     from shiftsim.runs.avoidable import is_avoidable
     from shiftsim.runs.edited import EditedStore
-    from shiftsim.runs.scenarios import open_edits, open_named_store
+    from shiftsim.runs.scenarios import open_edits
     from shiftsim.sim.traffic import traffic_name
 
-    opened = open_named_store(store)
+    opened = shiftsim.open_store(store)
     edits = open_edits(file, opened)
     if traffic:
         edits.require_traffic(traffic_name(traffic))
@@ -48,12 +49,11 @@ def check(
         except ShiftsimError as error:
             refused.append({"token": token, "error": error.message, "hint": error.hint})
     count = len(edited.tokens)
-    if as_json:
-        say_json({"edited": count, "refused": refused})
-    else:
-        for row in refused:
-            say(f"refused: {row['error']}" + (f" ({row['hint']})" if row["hint"] else ""))
-        say(f"{plural(count, 'edited scenario')}, {len(refused)} refused")
+    lines = [
+        *(f"refused: {row['error']}" + (row["hint"] and f" ({row['hint']})") for row in refused),
+        f"{plural(count, 'edited scenario')}, {len(refused)} refused",
+    ]
+    print_result({"edited": count, "refused": refused}, lines, as_json=as_json)
     if refused:
         raise ConfigError(
             f"{len(refused)} of {plural(count, 'edited scenario')} cannot be made",
@@ -64,93 +64,74 @@ def check(
 @app.command()
 def show(
     file: File,
-    token: Annotated[
-        str, typer.Argument(metavar="TOKEN", help="An edited scenario, or its beginning.")
-    ],
+    token: str = Argument(metavar="TOKEN", help="An edited scenario, or its beginning."),
     store: Store = "demo",
-    out: Annotated[
-        Path, typer.Option("--out", "-o", help="A .pdf, .png or .svg: before and after.")
-    ] = Path("edit.png"),
+    out: Path = Option(
+        Path("edit.png"), "--out", "-o", help="A .pdf, .png or .svg: before and after."
+    ),
 ) -> None:
     """What an edit makes of a scenario: words, and a picture of before and after."""
-    from shiftsim.errors import beginning
     from shiftsim.report.palette import save_picture
     from shiftsim.runs.edited import EditedStore
-    from shiftsim.runs.scenarios import open_edits, open_named_store
+    from shiftsim.runs.scenarios import open_edits
     from shiftsim.view.still import before_and_after
 
-    opened = open_named_store(store)
+    opened = shiftsim.open_store(store)
     edited = EditedStore(opened, open_edits(file, opened))
     found = beginning(f"edits {file!r}", "edited scenario", token, edited.tokens)
     scenario = edited.read(found)
-    script = scenario.script
-    say(f"{found}  {scenario.scenario_type}")
-    for line in script.words if script else ():
-        say(f"  {line}")
+    words = scenario.script.words if scenario.script else ()
+    echo("\n  ".join([f"{found}  {scenario.scenario_type}", *words]))
     out.parent.mkdir(parents=True, exist_ok=True)
     save_picture(before_and_after(opened.read(edited.base(found)), scenario), out)
-    say(f"written: {out}")
+    echo(f"written: {out}")
 
 
 @app.command("import")
 def import_edits(
-    names: Annotated[
-        Path, typer.Argument(metavar="NAMES", help="interPlan's filter: scenario_tokens in YAML.")
-    ],
-    modifications: Annotated[
-        Path, typer.Argument(metavar="MODIFICATIONS", help="Its interPlan_modifications.yaml.")
-    ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The .toml file to write.")] = Path(
-        "interplan.toml"
+    names: Path = Argument(metavar="NAMES", help="interPlan's filter: scenario_tokens in YAML."),
+    modifications: Path = Argument(
+        metavar="MODIFICATIONS", help="Its interPlan_modifications.yaml."
     ),
-    window: Annotated[
-        float, typer.Option(help="Duration of the scenarios [s]; 0 keeps the recorded one.")
-    ] = 30.0,
+    out: Path = Option(Path("interplan.toml"), "--out", "-o", help="The .toml file to write."),
+    window: float = Option(30.0, help="Duration of the scenarios [s]; 0 keeps the recorded one."),
 ) -> None:
     """Edits that make interPlan's scenarios, from interPlan's own two files."""
     from shiftsim.data.nuplan.filter import read_yaml
     from shiftsim.edits.interplan.codes import import_names
-    from shiftsim.files import write_text
     from shiftsim.runs.edited import edits_text, make_edits
 
     table = import_names(read_yaml(names), read_yaml(modifications), window)
-    made = make_edits(table, out.stem)
+    edits = make_edits(table, out.stem).edits
     write_text(out, edits_text(table))
-    tokens = {token for edit in made.edits for token in edit.tokens}
-    say(f"{plural(len(made.edits), 'edit')} of {plural(len(tokens), 'scenario')}")
-    say(f"written: {out}")
+    tokens = {token for edit in edits for token in edit.tokens}
+    echo(f"{plural(len(edits), 'edit')} of {plural(len(tokens), 'scenario')}")
+    echo(f"written: {out}")
 
 
 @app.command()
 def sample(
-    kind: Annotated[str, typer.Option(help="jaywalker, parked or works.")],
-    count: Annotated[int, typer.Option(min=1, help="How many edits.")] = 100,
-    seed: Annotated[int, typer.Option(min=0, help="Of all draws.")] = 0,
+    kind: str = Option(help="jaywalker, parked or works."),
+    count: int = Option(100, min=1, help="How many edits."),
+    seed: int = Option(0, min=0, help="Of all draws."),
     store: Store = "demo",
-    split: Annotated[str, typer.Option(help="Only scenarios of a split. [whole store]")] = "",
-    even: Annotated[
-        bool, typer.Option("--even", help="As many easy, medium and hard ones.")
-    ] = False,
-    out: Annotated[Path, typer.Option("--out", "-o", help="The .toml file. [KIND.toml]")] = Path(),
+    split: str = Option("", help="Only scenarios of a split. [whole store]"),
+    even: bool = Option(False, "--even", help="As many easy, medium and hard ones."),
+    out: Path = Option(Path(), "--out", "-o", help="The .toml file. [KIND.toml]"),
 ) -> None:
     """Draw edits over a store: in the way, and avoided by braking at 4 m/s^2 or by PDM-Closed."""
-    from collections import Counter
-    from functools import lru_cache
-
     from shiftsim.edits.sampling import KINDS, sample_edits
-    from shiftsim.errors import one_of
-    from shiftsim.files import write_text
     from shiftsim.runs.avoidable import grade
     from shiftsim.runs.edited import edits_text
-    from shiftsim.runs.scenarios import find_split, open_named_store
+    from shiftsim.runs.scenarios import find_split
 
     one_of("kind", kind, KINDS)
-    opened = open_named_store(store)
+    opened = shiftsim.open_store(store)
     tokens = find_split(split, Path(opened.path), opened.tokens).tokens
     read = lru_cache(maxsize=256)(opened.read)
     edits = list(sample_edits(kind, count, seed, tokens, read, grade, even=even))
     path = out if out.suffix else Path(f"{kind}.toml")
     write_text(path, edits_text({"format": 1, "edit": edits}))
     for name, number in sorted(Counter(edit["type"] for edit in edits).items()):
-        say(f"{name:20} {number}")
-    say(f"written: {path}")
+        echo(f"{name:20} {number}")
+    echo(f"written: {path}")

@@ -4,102 +4,96 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option, echo
 
 from shiftsim import cli
-from shiftsim.cli import Json, Quiet, plural, progress_bar, say, say_json
+from shiftsim.cli import Json, Quiet, plural, print_json, progress_bar
+from shiftsim.errors import one_of
+from shiftsim.files import safe_join
 
 if TYPE_CHECKING:
+    from shiftsim.benchmarks.bench import OpenedRuns
+    from shiftsim.report.build import Options
     from shiftsim.report.figures import Figure
+    from shiftsim.report.groups import Group
     from shiftsim.report.tables import Table
     from shiftsim.runs.results import Run
 
 _WORST = 10
-RunFolder = Annotated[
-    Path, typer.Argument(metavar="RUN", help="A run folder, or that of a benchmark.")
-]
-RunFolders = Annotated[list[Path], typer.Argument(metavar="RUN…", help="Run folders.")]
+RunFolder = Annotated[Path, Argument(metavar="RUN", help="A run folder, or that of a benchmark.")]
 
 
 def report(
-    runs: RunFolders,
-    style: Annotated[
-        list[str] | None,
-        typer.Option("--format", "-f", help="text, md, csv, latex or html; repeatable with --out."),
-    ] = None,
-    table: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--table", "-t", help="Only this table; repeatable. A wrong name shows the names."
-        ),
-    ] = None,
-    by: Annotated[
-        str | None, typer.Option(help="Scores per scenario_type, city or seed as well.")
-    ] = None,
-    published: Annotated[
-        bool, typer.Option("--published", help="The paper's figures beside the own ones.")
-    ] = False,
-    figures: Annotated[
-        bool, typer.Option("--figures", help="Pictures as well, into --out (RUN/report).")
-    ] = False,
-    worst: Annotated[int, typer.Option(help="Name the N worst scenarios.")] = 5,
-    out: Annotated[Path | None, typer.Option(help="Write everything into this folder.")] = None,
-    site: Annotated[
-        Path | None,
-        typer.Option(
-            "--html", help="Pages into this folder: tables, pictures, scenarios with replays."
-        ),
-    ] = None,
-    allow_partial: Annotated[
-        bool, typer.Option("--allow-partial", help="Print a labelled mean over what finished.")
-    ] = False,
+    folders: list[Path] = Argument(metavar="RUN…", help="Run folders."),
+    style: list[str] = Option(
+        [], "--format", "-f", help="text, md, csv, latex or html; repeatable with --out."
+    ),
+    table: list[str] = Option(
+        [], "--table", "-t", help="Only this table; repeatable. A wrong name shows the names."
+    ),
+    by: str | None = Option(None, help="Scores per scenario_type, city or seed as well."),
+    published: bool = Option(False, "--published", help="The paper's figures beside the own ones."),
+    figures: bool = Option(False, "--figures", help="Pictures as well, into --out (RUN/report)."),
+    worst: int = Option(5, help="Name the N worst scenarios."),
+    out: Path | None = Option(None, help="Write everything into this folder."),
+    site: Path | None = Option(
+        None, "--html", help="Pages into this folder: tables, pictures, scenarios with replays."
+    ),
+    allow_partial: bool = Option(
+        False, "--allow-partial", help="Print a labelled mean over what finished."
+    ),
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Tables and pictures of one or several runs, or of a benchmark's folder."""
-    from shiftsim.benchmarks import known_sets
-    from shiftsim.benchmarks import published as published_figures
     from shiftsim.benchmarks.bench import open_runs
-    from shiftsim.errors import one_of
-    from shiftsim.files import safe_join
-    from shiftsim.report.build import BRIEF, TABLES, Options, make_tables, write_report
-    from shiftsim.report.groups import read_groups
+    from shiftsim.report.build import BRIEF, TABLES, Options, write_report
+    from shiftsim.report.figures import figures as draw
     from shiftsim.report.scores import summary
     from shiftsim.report.tables import FORMATS, render
 
-    opened, own_lists, extra = open_runs(runs)
+    opened = open_runs(folders)
     if as_json:
-        say_json([summary(run) for run in opened])
+        print_json([summary(run) for run in opened.runs])
         return
-    for name in style or ():
+    for name in style:
         one_of("format", name, FORMATS)
-    groups = read_groups(opened, (*known_sets(), *own_lists))
     if figures and out is None:
-        out = safe_join(runs[0], "report")
+        out = safe_join(folders[0], "report")
     kind = (style or ["text"])[0]
     default = TABLES if out or site else ("scores",) if kind == "csv" else BRIEF
     options = Options(tuple(table or default), by, published, allow_partial)
-    tables = make_tables(groups, published_figures(), options)
-    title = f"Report on {', '.join(folder.resolve().name for folder in runs)}"
-    if not table and options.tables != ("scores",):
-        tables = [*extra(groups), *tables]
-    drawn = []
-    if figures or site is not None:
-        from shiftsim.report.figures import figures as draw
-
-        drawn = draw(groups, allow_partial=allow_partial)
+    groups, tables = read_tables(opened, options, with_coverage=not table)
+    drawn = draw(groups, allow_partial=allow_partial) if figures or site else []
+    title = f"Report on {', '.join(folder.resolve().name for folder in folders)}"
     if out is not None:
-        files = write_report(out, title, opened, tables, drawn, style or FORMATS)
-        say(f"{plural(len(files), 'file')} in {out}: {', '.join(path.name for path in files)}")
+        files = write_report(out, title, opened.runs, tables, drawn, style or FORMATS)
+        echo(f"{plural(len(files), 'file')} in {out}: {', '.join(path.name for path in files)}")
     if site is not None:
         with progress_bar(quiet=quiet) as advance:
-            _write_pages(site, title, opened, tables, drawn, advance)
-        say(f"written: {site / 'index.html'}")
+            _write_pages(site, title, opened.runs, tables, drawn, advance)
+        echo(f"written: {site / 'index.html'}")
     if out is not None or site is not None:
         return
-    say("\n\n".join(render(one, kind, width=cli.terminal_width()) for one in tables))
+    echo("\n\n".join(render(one, kind, width=cli.terminal_width()) for one in tables))
     if kind == "text" and not table:
-        _say_worst(opened, worst)
+        _print_worst(opened.runs, worst)
+
+
+def read_tables(
+    opened: "OpenedRuns", options: "Options", *, with_coverage: bool
+) -> "tuple[list[Group], list[Table]]":
+    """The scores of runs by planner and noise, and tables, also those of benchmarks if asked."""
+    from shiftsim.benchmarks import known_sets
+    from shiftsim.benchmarks import published as published_figures
+    from shiftsim.report.build import make_tables
+    from shiftsim.report.groups import read_groups
+
+    groups = read_groups(opened.runs, (*known_sets(), *opened.own))
+    tables = make_tables(groups, published_figures(), options)
+    if with_coverage and options.tables != ("scores",):
+        tables = [*opened.coverage(groups), *tables]
+    return groups, tables
 
 
 def _write_pages(
@@ -128,28 +122,27 @@ def _write_pages(
     )
 
 
-def _say_worst(runs: "Sequence[Run]", count: int) -> None:
+def _print_worst(runs: "Sequence[Run]", count: int) -> None:
     from shiftsim.report.scores import worst_rollouts
     from shiftsim.report.words import task_words
 
     for run in runs:
         rows = worst_rollouts(run, count)
         if rows:
-            say(f"\n worst scenarios of {run.path.name}, each by its worst rollout")
+            echo(f"\n worst scenarios of {run.path.name}, each by its worst rollout")
         for row in rows:
             where = f"{row['token']}  {task_words(row)}"
-            say(f"  {row['cls']:.4f}  {where}  {row['reason']}".rstrip())
+            echo(f"  {row['cls']:.4f}  {where}  {row['reason']}".rstrip())
 
 
 def explain(
     source: RunFolder,
-    token: Annotated[
-        str | None,
-        typer.Argument(metavar="[TOKEN]", help="Scenario, or its beginning. [the worst ten]"),
-    ] = None,
-    planner: Annotated[str | None, typer.Option(help="Only this planner.")] = None,
-    noise: Annotated[str | None, typer.Option(help="Only this noise.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Only this seed.")] = None,
+    token: str | None = Argument(
+        None, metavar="[TOKEN]", help="Scenario, or its beginning. [the worst ten]"
+    ),
+    planner: str | None = Option(None, help="Only this planner."),
+    noise: str | None = Option(None, help="Only this noise."),
+    seed: int | None = Option(None, help="Only this seed."),
     as_json: Json = False,
 ) -> None:
     """Why a rollout has its score, or why a task failed."""
@@ -157,35 +150,31 @@ def explain(
     from shiftsim.report.explain import explain_lines, explain_tasks
     from shiftsim.report.scores import worst_rollouts
 
-    runs, *_ = open_runs([source])
+    runs = open_runs([source]).runs
+    if token is None and as_json:
+        print_json({run.path.name: worst_rollouts(run, _WORST) for run in runs})
+    elif token is None:
+        _print_worst(runs, _WORST)
+        echo(f"\nwhy: shiftsim explain {source} TOKEN")
     if token is None:
-        if as_json:
-            say_json({run.path.name: worst_rollouts(run, _WORST) for run in runs})
-            return
-        _say_worst(runs, _WORST)
-        say(f"\nwhy: shiftsim explain {source} TOKEN")
         return
     chosen = explain_tasks(runs, token, planner=planner, noise=noise, seed=seed)
     if as_json:
-        tasks = [task for found in chosen.values() for task in found]
-        say_json(tasks)
+        print_json([task for tasks in chosen.values() for task in tasks])
         return
     for name, tasks in chosen.items():
         if len(runs) > 1:
-            say(f"{name}\n")
+            echo(f"{name}\n")
         for task in tasks:
-            for line in (*explain_lines(task), ""):
-                say(line)
+            echo("\n".join([*explain_lines(task), ""]))
     if any(run.rollout_places.values() for run in runs):
-        say(f"see it: shiftsim view {source} {token}")
+        echo(f"see it: shiftsim view {source} {token}")
 
 
 def diff(
-    first: Annotated[
-        Path, typer.Argument(metavar="RUN_A", help="A run folder, or that of a benchmark.")
-    ],
-    second: Annotated[Path, typer.Argument(metavar="RUN_B", help="Another one.")],
-    limit: Annotated[int, typer.Option(help="Look into the N largest changes.")] = 10,
+    first: Path = Argument(metavar="RUN_A", help="A run folder, or that of a benchmark."),
+    second: Path = Argument(metavar="RUN_B", help="Another one."),
+    limit: int = Option(10, help="Look into the N largest changes."),
     as_json: Json = False,
 ) -> None:
     """Scenarios whose score differs between two runs, and where the rollouts part."""
@@ -197,13 +186,12 @@ def diff(
     found = [diff_runs(one, other, limit=limit) for one, other in pairs]
     if as_json:
         values = [pair.to_dict() for pair in found]
-        say_json(values[0] if len(pairs) == 1 else values)
+        print_json(values[0] if len(pairs) == 1 else values)
         return
     for (run, _), pair in zip(pairs, found, strict=True):
         if len(pairs) > 1:
-            say(f"\n{run.path.name}")
-        for line in diff_lines(pair):
-            say(line)
+            echo(f"\n{run.path.name}")
+        echo("\n".join(diff_lines(pair)))
     changed = {short for pair in found for change in pair.changes for short in change.metrics}
     if changed:
-        say(f" metrics: {legend(short for short in LONG if short in changed)}")
+        echo(f" metrics: {legend(short for short in LONG if short in changed)}")

@@ -4,17 +4,29 @@ import shlex
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option, echo
 
+import shiftsim
 from shiftsim import cli
-from shiftsim.cli import Json, Quiet, plural, progress_bar, say, say_json, stdout_to_stderr
+from shiftsim.cli import (
+    Json,
+    Quiet,
+    plural,
+    print_json,
+    print_result,
+    progress_bar,
+    stdout_to_stderr,
+)
 from shiftsim.errors import ConfigError
+from shiftsim.files import read_toml, store_path
+from shiftsim.runs.config import DEFAULT_STORE, default_workers, make_config
 
 if TYPE_CHECKING:
     from shiftsim.runs.execute import OnProgress, Progress
@@ -22,7 +34,6 @@ if TYPE_CHECKING:
     from shiftsim.runs.results import Run
     from shiftsim.world.scenario import Scenario
 
-_UNFINISHED = 3
 _MAX_NAMED_FAILURES = 5
 _KERNELS_OF_A_RUN = "70 to 160"  # constant-velocity in replayed, PDM-Closed in reactive traffic
 _BEFORE = {
@@ -32,14 +43,14 @@ _BEFORE = {
     "complete": "is complete already",
 }
 
-Config = Annotated[Path | None, typer.Option(help="Settings in TOML; flags win over it.")]
+Config = Annotated[Path | None, Option(help="Settings in TOML; flags win over it.")]
 Live = Annotated[
-    bool, typer.Option("--live", help="Show the run while it lasts, on a page of this machine.")
+    bool, Option("--live", help="Show the run while it lasts, on a page of this machine.")
 ]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Check everything, simulate nothing.")]
+DryRun = Annotated[bool, Option("--dry-run", help="Check everything, simulate nothing.")]
 
 
-@cli.with_settings(*cli.ALL)
+@cli.with_settings()
 def run(
     settings: cli.Settings,
     config: Config = None,
@@ -49,17 +60,13 @@ def run(
     as_json: Json = False,
 ) -> None:
     """Simulate and score planners on scenarios."""
-    from shiftsim.files import read_toml
-
     values = read_toml(config) if config else {}
-    texts = settings.pop("planner_args", ())
-    of_file = values.get("planner_args", {})
-    values |= settings
-    if texts:
-        planners = values.get("planners", ())
-        values["planner_args"] = cli.planner_arguments(texts, of_file, planners)
+    if texts := settings.pop("planner_args", ()):
+        planners = settings.get("planners", values.get("planners", ()))
+        of_file = values.get("planner_args", {})
+        settings["planner_args"] = cli.planner_arguments(texts, of_file, planners)
     where = str(config) if config else "run"
-    run_settings(values, where, dry_run=dry_run, live=live, quiet=quiet, as_json=as_json)
+    run_settings(values | settings, where, dry_run=dry_run, live=live, quiet=quiet, as_json=as_json)
 
 
 def run_settings(
@@ -71,22 +78,20 @@ def run_settings(
     quiet: bool,
     as_json: bool = False,
 ) -> None:
-    """Run what the settings say, print what it gave, and leave with the right code."""
-    from shiftsim.runs.config import make_config
+    """Run what the settings  print what it gave, and leave with the right code."""
     from shiftsim.runs.execute import execute
     from shiftsim.runs.prepare import prepare
 
     with stdout_to_stderr():
         plan = prepare(make_config(values, where=where))
-    say_provenance([plan], as_json=as_json)
-    if not as_json:
-        _say_plan(plan)
+    announce([plan], _plan_lines(plan), dry_run=dry_run, as_json=as_json)
     if dry_run:
-        say_dry_run([plan], as_json=as_json)
         return
     words = [word for word in sys.argv[1:] if word not in ("--resume", "--retry-failed")]
-    with progress_of([plan], plan.folder, [*words, "--resume"], live, quiet or as_json) as shown:
-        finished = execute(plan, on_progress=shown, argv=sys.argv)
+    with progress_of(
+        [plan], plan.folder, [*words, "--resume"], live, quiet or as_json
+    ) as on_progress:
+        finished = execute(plan, on_progress=on_progress, argv=sys.argv)
     leave_with(finished, allow_partial=plan.config.allow_partial, as_json=as_json)
 
 
@@ -98,23 +103,16 @@ def progress_of(
 
     It then says in which folder that is kept, and the words of the command that goes on with it.
     """
-
-    def interrupt(number: int, frame: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with stdout_to_stderr(), progress_bar(quiet=quiet) as advance:
 
             def show(progress: "Progress") -> None:
-                advance(progress.done, progress.total, _note(progress))
+                advance(progress.done, progress.total, _time_shares(progress))
 
-            with _compiling_shown(partial(advance, 0, 0)):
-                if not live:
-                    yield show
-                    return
-                with _live_page(plans, folder, show) as add:
-                    yield add
+            page = _live_page(plans, folder, show) if live else nullcontext(show)
+            with _compiling_shown(partial(advance, 0, 0)), page as on_progress:
+                yield on_progress
     except KeyboardInterrupt:
         command = shlex.join(["shiftsim", *words])
         raise cli.Interrupted(f"kept: {folder}; go on with: {command}") from None
@@ -128,7 +126,7 @@ def _compiling_shown(show: Callable[[str], None]) -> Iterator[None]:
 
     Nothing is said where the kernels of a run are there already.
     """
-    from shiftsim.kernels import CACHE_FOLDER, machine_code
+    from shiftsim.kernels import machine_code
 
     ended = threading.Event()
 
@@ -141,14 +139,12 @@ def _compiling_shown(show: Callable[[str], None]) -> Iterator[None]:
                 known = count
 
     thread = threading.Thread(target=watch, daemon=True)
-    if CACHE_FOLDER:
-        thread.start()
+    thread.start()
     try:
         yield
     finally:
         ended.set()
-        if CACHE_FOLDER:
-            thread.join()
+        thread.join()
 
 
 @contextmanager
@@ -156,12 +152,11 @@ def _live_page(
     plans: "Sequence[RunPlan]", folder: Path, show: "OnProgress"
 ) -> "Iterator[OnProgress]":
     """Yields what shows progress on a page as well, as long as this lasts."""
-    from shiftsim.runs.scenarios import open_named_store
     from shiftsim.view.live import LiveRun, LiveServer
 
     def read(token: str) -> "Scenario":
         store = next(plan.store for plan in plans if token in plan.selection.tokens)
-        return open_named_store(store).read(token)
+        return shiftsim.open_store(store).read(token)
 
     def add(progress: "Progress") -> None:
         page.add(progress)
@@ -170,13 +165,13 @@ def _live_page(
     planners = [name for plan in plans for name in plan.config.planners]
     page = LiveRun(str(folder), sum(len(plan.tasks) for plan in plans), planners, read)
     with LiveServer(page) as server:
-        typer.echo(f"live        {server.address}", err=True)
+        echo(f"live        {server.address}", err=True)
         cli.show_in_browser(server.address)
         yield add
 
 
-def _note(progress: "Progress") -> str:
-    """Where the time goes."""
+def _time_shares(progress: "Progress") -> str:
+    """Which shares of the time planning, simulation, scoring and reading take."""
     parts = dict(progress.seconds)
     planner = parts.get("planner_seconds", 0.0)
     times = {
@@ -190,22 +185,22 @@ def _note(progress: "Progress") -> str:
     return f"{text} · {progress.failed} failed" if progress.failed else text
 
 
-def say_provenance(plans: "Sequence[RunPlan]", *, as_json: bool) -> None:
-    """Say before anything else that scenarios are synthetic, where they are."""
+def announce(
+    plans: "Sequence[RunPlan]", lines: Iterable[str], *, dry_run: bool, as_json: bool
+) -> None:
+    """Print what will be run; before anything else that scenarios are synthetic, where they are."""
     for found in dict.fromkeys(tuple(p.provenance.items()) for p in plans if p.provenance):
         text = ", ".join(str(value) if k == "name" else f"{k} {value}" for k, value in found)
-        typer.echo(f"data        generated, not recorded: {text}", err=as_json)
+        echo(f"data        generated, not recorded: {text}", err=as_json)
+    if not as_json:
+        echo("\n".join([*lines, ""]))
+    if dry_run:
+        values = [{"run": str(plan.folder), "tasks": len(plan.tasks)} for plan in plans]
+        lines = ["dry run: everything checked, nothing simulated"]
+        print_result(values, lines, as_json=as_json)
 
 
-def say_dry_run(plans: "Sequence[RunPlan]", *, as_json: bool) -> None:
-    """What a run would have been."""
-    if as_json:
-        say_json([{"run": str(plan.folder), "tasks": len(plan.tasks)} for plan in plans])
-    else:
-        say("dry run: everything checked, nothing simulated")
-
-
-def _say_plan(plan: "RunPlan") -> None:
+def _plan_lines(plan: "RunPlan") -> Iterator[str]:
     """Every setting, defaults included."""
     config, scenarios = plan.config, plan.selection
     found = len({task.token for task in plan.tasks})
@@ -213,38 +208,37 @@ def _say_plan(plan: "RunPlan") -> None:
     for name in config.planners:
         arguments = plan.planners[name].arguments
         given = "".join(f"  {key}={value}" for key, value in arguments.items())
-        say(f"planner     {name}{given}")
+        yield f"planner     {name}{given}"
         if weights := _weights(plan.planners[name].fingerprint):
-            say(f"weights     {name}, {weights}")
-    say(f"noise       {' '.join(config.noise)}   seeds {' '.join(map(str, config.seeds))}")
-    say(
+            yield f"weights     {name}, {weights}"
+    yield f"noise       {' '.join(config.noise)}   seeds {' '.join(map(str, config.seeds))}"
+    yield (
         f"split       {scenarios.split}  {found} of {plural(found + missing, 'scenario')} found"
         f"   store {plan.store}"
     )
     if scenarios.num_dropped:
-        say(f"filter      {scenarios.num_dropped} dropped scenarios left out (--all keeps them)")
-    say(
+        yield f"filter      {scenarios.num_dropped} dropped scenarios left out (--all keeps them)"
+    yield (
         f"settings    traffic {config.traffic}   controller {config.controller}"
         f"   thresholds {config.thresholds}"
     )
     if config.metrics:
-        say(f"metrics     {' '.join(config.metrics)}")
+        yield f"metrics     {' '.join(config.metrics)}"
     is_learned = any(entry.in_batches for entry in plan.planners.values())
     if is_learned or plan.fingerprint["batch_size"] > 1:
         strict = "   strict" if config.strict else ""
-        say(f"networks    batch size {config.batch_size}{strict}")
+        yield f"networks    batch size {config.batch_size}{strict}"
     where = f"workers {plan.workers} x 1 thread"
     if config.executor == "dask":
         where = f"dask {config.scheduler}"
     limit = f"   timeout {config.timeout:g} s" if config.timeout else ""
     part = f" (shard {config.shard})" if config.shard else ""
-    say(
+    yield (
         f"tasks       {len(plan.tasks)}{part}   {where}{limit}"
         f"   rollouts {config.save_rollouts}   → {plan.folder}"
     )
     if config.resumes:
-        say(f"resume      {_BEFORE[plan.before]}")
-    say()
+        yield f"resume      {_BEFORE[plan.before]}"
 
 
 def _weights(fingerprint: Mapping[str, Any]) -> str:
@@ -264,26 +258,27 @@ def leave_with(finished: "Run", *, allow_partial: bool, as_json: bool) -> None:
     if as_json:
         from shiftsim.report.scores import summary
 
-        say_json(summary(finished))
+        print_json(summary(finished))
     else:
-        _say_results(finished, allow_partial=allow_partial)
+        _print_results(finished, allow_partial=allow_partial)
     if not finished.is_complete:
-        raise typer.Exit(_UNFINISHED)
+        raise typer.Exit(cli.UNFINISHED)
 
 
-def _say_results(finished: "Run", *, allow_partial: bool) -> None:
+def _print_results(finished: "Run", *, allow_partial: bool) -> None:
     from shiftsim.report.scores import failures, score_table, worst_rollouts
     from shiftsim.report.words import task_words
 
     counts = finished.manifest["counts"]
-    say()
-    say(score_table([finished], allow_partial=allow_partial))
-    bad = [row for row in worst_rollouts(finished, 3) if row["cls"] < 1.0]
-    if bad:
-        words = (
-            f"{row['token']} {task_words(row)} {row['cls']:.2f} {row['reason']}" for row in bad
-        )
-        say(f" worst: {' · '.join(words)}")
+    echo()
+    echo(score_table([finished], allow_partial=allow_partial))
+    worst = [
+        f"{row['token']} {task_words(row)} {row['cls']:.2f} {row['reason']}"
+        for row in worst_rollouts(finished, 3)
+        if row["cls"] < 1.0
+    ]
+    if worst:
+        echo(f" worst: {' · '.join(worst)}")
     lost = failures(finished)
     alike: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for row in lost:
@@ -291,77 +286,67 @@ def _say_results(finished: "Run", *, allow_partial: bool) -> None:
     for (status, error, hint), rows in list(alike.items())[:_MAX_NAMED_FAILURES]:
         more = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
         first = f"{rows[0]['token']} {rows[0]['planner']} {rows[0]['noise']}"
-        say(f" {status}: {first}{more}: {error}")
+        echo(f" {status}: {first}{more}: {error}")
         if hint:
-            say(f"   hint: {hint}")
+            echo(f"   hint: {hint}")
     if lost:
-        say(
+        echo(
             f" {counts['failed']} failed, {counts['timeout']} timeout, {counts['missing']} missing"
             f" of {counts['expected']} tasks — shiftsim explain {finished.path} TOKEN"
         )
-    say(f" results: {finished.path}")
+    echo(f" results: {finished.path}")
     if counts["ok"] and finished.manifest["config"]["save_rollouts"] == "all":
-        say(f" replay:  shiftsim view {finished.path}")
+        echo(f" replay:  shiftsim view {finished.path}")
 
 
 @cli.with_settings(
-    "thresholds",
-    "metrics",
-    "store",
-    "out",
-    "workers",
-    "allow_partial",
+    *"thresholds metrics store out workers allow_partial".split(),
     store="Store. [the one of the run]",
 )
 def score(
-    source: Annotated[Path, typer.Argument(metavar="RUN", help="A run with stored rollouts.")],
+    *,
+    source: Path = Argument(metavar="RUN", help="A run with stored rollouts."),
     settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Score stored rollouts again, under another threshold profile, without simulating."""
     from shiftsim.runs.derive import rescore
-    from shiftsim.runs.results import open_run
 
-    run = open_run(source)
+    run = shiftsim.open_run(source)
     allow_partial = settings.pop("allow_partial", False)
+    settings = {"thresholds": run.manifest["config"]["thresholds"], **settings}
     with stdout_to_stderr(), progress_bar(quiet=quiet or as_json) as advance:
-        finished = rescore(
-            run,
-            **{"thresholds": run.manifest["config"]["thresholds"], **settings},
-            on_progress=lambda progress: advance(progress.done, progress.total),
-            argv=sys.argv,
-        )
+
+        def show(progress: "Progress") -> None:
+            advance(progress.done, progress.total)
+
+        finished = rescore(run, **settings, on_progress=show, argv=sys.argv)
     leave_with(finished, allow_partial=allow_partial, as_json=as_json)
 
 
 def merge(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN…", help="The shards of one run.")],
-    out: Annotated[
-        str | None, typer.Option(help="Run folder. [that of the shards without number]")
-    ] = None,
-    allow_partial: Annotated[
-        bool, typer.Option("--allow-partial", help="Accept missing shards; labelled so.")
-    ] = False,
+    runs: list[Path] = Argument(metavar="RUN…", help="The shards of one run."),
+    out: str | None = Option(None, help="Run folder. [that of the shards without number]"),
+    allow_partial: bool = Option(
+        False, "--allow-partial", help="Accept missing shards; labelled so."
+    ),
     as_json: Json = False,
 ) -> None:
     """Join runs made with --shard: the same tables as without."""
     from shiftsim.runs.derive import merge_runs
-    from shiftsim.runs.results import open_run
 
-    merged = merge_runs([open_run(path) for path in runs], out=out, allow_partial=allow_partial)
+    merged = merge_runs(list(map(shiftsim.open_run, runs)), out=out, allow_partial=allow_partial)
     leave_with(merged, allow_partial=allow_partial, as_json=as_json)
 
 
 @cli.with_settings("workers", "limit")
 def demo(
-    out: Annotated[Path | None, typer.Option(help="Folder of the store.")] = None,
-    towns: Annotated[
-        int | None, typer.Option(min=1, help="Only make a store of N random towns to train in.")
-    ] = None,
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="Of the random towns; same seed, same bytes. [0]")
-    ] = None,
+    out: Path | None = Option(None, help="Folder of the store."),
+    towns: int | None = Option(
+        None, min=1, help="Only make a store of N random towns to train in."
+    ),
+    seed: int | None = Option(None, min=0, help="Of the random towns; same seed, same bytes. [0]"),
     *,
     settings: cli.Settings,
     quiet: Quiet = False,
@@ -376,12 +361,10 @@ def demo(
     if seed is not None:
         raise ConfigError("--seed is of random towns only", hint="say how many with --towns")
     from shiftsim.data.synthetic.store import DEMO_SPLIT, demo_store
-    from shiftsim.files import store_path
-    from shiftsim.runs.config import DEFAULT_STORE
 
     folder = out or store_path(DEFAULT_STORE)
     if not folder.exists():
-        say(f"generating and converting recordings, compiling kernels → {folder}")
+        echo(f"generating and converting recordings, compiling kernels → {folder}")
         demo_store(folder)
     values = {
         "planners": ["log-future", "idm", "constant-velocity"],
@@ -394,13 +377,12 @@ def demo(
         run_settings(values, "demo", quiet=quiet)
     finally:
         named = f" --store {folder}" if out else ""
-        say()
-        say("next:")
-        say(f"  shiftsim run --planner idm --noise awgn-mid --seeds 0,1,2{named}")
-        say(f"  shiftsim run --planner my_package.my_module:MyPlanner{named}")
-        say("  shiftsim report runs/<id>        shiftsim view runs/<id>")
-        say("  shiftsim explain runs/<id> TOKEN")
-        say("  shiftsim planners list           shiftsim --help")
+        echo("\nnext:")
+        echo(f"  shiftsim run --planner idm --noise awgn-mid --seeds 0,1,2{named}")
+        echo(f"  shiftsim run --planner my_package.my_module:MyPlanner{named}")
+        echo("  shiftsim report runs/<id>        shiftsim view runs/<id>")
+        echo("  shiftsim explain runs/<id> TOKEN")
+        echo("  shiftsim planners list           shiftsim --help")
 
 
 def _make_towns(
@@ -410,20 +392,18 @@ def _make_towns(
     if "limit" in settings:
         raise ConfigError("--limit is of runs, --towns runs nothing", hint="leave one of them out")
     from shiftsim.data.synthetic.store import write_towns
-    from shiftsim.files import store_path
-    from shiftsim.runs.config import default_workers
     from shiftsim.runs.filter import filter_store
     from shiftsim.runs.workers import map_unordered
 
     folder = out or store_path(f"towns-{seed}")
     workers = settings.get("workers", 0) or default_workers()
-    say(f"generating and converting {plural(towns, 'town')} of seed {seed} → {folder}")
+    echo(f"generating and converting {plural(towns, 'town')} of seed {seed} → {folder}")
     with progress_bar(quiet=quiet) as advance:
         spread = partial(map_unordered, workers=min(workers, towns), alone=1)
         write_towns(folder, towns=towns, seed=seed, spread=spread, progress=advance)
-    say("driving every scenario as recorded, to leave out those that cannot be driven so")
+    echo("driving every scenario as recorded, to leave out those that cannot be driven so")
     with progress_bar(quiet=quiet) as advance:
         found = filter_store(folder, workers=workers, on_progress=advance)
     counts = found.counts()
-    say(f" {counts['accepted']} of {plural(len(found.rows), 'scenario')} accepted → {folder}")
-    say(f" next: shiftsim run --planner log-future --store {folder} --limit 20")
+    echo(f" {counts['accepted']} of {plural(len(found.rows), 'scenario')} accepted → {folder}")
+    echo(f" next: shiftsim run --planner log-future --store {folder} --limit 20")

@@ -2,57 +2,53 @@
 
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Option, echo
 
-from shiftsim.cli import Quiet, plural, progress_bar, say, show_in_browser
+import shiftsim
+from shiftsim.cli import Quiet, plural, progress_bar, show_in_browser
 from shiftsim.cli.report import RunFolder
 from shiftsim.errors import ConfigError
+from shiftsim.files import safe_join
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from shiftsim.view.build import Gallery
 
 Others = Annotated[
     list[Path] | None,
-    typer.Option("--with", help="Another run on the same store, shown together; repeatable."),
+    Option("--with", help="Another run on the same store, shown together; repeatable."),
 ]
 Planners = Annotated[
-    list[str] | None, typer.Option("--planner", "-p", help="Only this planner; repeatable.")
+    list[str] | None, Option("--planner", "-p", help="Only this planner; repeatable.")
 ]
-Noises = Annotated[
-    list[str] | None, typer.Option("--noise", "-n", help="Only this noise; repeatable.")
-]
+Noises = Annotated[list[str] | None, Option("--noise", "-n", help="Only this noise; repeatable.")]
 Seeds = Annotated[
-    list[int] | None, typer.Option("--seed", help="Only this seed; repeatable. [the first]")
+    list[int] | None, Option("--seed", help="Only this seed; repeatable. [the first]")
 ]
-Store = Annotated[
-    str | None, typer.Option("--store", "-s", help="Name or folder. [the manifest's]")
-]
+Store = Annotated[str | None, Option("--store", "-s", help="Name or folder. [the manifest's]")]
+Browser = Annotated[bool, Option("--open/--no-open", help="Open the page in the browser.")]
 
 
 def view(
     run: RunFolder,
-    token: Annotated[
-        str | None, typer.Argument(metavar="[TOKEN]", help="A scenario. [all of them]")
-    ] = None,
+    token: str | None = Argument(None, metavar="[TOKEN]", help="A scenario. [all of them]"),
     others: Others = None,
     planner: Planners = None,
     noise: Noises = None,
     seed: Seeds = None,
     store: Store = None,
-    limit: Annotated[int, typer.Option(help="Only the N with the lowest scores, 0 for all.")] = 200,
-    out: Annotated[Path | None, typer.Option(help="Folder to write to. [RUN/view]")] = None,
-    browser: Annotated[
-        bool, typer.Option("--open/--no-open", help="Open the page in the browser.")
-    ] = True,
+    limit: int = Option(200, help="Only the N with the lowest scores, 0 for all."),
+    out: Path | None = Option(None, help="Folder to write to. [RUN/view]"),
+    browser: Browser = True,
     quiet: Quiet = False,
 ) -> None:
     """Replay rollouts in the browser: pages that need no server and no network."""
-    from shiftsim.files import safe_join
     from shiftsim.view.build import page_name, write_site
 
-    found = _galleries([run, *(others or ())], planner, noise, seed, store)
+    found = _galleries([run, *(others or ())], store, planner, noise, seed)
     folder = out or safe_join(run, "view")
     if token is not None:
         gallery, token = _holding(found, token)
@@ -61,33 +57,24 @@ def view(
         gallery.page(token).save(page)
     else:
         with progress_bar(quiet=quiet) as advance:
-            count = write_site(
-                folder,
-                found,
-                title=f"Replays of {run.name}",
-                limit=limit,
-                on_progress=advance,
-            )
+            title = f"Replays of {run.name}"
+            count = write_site(folder, found, title=title, limit=limit, on_progress=advance)
         left = sum(len(gallery.tokens) for gallery in found) - count
-        say(f"{plural(count, 'replay')}{f', {left} more with --limit 0' if left else ''}")
+        echo(f"{plural(count, 'replay')}{f', {left} more with --limit 0' if left else ''}")
         page = folder / "index.html"
-    say(f"written: {page}")
+    echo(f"written: {page}")
     if browser:
         show_in_browser(page.resolve().as_uri())
 
 
 def plot(
     run: RunFolder,
-    token: Annotated[str, typer.Argument(metavar="TOKEN", help="A scenario.")],
-    at: Annotated[
-        str, typer.Option(help="Time of a still from the start [s]; several, such as 0,5,10.")
-    ] = "0",
-    grid: Annotated[
-        bool, typer.Option("--grid", help="A row per rollout, a column per time.")
-    ] = False,
-    out: Annotated[
-        Path, typer.Option("--out", "-o", help="A .pdf, .png or .svg, or a film: .mp4 or .gif.")
-    ] = Path("figure.pdf"),
+    token: str = Argument(metavar="TOKEN", help="A scenario."),
+    at: str = Option("0", help="Time of a still from the start [s]; several, such as 0,5,10."),
+    grid: bool = Option(False, "--grid", help="A row per rollout, a column per time."),
+    out: Path = Option(
+        Path("figure.pdf"), "--out", "-o", help="A .pdf, .png or .svg, or a film: .mp4 or .gif."
+    ),
     others: Others = None,
     planner: Planners = None,
     noise: Noises = None,
@@ -97,11 +84,11 @@ def plot(
     """The driven paths of several rollouts over the map, as a still or a film."""
     from shiftsim.view.still import save_figure
 
-    found = _galleries([run, *(others or ())], planner, noise, seed, store)
+    found = _galleries([run, *(others or ())], store, planner, noise, seed)
     gallery, token = _holding(found, token)
     scenario = gallery.store.read(token)
     save_figure(out, scenario, gallery.shown(token, scenario), at=_times(at), in_grid=grid)
-    say(f"written: {out}")
+    echo(f"written: {out}")
 
 
 def _times(text: str) -> list[float]:
@@ -114,45 +101,38 @@ def _times(text: str) -> list[float]:
 
 
 def inspect(
-    store: Annotated[str, typer.Argument(metavar="STORE", help="Name or folder of a store.")],
-    reviewer: Annotated[str, typer.Option(help="Who reviews. [the login name]")] = "",
-    port: Annotated[int, typer.Option(help="Port on this machine, 0 for a free one.")] = 0,
-    browser: Annotated[
-        bool, typer.Option("--open/--no-open", help="Open the page in the browser.")
-    ] = True,
+    store: str = Argument(metavar="STORE", help="Name or folder of a store."),
+    reviewer: str = Option("", help="Who reviews. [the login name]"),
+    port: int = Option(0, help="Port on this machine, 0 for a free one."),
+    browser: Browser = True,
 ) -> None:
     """Review scenarios in the browser: accept, reject, comment, correct the route."""
     from shiftsim.data.store.tables import REVIEW
-    from shiftsim.runs.scenarios import open_named_store
     from shiftsim.view.review import ReviewServer, ReviewService
 
-    path = open_named_store(store).path
+    path = shiftsim.open_store(store).path
     with ReviewServer(ReviewService(path, reviewer), port) as server:
-        say(f"review     {server.address}")
-        say(f"kept in    {path / REVIEW}")
-        say("stop with Ctrl-C; what was decided is on disk")
+        echo(f"review     {server.address}")
+        echo(f"kept in    {path / REVIEW}")
+        echo("stop with Ctrl-C; what was decided is on disk")
         if browser:
             show_in_browser(server.address)
         try:
             server.serve_forever()
         except KeyboardInterrupt:
-            say()
+            echo()
 
 
 def _galleries(
-    folders: list[Path],
-    planner: list[str] | None,
-    noise: list[str] | None,
-    seed: list[int] | None,
-    store: str | None,
+    folders: list[Path], store: str | None, *chosen: "Sequence[Any] | None"
 ) -> "list[Gallery]":
-    """The rollouts of runs and benchmarks, one gallery for each store."""
+    """The rollouts of runs and benchmarks by planner, noise and seed, a gallery for each store."""
     from shiftsim.benchmarks.bench import open_runs
     from shiftsim.runs.scenarios import open_run_store
     from shiftsim.view.build import Choice, galleries
 
-    runs, *_ = open_runs(folders)
-    choice = Choice(tuple(planner or ()), tuple(noise or ()), tuple(seed or ()))
+    runs = open_runs(folders).runs
+    choice = Choice(*(tuple(values or ()) for values in chosen))
     return galleries(runs, [open_run_store(run, store) for run in runs], choice)
 
 

@@ -41,6 +41,8 @@ OBSERVATIONS: dict[str, Callable[[], Observer]] = {
 }
 ACTIONS = ("command", "trajectory")
 
+Make = Callable[[], gymnasium.Env[Any, Any]]
+
 
 class Source(Protocol):
     """Where scenarios come from, if not from a store."""
@@ -223,23 +225,26 @@ def DrivingVectorEnv(
             hint="num_workers must be at least 1, and at most num_envs",
         )
     makers = [partial(DrivingEnv, **settings)] * num_envs
-    if num_workers == 1:
-        return SyncVectorEnv(makers, autoreset_mode=autoreset_mode)
-    return ProcessVectorEnv(makers, autoreset_mode=autoreset_mode)
+    return vector_env(makers, num_workers, autoreset_mode=autoreset_mode)
+
+
+def vector_env(
+    makers: Sequence[Make], num_workers: int, **settings: Any
+) -> "VectorEnv[Any, Any, Any]":
+    """Environments side by side, in this process or in one each; `settings` as in Gymnasium."""
+    return (
+        SyncVectorEnv(makers, **settings)
+        if num_workers == 1
+        else ProcessVectorEnv(makers, **settings)
+    )
 
 
 class ProcessVectorEnv(AsyncVectorEnv):
     """Environments in a process each; an error in one of them, or its death, closes all."""
 
-    def __init__(
-        self,
-        makers: Sequence[Callable[[], gymnasium.Env[Any, Any]]],
-        *,
-        autoreset_mode: str | AutoresetMode,
-    ) -> None:
+    def __init__(self, makers: Sequence[Make], **settings: Any) -> None:
         """Start the processes; forking is unsafe beside the threads of torch."""
-        start = partial(super().__init__, context="spawn", autoreset_mode=autoreset_mode)
-        self._close_on_error(start, makers)
+        self._close_on_error(partial(super().__init__, context="spawn", **settings), makers)
 
     def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
         """As Gymnasium's."""

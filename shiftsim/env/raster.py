@@ -31,27 +31,11 @@ _COLOURS = {  # red, green, blue by channel; what is drawn first lies below
 _roads = PerMap(make_roads)  # of all environments of a process
 
 
-class Canvas:
-    """Draws an episode as CaRL sees it; the route is drawn as the scenario gives it."""
-
-    def __init__(self, episode: Episode) -> None:
-        scene = episode.scene
-        self._roads = _roads(scene.map)
-        self._on_route: BoolArray = np.zeros(len(scene.map.blocks), np.bool_)
-        self._on_route[route_blocks(scene)] = True
-        self._lights = LightLookup(scene.map, LightStatus.ABSENT)
-
-    def draw(self, episode: Episode) -> Raster:
-        """The present raster (9, 256, 256)."""
-        log, row, raster = episode.log, episode.iteration, np.zeros(SHAPE, np.uint8)
-        status = self._lights.at(log.traffic_lights.rows(slice(row, row + 1)))
-        roads = self._roads
-        draw(raster, roads, log.ego[row], log.tracks, row, self._on_route, status)
-        return raster
-
-
 class RasterObserver:
-    """CaRL's raster and measurements, and what only its critic sees."""
+    """CaRL's raster and measurements, and what only its critic sees.
+
+    The route is drawn as the scenario gives it.
+    """
 
     space: Space[Any] = spaces.Dict(
         {
@@ -63,8 +47,19 @@ class RasterObserver:
     )
 
     def start(self, episode: Episode) -> None:
-        """Lay out the map."""
-        self._canvas = Canvas(episode)
+        """Rasterize the map."""
+        scene = episode.scene
+        self._roads = _roads(scene.map)
+        self._on_route: BoolArray = np.zeros(len(scene.map.blocks), np.bool_)
+        self._on_route[route_blocks(scene)] = True
+        self._lights = LightLookup(scene.map, LightStatus.ABSENT)
+
+    def draw(self, episode: Episode) -> Raster:
+        """The present raster (9, 256, 256)."""
+        log, row, raster = episode.log, episode.iteration, np.zeros(SHAPE, np.uint8)
+        status = self._lights.at(log.traffic_lights.rows(slice(row, row + 1)))
+        draw(raster, self._roads, log.ego[row], log.tracks, row, self._on_route, status)
+        return raster
 
     def look(self, episode: Episode) -> dict[str, Any]:
         """The present raster and measurements."""
@@ -73,7 +68,7 @@ class RasterObserver:
         time_left = 1.0 - row / episode.scenario.num_iterations
         critic = np.array([time_left, 1.0 - terms.completion, terms.comfort, terms.ttc], np.float32)
         return {
-            "raster": self._canvas.draw(episode),
+            "raster": self.draw(episode),
             "measurements": measure(episode.log.ego[row], action).astype(np.float32),
             "value_measurements": critic,
         }
@@ -81,7 +76,9 @@ class RasterObserver:
 
 def picture_of(episode: Episode) -> np.ndarray:
     """(256, 256, 3) uint8, driving to the right, left is up."""
-    raster = Canvas(episode).draw(episode)
+    observer = RasterObserver()
+    observer.start(episode)
+    raster = observer.draw(episode)
     picture = np.full((view.SIZE, view.SIZE, 3), 245, np.uint8)
     for channel, colour in _COLOURS.items():
         picture[raster[channel, ::-1] > 0] = colour

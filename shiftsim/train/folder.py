@@ -2,50 +2,55 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
-
-import pyarrow as pa
-import pyarrow.parquet as pq
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from shiftsim.errors import CheckpointError, ConfigError, MissingExtraError
 from shiftsim.files import atomic_write, write_text
-from shiftsim.report.palette import dashes, new_figure, planner_styles, save_picture
+from shiftsim.runs.config import Option
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 SETTINGS = "settings.json"
+STATE = "state.pt"  # all that is needed to go on
+# networks: after the last round, with the best score on the towns that are left out, after PPO
+LATEST, BEST, REINFORCED = "latest.safetensors", "best.safetensors", "ppo.safetensors"
 TAUS = (0.2, 0.3, 0.5)  # s, tried where none is given
 
 OnMessage = Callable[[str], None]  # gets a line that says how far a training is
-Weights = dict[str, Tensor]  # by their names in CaRL's checkpoint
+Weights: TypeAlias = dict[str, "Tensor"]  # by their names in CaRL's checkpoint
 
 
-@dataclass(frozen=True, slots=True)
+def _option(default: Any, help: str) -> Any:
+    """A setting that is an option of the command line, too."""
+    return field(default=default, metadata={"option": Option(help)})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """What a training depends on, and where and how it is done."""
+    """What a training of CaRL's network depends on, and where and how it is done."""
 
-    store: str  # name, path or URL of the store
-    out: Path  # folder that is written
-    split: str = ""  # of the store; all scenarios if empty
-    checkpoint: str = ""  # weights to begin with, as planners take them; from nothing if empty
-    seed: int = 0
-    rounds: int = 8  # of collecting, training and testing
-    states: int = 360_000  # labelled states in all
-    samples: int = 1_280_000  # states that the network is trained on in all, each time counted
-    tau: float = 0.0  # of the labels [s]; 0 to choose it
-    tests: int = 40  # scenarios that a round is tested on, of towns that are left out
-    ppo_samples: int = 0  # of reinforcement learning afterwards
-    device: str = "cpu"
-    workers: int = 2  # processes that drive, and threads that train
+    out: Path = field(
+        metadata={"option": Option("Folder for networks, curves and what was collected.")}
+    )
+    store: str = _option("demo", "Store by name, path or URL.")
+    split: str = _option("", "Split of the store; all its scenarios if empty.")
+    checkpoint: str = _option("", "Weights to begin with: a file, or shiftsim. Else from nothing.")
+    device: str = _option("cpu", "cpu, cuda, cuda:N or auto.")
+    seed: int = _option(0, "Of everything that is random.")
+    workers: int = _option(2, "Processes that drive, threads that train.")
+    rounds: int = _option(8, "Of collecting, training and testing.")
+    states: int = _option(360_000, "Labelled states to collect in all.")
+    samples: int = _option(1_280_000, "States to train on, each time counted.")
+    tau: float = _option(0.0, "Of the labels [s]; 0 to choose it.")
+    tests: int = _option(40, "Scenarios that each round is tested on.")
+    ppo_samples: int = _option(0, "Steps of PPO afterwards.")
 
     def __post_init__(self) -> None:
         """Refuse numbers that make no training."""
-        for name in ("rounds", "states", "samples", "tests", "workers"):
-            if getattr(self, name) < 1:
-                value = getattr(self, name)
-                raise ConfigError(f"{name} is {value!r}", hint="give a number above 0")
+        _require_positive(self, "rounds", "states", "samples", "tests", "workers")
         if not 0.0 <= self.tau <= 2.0:
             raise ConfigError(f"tau is {self.tau!r}", hint="give seconds up to 2, or 0 to choose")
         if self.seed < 0 or self.ppo_samples < 0:
@@ -57,29 +62,35 @@ class Settings:
         left_out = ("out", "workers", "ppo_samples")
         return {name: value for name, value in asdict(self).items() if name not in left_out}
 
-    @property
-    def network(self) -> Path:
-        """The network after the last round."""
-        return self.out / "latest.safetensors"
-
-    @property
-    def best(self) -> Path:
-        """The network with the best score on the towns that are left out."""
-        return self.out / "best.safetensors"
-
-    @property
-    def reinforced(self) -> Path:
-        """The network after PPO."""
-        return self.out / "ppo.safetensors"
-
-    @property
-    def state(self) -> Path:
-        """All that is needed to go on."""
-        return self.out / "state.pt"
-
     def part(self, number: int) -> Path:
         """The states of a round."""
         return self.out / "states" / f"round-{number:02d}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrafficSettings:
+    """What a training of traffic depends on, and where it is written."""
+
+    out: Path = field(
+        metadata={"option": Option("Folder for weights, losses and how real they are.")}
+    )
+    store: str = _option("demo", "Store by name, path or URL.")
+    split: str = _option("", "Split of the store; all its scenarios if empty.")
+    seed: int = _option(0, "Of everything that is random.")
+    rounds: int = _option(5, "Of collecting and training.")
+    scenarios: int = _option(150, "That each round collects from.")
+    epochs: int = _option(8, "Of each round.")
+    tests: int = _option(100, "Scenarios that the result is measured on.")
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no training."""
+        _require_positive(self, "rounds", "scenarios", "epochs", "tests")
+
+
+def _require_positive(settings: object, *names: str) -> None:
+    for name in names:
+        if (value := getattr(settings, name)) < 1:
+            raise ConfigError(f"{name} is {value!r}", hint="give a number above 0")
 
 
 def prepare_folder(settings: Settings, store: str, *, resume: bool) -> None:
@@ -90,26 +101,34 @@ def prepare_folder(settings: Settings, store: str, *, resume: bool) -> None:
     """
     place = settings.out / SETTINGS
     now = json.loads(json.dumps(settings.determining)) | {"store_hash": store}
-    if place.exists():
-        before = json.loads(place.read_text("utf-8"))
-        differing = sorted(name for name in now if before.get(name) != now[name])
-        if differing:
-            name = differing[0]
+    if not place.exists():
+        make_folder(settings.out)
+        write_text(place, json.dumps(now, indent=2) + "\n")
+        return
+    before = json.loads(place.read_text("utf-8"))
+    for name in sorted(now):
+        if before.get(name) != now[name]:
             raise ConfigError(
                 f"{str(place)!r} is of a training with {name} {before.get(name)!r}, "
                 f"not {now[name]!r}",
                 hint="choose another --out",
             )
-        if not resume:
-            raise ConfigError(
-                f"{str(settings.out)!r} holds a training already",
-                hint="go on with --resume, or choose another --out",
-            )
-        return
-    if settings.out.exists() and any(settings.out.iterdir()):
-        raise ConfigError(f"{str(settings.out)!r} is not empty", hint="choose another --out")
-    settings.out.mkdir(parents=True, exist_ok=True)
-    write_text(place, json.dumps(now, indent=2) + "\n")
+    if not resume:
+        raise ConfigError(
+            f"{str(settings.out)!r} holds a training already",
+            hint="go on with --resume, or choose another --out",
+        )
+
+
+def make_folder(path: Path) -> None:
+    """Make an empty folder.
+
+    Raises:
+        ConfigError: It is there and not empty.
+    """
+    if path.exists() and any(path.iterdir()):
+        raise ConfigError(f"{str(path)!r} is not empty", hint="choose another --out")
+    path.mkdir(parents=True, exist_ok=True)
 
 
 def read_state(path: Path) -> dict[str, Any]:
@@ -118,6 +137,8 @@ def read_state(path: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: The file is damaged.
     """
+    import torch
+
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
@@ -129,6 +150,8 @@ def read_state(path: Path) -> dict[str, Any]:
 
 def write_state(path: Path, state: dict[str, Any]) -> None:
     """Keep what a training needs to go on."""
+    import torch
+
     with atomic_write(path) as partial:
         torch.save(state, partial)
 
@@ -144,12 +167,17 @@ def write_network(path: Path, weights: Weights) -> None:
 
 def write_table(path: Path, rows: list[dict[str, Any]]) -> None:
     """Write rows as Parquet."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     with atomic_write(path) as partial:
         pq.write_table(pa.Table.from_pylist(rows), partial)
 
 
 def draw_curves(path: Path, curve: list[dict[str, Any]], scores: list[dict[str, Any]]) -> None:
     """Draw errors while training, and scores after each round; nothing without matplotlib."""
+    from shiftsim.report.palette import dashes, new_figure, planner_styles, save_picture
+
     try:
         figure = new_figure(figsize=(8.0, 3.2))
     except MissingExtraError:

@@ -11,22 +11,16 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from torch import Tensor
 
-from shiftsim.env.driving import DrivingEnv, ProcessVectorEnv
+from shiftsim.env.driving import DrivingEnv, vector_env
 from shiftsim.files import write_text
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.planners.learned.carl.network import CarlNetwork, Policy
-from shiftsim.train.folder import (
-    OnMessage,
-    Settings,
-    Weights,
-    read_state,
-    write_state,
-    write_table,
-)
+from shiftsim.train import folder
+from shiftsim.train.folder import OnMessage, Settings, Weights
 from shiftsim.train.jobs import NOISES, Towns
 from shiftsim.train.learning import (
     UNITS,
@@ -64,13 +58,6 @@ class RolloutBuffer(NamedTuple):
     advantages: Values  # (M,)
 
 
-class UpdateResult(NamedTuple):
-    """What an update came to."""
-
-    loss: float
-    clipped: float  # share of the steps at which the ratio was cut
-
-
 def advantages_of(
     rewards: FloatArray, values: FloatArray, ended: NDArray[np.bool_], last: FloatArray
 ) -> FloatArray:
@@ -92,20 +79,19 @@ def advantages_of(
 def ppo_loss(
     policy: Policy, values: Tensor, part: dict[str, Tensor], *, critic_only: bool
 ) -> tuple[Tensor, Tensor]:
-    """Sum of losses over some steps of a `RolloutBuffer`, and of the steps that were cut (1,)."""
+    """Loss summed over some steps of a `RolloutBuffer`; (1,) those with a clipped ratio."""
     x = part["actions"].clamp(_EDGE, 1.0 - _EDGE)
     density = log_density(policy.alpha, policy.beta, x).sum(1)
     ratio = (density - part["density"]).exp()
-    gain, near = part["advantages"], ratio.clamp(1.0 - CLIP, 1.0 + CLIP)
-    wanted, before = part["returns"], part["values"]
-    close = before + (values - before).clamp(-CLIP, CLIP)
-    off = (values - wanted).square()
+    advantages, clipped_ratio = part["advantages"], ratio.clamp(1.0 - CLIP, 1.0 + CLIP)
+    clipped_values = part["values"] + (values - part["values"]).clamp(-CLIP, CLIP)
+    errors = (values - part["returns"]).square()
     if critic_only:
-        return VALUE_WEIGHT * 0.5 * off.sum(), torch.zeros(1)  # nothing was cut
-    acting = -torch.minimum(ratio * gain, near * gain).sum()
-    critic = 0.5 * torch.maximum(off, (close - wanted).square()).sum()
-    cut = ((ratio - 1.0).abs() > CLIP).sum().detach().float().reshape(1)
-    return acting + VALUE_WEIGHT * critic, cut
+        return VALUE_WEIGHT * 0.5 * errors.sum(), torch.zeros(1)  # nothing was clipped
+    acting = -torch.minimum(ratio * advantages, clipped_ratio * advantages).sum()
+    critic = 0.5 * torch.maximum(errors, (clipped_values - part["returns"]).square()).sum()
+    num_clipped = ((ratio - 1.0).abs() > CLIP).sum().detach().float().reshape(1)
+    return acting + VALUE_WEIGHT * critic, num_clipped
 
 
 def reinforce(
@@ -116,7 +102,7 @@ def reinforce(
     state: dict[str, Any] = {"rows": [], "best": weights, "highest": -np.inf, "seconds": 0.0}
     path = settings.out / "ppo.pt"
     if path.exists():
-        state = read_state(path)
+        state = folder.read_state(path)
         trainer.restore(state.pop("trainer"))
     began, written = monotonic() - state["seconds"], monotonic()
     with trainer:
@@ -128,16 +114,16 @@ def reinforce(
                 best = {name: v.clone() for name, v in trainer.network.state_dict().items()}
                 state |= {"best": to_official(best), "highest": mean}
             steps, seconds = trainer.update * ROLLOUT, monotonic() - began
-            state["rows"].append({"samples": steps, "return": mean, **result._asdict()})
-            left = seconds / trainer.update * (trainer.total - trainer.update)
+            state["rows"].append({"samples": steps, "return": mean, **result})
+            left = seconds / 60.0 / trainer.update * (trainer.total - trainer.update)
             on_message(
                 f"PPO: {steps} of {trainer.total * ROLLOUT} samples  {steps / seconds:.0f} "
-                f"samples/s  return {mean:.1f}  loss {result.loss:.3f}  {left / 60.0:.0f} min left"
+                f"samples/s  return {mean:.1f}  loss {result['loss']:.3f}  {left:.0f} min left"
             )
-            write_table(settings.out / "ppo.parquet", state["rows"])
+            folder.write_table(settings.out / "ppo.parquet", state["rows"])
             if monotonic() - written > _WRITE_EVERY or trainer.update == trainer.total:
                 written, state["seconds"] = monotonic(), seconds
-                write_state(path, state | {"trainer": trainer.state()})
+                folder.write_state(path, state | {"trainer": trainer.state()})
     best_weights: Weights = state["best"]
     return best_weights
 
@@ -162,35 +148,31 @@ class Trainer:
     def __enter__(self) -> "Trainer":
         makers = [partial(_make, self._settings, number) for number in range(ENVS)]
         mode = AutoresetMode.SAME_STEP
-        self._envs = (
-            SyncVectorEnv(makers, autoreset_mode=mode)
-            if self._settings.workers == 1
-            else ProcessVectorEnv(makers, autoreset_mode=mode)
-        )
+        self._envs = vector_env(makers, self._settings.workers, autoreset_mode=mode)
         seeds = np.random.default_rng([self._settings.seed, 4, self.update])
         numbers = seeds.integers(2**31, size=ENVS).tolist()
-        self._seen, _ = self._envs.reset(seed=numbers)
+        self._observations, _ = self._envs.reset(seed=numbers)
         self._sums = np.zeros(ENVS)
         return self
 
     def __exit__(self, *_: object) -> None:
         self._envs.close()
 
-    def improve(self) -> UpdateResult:
-        """Drive one rollout, and learn from it."""
+    def improve(self) -> dict[str, float]:
+        """Drive one rollout and learn from it: mean loss, share of steps with a clipped ratio."""
         random = np.random.default_rng([self._settings.seed, 5, self.update])
         torch.manual_seed(int(random.integers(2**31)))
         buffer = self._drive(ROLLOUT // ENVS)
-        loss = cut = 0.0
+        loss = clipped = 0.0
         for _ in range(EPOCHS):
             order = random.permutation(len(buffer.pictures))
             for first in range(0, len(order), MINIBATCH):
                 rows = order[first : first + MINIBATCH]
                 critic_only = self.update / self.total < ALONE
-                done, clipped = self._learn(buffer, rows, critic_only=critic_only)
-                loss, cut = loss + done * len(rows), cut + clipped
+                mean_loss, count = self._learn(buffer, rows, critic_only=critic_only)
+                loss, clipped = loss + mean_loss * len(rows), clipped + count
         self.update += 1
-        return UpdateResult(loss / EPOCHS / len(order), cut / EPOCHS / len(order))
+        return {"loss": loss / EPOCHS / len(order), "clipped": clipped / EPOCHS / len(order)}
 
     def _drive(self, steps: int) -> RolloutBuffer:
         """Act in all environments for so many steps."""
@@ -200,50 +182,48 @@ class Trainer:
         density, values, rewards = np.zeros((3, steps, ENVS))
         with torch.no_grad():
             for step in range(steps):
-                seen = self._seen
-                policy, value = self._ask(seen)
+                batch = self._observations
+                policy, value = self._evaluate(*_inputs(batch))
                 x = torch.distributions.Beta(policy.alpha, policy.beta).sample()
                 x = x.clamp(_EDGE, 1.0 - _EDGE)
                 density[step] = log_density(policy.alpha, policy.beta, x).sum(1).cpu()
                 actions[step], values[step] = x.cpu(), value.cpu()
-                pictures += [compress_raster(raster) for raster in seen["raster"]]
-                measured[step], critic[step] = seen["measurements"], seen["value_measurements"]
-                asked = (2.0 * actions[step] - 1.0).astype(np.float32)
-                self._seen, reward, infraction, is_over, _ = self._envs.step(asked)
+                pictures += [compress_raster(raster) for raster in batch["raster"]]
+                measured[step], critic[step] = batch["measurements"], batch["value_measurements"]
+                sent = (2.0 * actions[step] - 1.0).astype(np.float32)
+                self._observations, reward, infraction, is_over, _ = self._envs.step(sent)
                 rewards[step], ended[step] = reward / PERCENT, infraction | is_over
                 self._sums += reward
                 self.returns += self._sums[ended[step]].tolist()
                 self._sums[ended[step]] = 0.0
-            last = self._ask(self._seen)[1].cpu().numpy().astype(np.float64)
+            last = self._evaluate(*_inputs(self._observations))[1].cpu().numpy().astype(np.float64)
         gains = advantages_of(rewards, values, ended, last)
         numbers = (measured, critic, actions, density, values, gains + values, gains)
         flat = [found.reshape(-1, *found.shape[2:]).astype(np.float32) for found in numbers]
         return RolloutBuffer(pictures, *flat)
 
-    def _ask(self, seen: dict[str, Any]) -> tuple[Policy, Tensor]:
-        """The policy and what the critic expects (ENVS,)."""
-        arrays = (seen["raster"], seen["measurements"] / UNITS, seen["value_measurements"])
-        pictures, measured, critic = (torch.from_numpy(a).to(self._device) for a in arrays)
-        features = self.network.features_extractor(pictures, measured)
-        return self.network.policy(features), self.network.value(features, critic)[:, 0]
+    def _evaluate(self, *inputs: Any, critic_only: bool = False) -> tuple[Policy, Tensor]:
+        """The policy and what the critic expects (B,); alone it does not change the features."""
+        rasters, measured, critic = (torch.as_tensor(a, device=self._device) for a in inputs)
+        features = self.network.features_extractor(rasters, measured)
+        read = features.detach() if critic_only else features
+        return self.network.policy(features), self.network.value(read, critic)[:, 0]
 
     def _learn(
         self, buffer: RolloutBuffer, order: IntArray, *, critic_only: bool
     ) -> tuple[float, float]:
-        names = ("measurements", "critic", "actions", "density", "values", "returns", "advantages")
-        chosen = {name: torch.from_numpy(getattr(buffer, name)[order]) for name in names}
+        arrays = buffer._asdict()
+        pictures = arrays.pop("pictures")
+        chosen = {name: torch.from_numpy(values[order]) for name, values in arrays.items()}
         chosen["measurements"] /= torch.from_numpy(UNITS)
         gain = chosen["advantages"]
         chosen["advantages"] = (gain - gain.mean()) / (gain.std() + 1e-8)
 
         def loss_of_rows(rows: IntArray) -> tuple[Tensor, Tensor]:
-            rasters = np.stack([read_raster(buffer.pictures[index]) for index in order[rows]])
+            rasters = np.stack([read_raster(pictures[index]) for index in order[rows]])
             part = {name: value[rows].to(self._device) for name, value in chosen.items()}
-            pictures = torch.from_numpy(rasters).to(self._device)
-            features = self.network.features_extractor(pictures, part["measurements"])
-            policy = self.network.policy(features)
-            read = features.detach() if critic_only else features
-            values = self.network.value(read, part["critic"])[:, 0]
+            inputs = (rasters, part["measurements"], part["critic"])
+            policy, values = self._evaluate(*inputs, critic_only=critic_only)
             return ppo_loss(policy, values, part, critic_only=critic_only)
 
         parameters: list[Tensor] = list(self.network.parameters())
@@ -267,6 +247,11 @@ class Trainer:
         self.network.load_state_dict(state["network"])
         self._optimiser.load_state_dict(state["optimiser"])
         self.update, self.returns = state["update"], list(state["returns"])
+
+
+def _inputs(batch: dict[str, Any]) -> tuple[Values, ...]:
+    """What the network reads of observations."""
+    return batch["raster"], batch["measurements"] / UNITS, batch["value_measurements"]
 
 
 def _make(settings: Settings, number: int) -> gymnasium.Env[Any, Any]:

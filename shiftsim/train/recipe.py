@@ -15,18 +15,8 @@ from typing import Any
 from shiftsim.planners.learned.device import resolve_device
 from shiftsim.runs.filter import read_filter_results
 from shiftsim.runs.scenarios import find_split, open_named_store
-from shiftsim.train.folder import (
-    TAUS,
-    OnMessage,
-    Settings,
-    Weights,
-    draw_curves,
-    prepare_folder,
-    read_state,
-    write_network,
-    write_state,
-    write_table,
-)
+from shiftsim.train import folder
+from shiftsim.train.folder import BEST, LATEST, OnMessage, Settings, Weights
 from shiftsim.train.jobs import RunJobs, Towns, collect, divide, mean_scores, run_jobs
 from shiftsim.train.learning import (
     BATCH,
@@ -73,14 +63,14 @@ class Training:
         usable = filtered.accepted if filtered else store.tokens
         tokens = find_split(settings.split, store.path, usable).tokens
         self.towns: Towns = divide(store, tokens, settings.seed)
-        prepare_folder(settings, store.hash, resume=resume)
+        folder.prepare_folder(settings, store.hash, resume=resume)
         self.steps = max(1, settings.samples // settings.rounds // BATCH)
         total = self.steps * settings.rounds
         begin = from_official(self._begin()) if settings.checkpoint else None
         self.learner = Learner(self.device, settings.workers, total, settings.seed, begin)
         self.progress = Progress()
-        if settings.state.exists():
-            state = read_state(settings.state)
+        if (settings.out / folder.STATE).exists():
+            state = folder.read_state(settings.out / folder.STATE)
             self.progress = Progress(**state["progress"])
             self.learner.restore(state["learner"])
         self._began = monotonic() - self.progress.seconds
@@ -91,8 +81,8 @@ class Training:
 
         settings = self._settings
         state = load_weights(settings.checkpoint, "carl").state
-        if not settings.network.exists():
-            write_network(settings.network, state)
+        if not (settings.out / LATEST).exists():
+            folder.write_network(settings.out / LATEST, state)
         return state
 
     def run(self) -> None:
@@ -119,35 +109,35 @@ class Training:
         from shiftsim.train.ppo import reinforce
 
         settings = self._settings
-        state = load_weights(str(settings.best), "carl").state
-        write_network(
-            settings.reinforced,
+        state = load_weights(str(settings.out / BEST), "carl").state
+        folder.write_network(
+            settings.out / folder.REINFORCED,
             reinforce(settings, self.towns, state, self.device, self._on_message),
         )
-        found = self._scores(settings.reinforced, "PPO:")
+        found = self._scores(settings.out / folder.REINFORCED, "PPO:")
         self._on_message(f"PPO: {_in_words(found)}")
 
     def _choose_tau(self) -> float:
         """The tau with which PDM-Closed drives best through its labels, with and without noise."""
         settings, rows = self._settings, self.progress.taus
-        for tau in TAUS:
+        for tau in folder.TAUS:
             run = self._run_jobs(_NO_DRIVER, f"tau {tau:g} s")
             found = mean_scores(self.towns, settings.tests, tau, run, by_expert=True)
             rows.append({"tau": tau, **found})
             self._on_message(f"tau {tau:g} s: {_in_words(found)}")
-        write_table(settings.out / "tau.parquet", rows)
+        folder.write_table(settings.out / "tau.parquet", rows)
         return float(max(rows, key=lambda row: sum(row.values()) - row["tau"])["tau"])
 
     def _collect(self) -> None:
         settings, progress = self._settings, self.progress
-        folder = settings.part(progress.round)
-        if folder.exists():
+        part = settings.part(progress.round)
+        if part.exists():
             return
         drives = progress.round or settings.checkpoint
-        checkpoint = str(settings.network) if drives else _NO_DRIVER
+        checkpoint = str(settings.out / LATEST) if drives else _NO_DRIVER
         run = self._run_jobs(checkpoint, f"{self._where} collecting")
         number, tau = progress.round, progress.tau
-        write_part(folder, collect(settings, self.towns, number, tau, run, self._on_message))
+        write_part(part, collect(settings, self.towns, number, tau, run, self._on_message))
         self._write_state()
 
     def _train(self) -> None:
@@ -183,19 +173,19 @@ class Training:
     def _test(self) -> None:
         settings, progress = self._settings, self.progress
         state = to_official(self.learner.driving())
-        write_network(settings.network, state)
-        found = self._scores(settings.network, self._where)
+        folder.write_network(settings.out / LATEST, state)
+        found = self._scores(settings.out / LATEST, self._where)
         seconds = monotonic() - self._began
         samples = self.learner.step * BATCH
         row = {"round": progress.round, "samples": samples, **found, "seconds": seconds}
         before = max((sum_of(row) for row in progress.scores), default=-1.0)
         progress.scores.append(row)
         if sum_of(row) > before:
-            write_network(settings.best, state)
+            folder.write_network(settings.out / BEST, state)
         self._on_message(f"{self._where} {_in_words(found)}  after {seconds / 60.0:.0f} min")
-        write_table(settings.out / "scores.parquet", progress.scores)
-        write_table(settings.out / "curve.parquet", progress.curve)
-        draw_curves(settings.out / "curves.png", progress.curve, progress.scores)
+        folder.write_table(settings.out / "scores.parquet", progress.scores)
+        folder.write_table(settings.out / "curve.parquet", progress.curve)
+        folder.draw_curves(settings.out / "curves.png", progress.curve, progress.scores)
 
     def _scores(self, network: Path, where: str) -> dict[str, float]:
         run, count = self._run_jobs(str(network), f"{where} testing"), self._settings.tests
@@ -204,7 +194,7 @@ class Training:
     def _write_state(self) -> None:
         self.progress.seconds = monotonic() - self._began
         state = {"progress": vars(self.progress), "learner": self.learner.state()}
-        write_state(self._settings.state, state)
+        folder.write_state(self._settings.out / folder.STATE, state)
 
     @property
     def _where(self) -> str:

@@ -4,6 +4,7 @@ import pytest
 from made_runs import random_scores, write_run
 from pictures import cut_off, overlaps, written
 
+from shiftsim.report import palette
 from shiftsim.report.build import write_report
 from shiftsim.report.groups import read_groups
 from shiftsim.report.palette import planner_styles
@@ -148,7 +149,7 @@ def test_fonts_of_a_pdf_are_truetype_as_papers_ask_for(groups, tmp_path):
 
 def test_the_curve_of_a_training_is_drawn_in_the_colours_of_all_pictures(tmp_path, monkeypatch):
     kept = []
-    monkeypatch.setattr(folder, "save_picture", lambda figure, path: kept.append(figure))
+    monkeypatch.setattr(palette, "save_picture", lambda figure, path: kept.append(figure))
     rows = [{"samples": 1e5 * i, "acceleration_error": 0.2, "steering_error": 0.1} for i in (1, 2)]
     folder.draw_curves(tmp_path / "a.png", rows, [{"samples": 1e5, "none": 0.9, "ou-high": 0.7}])
     (figure,) = kept

@@ -7,6 +7,7 @@ import torch
 from shiftsim.data.store.reading import open_store
 from shiftsim.planners.learned.carl.network import CarlNetwork, Policy
 from shiftsim.train import ppo
+from shiftsim.train.folder import BEST, REINFORCED
 from shiftsim.train.jobs import divide
 from shiftsim.train.learning import to_official
 from shiftsim.train.recipe import Training
@@ -62,9 +63,9 @@ def test_it_goes_on_from_imitation_and_writes_a_network(short, small):
     settings = small(ppo_samples=128, samples=128)
     lines = []
     Training(settings, lines.append).run()
-    assert settings.reinforced.is_file()
+    assert (settings.out / REINFORCED).is_file()
     assert sum("return" in line for line in lines) == 2
-    assert settings.reinforced.read_bytes() != settings.best.read_bytes()
+    assert (settings.out / REINFORCED).read_bytes() != (settings.out / BEST).read_bytes()
     again = []
     Training(settings, again.append, resume=True).run()
     assert not any("return" in line for line in again)  # all of it is done

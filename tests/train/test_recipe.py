@@ -15,7 +15,7 @@ from shiftsim.data.store.reading import open_store
 from shiftsim.errors import CheckpointError, ConfigError
 from shiftsim.train import recipe
 from shiftsim.train.driving import Driver, Job, PolicyPlanner, Start
-from shiftsim.train.folder import Settings
+from shiftsim.train.folder import BEST, LATEST, STATE, Settings
 from shiftsim.train.jobs import divide
 from shiftsim.train.recipe import Training
 
@@ -55,7 +55,7 @@ def test_a_training_that_was_ended_goes_on_as_if_it_had_not(small, trained, monk
         train(ended)
     train(ended, resume=True)
     assert len(steps) == 7  # 6 steps, of which the interrupted one was begun twice
-    assert ended.network.read_bytes() == whole.network.read_bytes()
+    assert (ended.out / LATEST).read_bytes() == (whole.out / LATEST).read_bytes()
 
 
 def test_what_comes_out_drives_and_says_how_it_came(trained, toy, tmp_path):
@@ -64,10 +64,10 @@ def test_what_comes_out_drives_and_says_how_it_came(trained, toy, tmp_path):
         assert (settings.out / name).stat().st_size > 0
     assert len(pq.read_table(settings.out / "scores.parquet")) == 2
     assert any("training on" in line for line in lines)
-    assert settings.best.stat().st_size < 8_000_000
+    assert (settings.out / BEST).stat().st_size < 8_000_000
     done = shiftsim.run(
         "carl",
-        checkpoints=[f"carl={settings.best}"],
+        checkpoints=[f"carl={settings.out / BEST}"],
         store=str(toy),
         workers=1,
         out=str(tmp_path / "run"),
@@ -79,11 +79,11 @@ def test_with_weights_to_begin_with_the_network_drives_at_once(small, trained, m
     asked = []
     monkeypatch.setattr(recipe, "collect", lambda *job: asked.append(job[4].args[1]) or [])
     monkeypatch.setattr(recipe, "write_part", lambda folder, states: None)
-    settings = small("more", checkpoint=str(trained[0].best))
+    settings = small("more", checkpoint=str(trained[0].out / BEST))
     training = Training(settings, print)
     training._collect()
-    assert asked == [str(settings.network)]
-    assert settings.network.read_bytes() == trained[0].best.read_bytes()
+    assert asked == [str(settings.out / LATEST)]
+    assert (settings.out / LATEST).read_bytes() == (trained[0].out / BEST).read_bytes()
 
 
 def test_what_comes_before_an_infraction_of_the_network_is_urgent(toy, monkeypatch):
@@ -126,7 +126,7 @@ def test_a_folder_holds_one_training(small, tmp_path):
         Training(settings, print)
     with pytest.raises(ConfigError, match="seed 5, not 6"):
         Training(small(seed=6), print, resume=True)
-    settings.state.write_bytes(b"damaged")
+    (settings.out / STATE).write_bytes(b"damaged")
     with pytest.raises(CheckpointError, match=r"state\.pt"):
         Training(settings, print, resume=True)
     (tmp_path / "full").mkdir()
@@ -151,10 +151,10 @@ def test_a_killed_command_goes_on(small, toy):
     words += ["--out", str(killed.out), "--rounds", "2", "--states", "40", "--samples", "6400"]
     words += ["--tau", "0.3", "--tests", "2", "--workers", "1", "--seed", "5"]
     process = subprocess.Popen(words)
-    while not killed.network.exists():
+    while not (killed.out / LATEST).exists():
         assert process.poll() is None
         time.sleep(0.2)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     subprocess.run([*words, "--resume"], check=True)
-    assert killed.network.read_bytes() == whole.network.read_bytes()
+    assert (killed.out / LATEST).read_bytes() == (whole.out / LATEST).read_bytes()

@@ -14,8 +14,9 @@ from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import ConfigError
 from shiftsim.sim.traffic.constant_velocity import ConstantVelocity
 from shiftsim.sim.traffic.learned.model import LearnedTraffic, load_weights
+from shiftsim.train.folder import TrafficSettings
 from shiftsim.train.traffic.realism import compare
-from shiftsim.train.traffic.recipe import TrafficSettings, train_traffic
+from shiftsim.train.traffic.recipe import train_traffic
 from shiftsim.train.traffic.states import compute_labels
 from shiftsim.world.state import AgentKind, Tracks
 
@@ -88,7 +89,9 @@ def test_labels_lead_back_to_the_recorded_drive():
 
 @pytest.fixture(scope="module")
 def weights(store, tmp_path_factory):
-    settings = TrafficSettings(str(store), tmp_path_factory.mktemp("traffic") / "out", **SMALL)
+    settings = TrafficSettings(
+        store=str(store), out=tmp_path_factory.mktemp("traffic") / "out", **SMALL
+    )
     lines = []
     return train_traffic(settings, lines.append), lines
 
@@ -103,18 +106,20 @@ def test_a_training_gives_weights_losses_and_a_table(weights, store, tmp_path):
     assert rows[1]["distance_m"] > 0.0
     assert pq.read_table(file.parent / "losses.parquet").num_rows == 2
     with pytest.raises(ConfigError, match="is not empty"):
-        train_traffic(TrafficSettings(str(store), file.parent, **SMALL), lines.append)
-    again = train_traffic(TrafficSettings(str(store), tmp_path / "out", **SMALL), lines.append)
+        train_traffic(TrafficSettings(store=str(store), out=file.parent, **SMALL), lines.append)
+    again = train_traffic(
+        TrafficSettings(store=str(store), out=tmp_path / "out", **SMALL), lines.append
+    )
     for first, second in zip(load_weights(file), load_weights(again), strict=True):
         np.testing.assert_array_equal(first, second)
-    other = TrafficSettings(str(store), tmp_path / "other", **(SMALL | {"seed": 4}))
+    other = TrafficSettings(store=str(store), out=tmp_path / "other", **(SMALL | {"seed": 4}))
     found = load_weights(train_traffic(other, lines.append))
     assert not np.array_equal(found.first, load_weights(file).first)
 
 
 def test_settings_that_make_no_training_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="rounds is 0"):
-        TrafficSettings("demo", tmp_path, rounds=0)
+        TrafficSettings(out=tmp_path, rounds=0)
 
 
 def test_the_shipped_weights_are_nearer_than_constant_velocity(store):

@@ -6,7 +6,6 @@ round trains on the states of all rounds so far, and the last network is measure
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,13 +16,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from shiftsim.data.store.reading import ScenarioStore
-from shiftsim.errors import ConfigError
 from shiftsim.files import atomic_write
 from shiftsim.runs.scenarios import find_split, open_named_store
 from shiftsim.sim.traffic import Traffic, make_traffic
 from shiftsim.sim.traffic.learned.features import NUM_FEATURES
 from shiftsim.sim.traffic.learned.model import HIDDEN, SCALES, LearnedTraffic, Weights
-from shiftsim.train.folder import OnMessage, write_table
+from shiftsim.train.folder import OnMessage, TrafficSettings, make_folder, write_table
 from shiftsim.train.jobs import divide
 from shiftsim.train.traffic.realism import compare
 from shiftsim.train.traffic.states import States, join, states_of
@@ -31,26 +29,6 @@ from shiftsim.train.traffic.states import States, join, states_of
 WEIGHTS, TABLE, CURVE = "weights.npz", "realism.parquet", "losses.parquet"
 BATCH, RATE, FLOOR = 1024, 2e-3, 0.02
 ASIDE = 0.3  # m beside the point steered to that weigh as much as 1 m/s^2
-
-
-@dataclass(frozen=True, slots=True)
-class TrafficSettings:
-    """What a training of traffic depends on, and where it is written."""
-
-    store: str  # name, path or URL of the store
-    out: Path  # folder that is written
-    split: str = ""  # of the store; all scenarios if empty
-    seed: int = 0
-    rounds: int = 5  # of collecting and training
-    scenarios: int = 150  # that each round collects from
-    epochs: int = 8  # of each round
-    tests: int = 100  # scenarios of towns left out that the result is measured on
-
-    def __post_init__(self) -> None:
-        """Refuse numbers that make no training."""
-        for name in ("rounds", "scenarios", "epochs", "tests"):
-            if (value := getattr(self, name)) < 1:
-                raise ConfigError(f"{name} is {value!r}", hint="give a number above 0")
 
 
 def train_traffic(settings: TrafficSettings, on_message: OnMessage) -> Path:
@@ -63,14 +41,12 @@ def train_traffic(settings: TrafficSettings, on_message: OnMessage) -> Path:
         DataError: The store is not there, or has too few scenarios.
     """
     out, seed = settings.out, settings.seed
-    if out.exists() and any(out.iterdir()):
-        raise ConfigError(f"{str(out)!r} is not empty", hint="choose another --out")
     store = open_named_store(settings.store)
     tokens = find_split(settings.split, store.path, store.tokens).tokens
     towns = divide(store, tokens, seed)
     trained = [token for group in towns.trained.values() for token in sorted(group)]
     tested = [token for group in towns.tested.values() for token in sorted(group)]
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     torch.set_num_threads(1)  # sums in one order
     network, parts, losses = new_network(seed), list[States](), list[dict[str, Any]]()
     file = out / WEIGHTS
@@ -101,18 +77,11 @@ def _collected(
     store: ScenarioStore, tokens: Iterable[str], file: Path, seed: int, number: int
 ) -> States:
     """States of a round; from the second one on the network drives."""
-    traffic = LearnedTraffic(file)
-    return join(
-        [
-            states_of(
-                store.read(token),
-                traffic,
-                np.random.default_rng([seed, number, place]),
-                drives=number > 0,
-            )
-            for place, token in enumerate(tokens)
-        ]
-    )
+    traffic, found = LearnedTraffic(file), list[States]()
+    for place, token in enumerate(tokens):
+        random = np.random.default_rng([seed, number, place])
+        found.append(states_of(store.read(token), traffic, random, drives=number > 0))
+    return join(found)
 
 
 def write_weights(path: Path, weights: Weights) -> None:
