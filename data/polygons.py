@@ -1,4 +1,4 @@
-"""Polygons of maps: which of them meet, how much they share, and their largest part."""
+"""Polygons of maps: how much of them is shared, and their largest part."""
 
 from collections.abc import Sequence
 
@@ -6,26 +6,11 @@ import numpy as np
 import shapely
 
 
-def touching(polygons: Sequence[shapely.Polygon]) -> list[tuple[int, int]]:
-    """Pairs (i, j), i < j, of polygons that meet, borders included; sorted."""
-    from rtree.index import Index
-
-    shapes = np.array(polygons, dtype=object)
-    bounds = shapely.bounds(shapes).reshape(-1, 4)
-    boxes = [(int(i), bounds[i].tolist(), None) for i in np.flatnonzero(~shapely.is_empty(shapes))]
-    if not boxes:
-        return []
-    index = Index(iter(boxes))
-    pairs = [(i, j) for i, box, _ in boxes for j in index.intersection(box) if i < j]
-    one, two = np.array(pairs, np.int64).reshape(-1, 2).T
-    meet = shapely.intersects(shapes[one], shapes[two])
-    return sorted(zip(one[meet].tolist(), two[meet].tolist(), strict=True))
-
-
 def shared_areas(polygons: Sequence[shapely.Polygon]) -> dict[tuple[int, int], float]:
-    """Area that polygons i < j share [m^2], for all that meet."""
-    pairs = touching(polygons)
+    """Area that polygons i < j share [m^2], for all that meet, borders included; by i and j."""
     shapes = np.array(polygons, dtype=object)
+    one, two = shapely.STRtree(shapes).query(shapes, predicate="intersects")
+    pairs = sorted((i, j) for i, j in zip(one.tolist(), two.tolist(), strict=True) if i < j)
     one, two = np.array(pairs, np.int64).reshape(-1, 2).T
     try:
         areas = shapely.area(shapely.intersection(shapes[one], shapes[two])).tolist()

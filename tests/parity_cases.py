@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from nuplan_logs import read_scenario
 
-from shiftsim.data.nuplan.scenarios import find_maps, load_map, read_scenario
+from shiftsim.data.nuplan.scenarios import find_maps, load_map
 from shiftsim.errors import DataError
 from shiftsim.verify.report import Report
 from shiftsim.verify.rollouts import LOGGED, REACTIVE, SCORES, SIMULATED

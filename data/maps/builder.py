@@ -1,177 +1,277 @@
-"""Shaped lanes and connectors to the parts of a map: ids, links, roadblocks, intersections.
+"""A lane graph to a map: ids, links, roadblocks, intersections, whatever the source of the lanes.
 
-Whatever the source: readers of OpenDRIVE and of lane pieces shape lanes and connectors in their own
-ways, and hand them over here.
+`MapBuilder` asks a source only how its segments are shaped, and what governs traffic on them.
 """
 
-from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from itertools import count
-from typing import Protocol, TypeVar
+from abc import ABC, abstractmethod
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import count, pairwise
+from typing import Any, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 import shapely
 
 from shiftsim.data.maps.opendrive.areas import merge_closed
 from shiftsim.data.maps.opendrive.overlaps import subtract_overlaps
-from shiftsim.data.maps.opendrive.shapes import lane_polygon
+from shiftsim.data.maps.opendrive.shapes import bend_ends, lane_polygon
+from shiftsim.data.maps.topology import Connector, Lane, LaneGraph, S
 from shiftsim.data.polygons import largest_part
 from shiftsim.kernels import FloatArray, IntArray
-from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec
+from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
+from shiftsim.world.map import VectorMap
 
 LIGHT_KIND, STOP_SIGN_KIND, PASS_THROUGH = 1, 2, 5  # kinds of intersections
 T = TypeVar("T")
+_Segment = TypeVar("_Segment", contravariant=True)
+_Spec = TypeVar("_Spec", EdgeSpec, BlockSpec, AreaSpec)
+Pairs: TypeAlias = set[tuple[int, int]]
 _CLOSING = 0.5  # m
 _STRAIGHT_TURN, _U_TURN = np.deg2rad(30.0), np.deg2rad(150.0)
 
 
 @dataclass(frozen=True)
-class _Shape:
-    left: FloatArray  # (K, 2) left border in the direction of travel [m]
+class BuiltMap:
+    """A map, and what became of its source."""
+
+    road: VectorMap
+    warnings: dict[str, int]  # what was repaired, inferred or left out: count by kind
+    # by connector that has one: the name of its light
+    lights: Mapping[str, str] = field(default_factory=dict)
+    # by lane or connector: the segments of the source that it was made of, in order
+    segments: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+    # ids of pairs of lanes, and of roadblocks, that lie over each other on different levels
+    stacked: frozenset[tuple[str, str]] = frozenset()
+
+
+class _Shape(NamedTuple):
+    """A lane or connector of the graph, in the direction of travel."""
+
+    left: FloatArray  # (K, 2) left border [m]
     right: FloatArray  # (K', 2) right border [m]
     line: FloatArray  # (K'', 2) baseline [m]
     polygon: shapely.Polygon  # its area
-    speed_limit: float | None  # [m/s]; None where the source has none
 
 
-@dataclass(frozen=True)
-class ShapedLane(_Shape):
-    """A lane; those of a roadblock follow each other from left to right."""
+class Shaper(Protocol[_Segment]):
+    """Shapes segments that follow each other, in the direction of travel."""
 
-    block: int  # number of its roadblock
-    index: int  # place in it, 0 leftmost
-    is_beside: bool  # whether it touches the one before, where that is in the same roadblock
+    def joined_borders(self, segments: Sequence[_Segment]) -> tuple[FloatArray, FloatArray]:
+        """Left and right border (K, 2), (K', 2) [m]."""
 
-
-@dataclass(frozen=True)
-class ShapedConnector(_Shape):
-    """A lane connector."""
-
-    source: int  # lane it comes from
-    target: int  # lane it leads to
-    has_light: bool
-    stops: Sequence[int]  # stop polygons that belong to it
-
-
-class _Lane(Protocol):
-    @property
-    def block(self) -> int: ...
-
-
-class _Connector(Protocol):
-    @property
-    def source(self) -> int: ...
-    @property
-    def target(self) -> int: ...
-
-
-def block_pairs(lanes: Sequence[_Lane], connectors: Iterable[_Connector]) -> list[tuple[int, int]]:
-    """Roadblocks that each connector comes from and leads to."""
-    return [(lanes[c.source].block, lanes[c.target].block) for c in connectors]
-
-
-class MapBuilder:
-    """Parts of a map, with one series of ids for all of them."""
-
-    def __init__(
+    def baseline(
         self,
-        lanes: Sequence[ShapedLane],
-        connectors: Sequence[ShapedConnector],
-        *,
-        groups: IntArray,
-        num_stops: int,
-        stacked: Collection[tuple[int, int]] = (),
-    ) -> None:
-        """Number everything.
+        segments: Sequence[_Segment],
+        start: FloatArray | None = None,
+        end: FloatArray | None = None,
+    ) -> FloatArray:
+        """Centre line (K, 2), from `start` (2,) to `end` (2,) where given [m]."""
 
-        `groups` are the intersections of the connectors, 0 and up; `stacked` pairs of roadblocks
-        lie on different levels.
-        """
-        self._lanes, self._connectors, self._stacked = lanes, connectors, set(stacked)
+
+class MapBuilder(ABC, Generic[S]):
+    """Makes the map of a lane graph, with one series of ids for all of its parts."""
+
+    larger: str  # what the lane is, of two that overlap, that gives way: bigger or longer
+
+    def __init__(self, graph: LaneGraph[S], shaper: Shaper[S], warnings: Counter[str]) -> None:
+        """Counts in `warnings` what is repaired."""
+        self.graph, self.shaper, self.warnings = graph, shaper, warnings
+        lanes = graph.lanes
+        # roadblocks that each connector comes from and leads to
+        self.block_pairs = [
+            (lanes[c.source].block, lanes[c.target].block) for c in graph.connectors
+        ]
         self._next_id = map(str, count(1))
-        self.lane_ids = self._new_ids(len(lanes))
-        self.connector_ids = self._new_ids(len(connectors))
-        self.block_ids = self._new_ids(max((lane.block for lane in lanes), default=-1) + 1)
-        self._pairs = block_pairs(lanes, connectors)
-        pairs = sorted(set(self._pairs))
+
+    def connector_borders(self, connector: Connector[S]) -> tuple[FloatArray, FloatArray]:
+        """Left and right border (K, 2), (K', 2) of a connector [m]."""
+        return self.shaper.joined_borders(connector.segments)
+
+    @abstractmethod
+    def speed_limits(self, segment: S) -> Iterable[tuple[float | None, float]]:
+        """Limits on a segment [m/s], None for none, and the length over which each holds [m]."""
+
+    @abstractmethod
+    def sizes(self, polygons: Sequence[shapely.Polygon]) -> list[float]:
+        """How large each lane is; where two overlap, the larger one gives way."""
+
+    def stacked_lanes(self, polygons: Sequence[shapely.Polygon]) -> Pairs:
+        """Pairs i < j of lanes that lie on different levels."""
+        return set()
+
+    def are_adjacent(self, left: Lane[S], right: Lane[S]) -> bool:
+        """Whether two lanes touch that follow each other in a roadblock."""
+        return True
+
+    @abstractmethod
+    def stop_areas(self, lanes: Sequence[shapely.Polygon]) -> list[tuple[shapely.Polygon, int]]:
+        """Stop polygons and their kinds."""
+
+    @abstractmethod
+    def stops_of(self, number: int, before: FloatArray, line: FloatArray) -> Sequence[int]:
+        """Stop polygons of a connector, by its baseline and that of the lane before it."""
+
+    @abstractmethod
+    def light(self, number: int) -> str | None:
+        """The light that governs a connector: its name, empty where unknown; None for no light."""
+
+    @abstractmethod
+    def groups(self, connectors: Sequence[shapely.Polygon]) -> IntArray:
+        """Number of the intersection of each connector, 0 and up."""
+
+    @abstractmethod
+    def kind(self, numbers: Sequence[int]) -> int:
+        """Kind of the intersection of some connectors."""
+
+    @abstractmethod
+    def areas(
+        self, edges: Sequence[shapely.Polygon], intersections: Sequence[AreaSpec]
+    ) -> dict[str, Sequence[shapely.Polygon]]:
+        """Layers without links; `edges` are the areas of all lanes and connectors."""
+
+    def build(self, name: str, *, epsg: int = 0, offset: FloatArray | None = None) -> BuiltMap:
+        """The map, moved by `offset` (2,) [m]."""
+        graph = self.graph
+        self._shape_lanes()
+        stops = self.stop_areas([lane.polygon for lane in self._lanes])
+        self._connectors = [self._shape_connector(connector) for connector in graph.connectors]
+        self._groups = self.groups([c.polygon for c in self._connectors]).tolist()
+        self._lane_ids = self._new_ids(len(graph.lanes))
+        self._connector_ids = self._new_ids(len(graph.connectors))
+        self._block_ids = self._new_ids(max((lane.block for lane in graph.lanes), default=-1) + 1)
+        pairs = sorted(set(self.block_pairs))
         self._pair_ids = dict(zip(pairs, self._new_ids(len(pairs)), strict=True))
-        self._groups = groups.tolist()
-        self._group_ids = self._new_ids(int(groups.max(initial=-1)) + 1)
-        self.stop_ids = self._new_ids(num_stops)
+        self._group_ids = self._new_ids(max(self._groups, default=-1) + 1)
+        self._stop_ids = self._new_ids(len(stops))
+        edges = [*self._lane_specs(), *self._connector_specs()]
+        blocks = [*self._roadblocks(), *self._roadblock_connectors()]
+        layers = {
+            "intersections": list(self._intersections()),
+            "stop_polygons": [AreaSpec(i, *s) for i, s in zip(self._stop_ids, stops, strict=True)],
+        }
+        polygons = [edge.polygon for edge in edges]
+        for layer, shapes in self.areas(polygons, layers["intersections"]).items():
+            layers[layer] = [AreaSpec(next(self._next_id), shape) for shape in shapes]
+        road = build_map(
+            name,
+            edges=_moved(edges, offset),
+            blocks=_moved(blocks, offset),
+            epsg=epsg,
+            **{layer: _moved(specs, offset) for layer, specs in layers.items()},
+        )
+        return self._report(road)
+
+    def _report(self, road: VectorMap) -> BuiltMap:
+        stacked = {(self._lane_ids[i], self._lane_ids[j]) for i, j in self._stacked}
+        stacked |= {(self._block_ids[a], self._block_ids[b]) for a, b in self._stacked_blocks()}
+        runs = [lane.segments for lane in self.graph.lanes]
+        runs += [connector.segments for connector in self.graph.connectors]
+        segments = dict(zip([*self._lane_ids, *self._connector_ids], runs, strict=True))
+        named = ((i, self.light(number)) for number, i in enumerate(self._connector_ids))
+        lights = {i: light for i, light in named if light}
+        return BuiltMap(road, dict(self.warnings), lights, segments, frozenset(stacked))
+
+    def _stacked_blocks(self) -> Pairs:
+        blocks = [lane.block for lane in self.graph.lanes]
+        pairs = [(blocks[i], blocks[j]) for i, j in self._stacked]
+        return {(min(pair), max(pair)) for pair in pairs}
 
     def _new_ids(self, number: int) -> list[str]:
         return [next(self._next_id) for _ in range(number)]
 
-    def edges(self) -> list[EdgeSpec]:
-        """All lanes and connectors."""
-        return [*self._lane_specs(), *self._connector_specs()]
+    def _shape_lanes(self) -> None:
+        borders = [self.shaper.joined_borders(lane.segments) for lane in self.graph.lanes]
+        polygons = [lane_polygon(*pair) for pair in borders]
+        self._stacked = self.stacked_lanes(polygons)
+        polygons, overlaps = subtract_overlaps(polygons, self.sizes(polygons), self._stacked)
+        if overlaps:
+            self.warnings[f"overlap of two lanes, taken from the {self.larger} one"] += overlaps
+        self._lanes = [
+            _Shape(*pair, self.shaper.baseline(lane.segments), polygon)
+            for pair, lane, polygon in zip(borders, self.graph.lanes, polygons, strict=True)
+        ]
+
+    def _shape_connector(self, connector: Connector[S]) -> _Shape:
+        borders = self.connector_borders(connector)
+        before, after = (self._lanes[i].line for i in (connector.source, connector.target))
+        line = self.shaper.baseline(connector.segments, before[-1], after[0])
+        return _Shape(*borders, bend_ends(line, before, after), lane_polygon(*borders))
 
     def _lane_specs(self) -> Iterator[EdgeSpec]:
-        lanes = self._lanes
+        lanes = self.graph.lanes
         outgoing, incoming = defaultdict(list), defaultdict(list)
-        for connector_id, connector in zip(self.connector_ids, self._connectors, strict=True):
+        for connector_id, connector in zip(self._connector_ids, self.graph.connectors, strict=True):
             outgoing[connector.source].append(connector_id)
             incoming[connector.target].append(connector_id)
         # neighbours share a border
         borders: dict[tuple[int, int], str] = defaultdict(lambda: next(self._next_id))
-        beside = [
-            i > 0 and lane.is_beside and lanes[i - 1].block == lane.block
-            for i, lane in enumerate(lanes)
-        ] + [False]
-        for number, lane in enumerate(lanes):
+        left_lane, right_lane = dict[int, str](), dict[int, str]()
+        for number, (left, right) in enumerate(pairwise(lanes)):
+            if left.block == right.block and self.are_adjacent(left, right):
+                left_lane[number + 1] = self._lane_ids[number]
+                right_lane[number] = self._lane_ids[number + 1]
+        for number, (lane, shape) in enumerate(zip(lanes, self._lanes, strict=True)):
             yield EdgeSpec(
-                id=self.lane_ids[number],
+                id=self._lane_ids[number],
                 is_connector=False,
-                polygon=lane.polygon,
-                baseline=lane.line,
-                block_id=self.block_ids[lane.block],
+                polygon=shape.polygon,
+                baseline=shape.line,
+                block_id=self._block_ids[lane.block],
                 incoming=incoming[number],
                 outgoing=outgoing[number],
-                left=lane.left,
-                right=lane.right,
+                left=shape.left,
+                right=shape.right,
                 left_id=borders[lane.block, lane.index],
                 right_id=borders[lane.block, lane.index + 1],
-                speed_limit=lane.speed_limit,
+                speed_limit=self._speed_limit(lane.segments),
                 lane_index=lane.index,
-                left_lane=self.lane_ids[number - 1] if beside[number] else None,
-                right_lane=self.lane_ids[number + 1] if beside[number + 1] else None,
+                left_lane=left_lane.get(number),
+                right_lane=right_lane.get(number),
             )
 
     def _connector_specs(self) -> Iterator[EdgeSpec]:
-        for number, connector in enumerate(self._connectors):
+        for number, shape in enumerate(self._connectors):
+            connector = self.graph.connectors[number]
             left_id, right_id = self._new_ids(2)
+            stops = self.stops_of(number, self._lanes[connector.source].line, shape.line)
             yield EdgeSpec(
-                id=self.connector_ids[number],
+                id=self._connector_ids[number],
                 is_connector=True,
-                polygon=connector.polygon,
-                baseline=connector.line,
-                block_id=self._pair_ids[self._pairs[number]],
-                incoming=[self.lane_ids[connector.source]],
-                outgoing=[self.lane_ids[connector.target]],
-                left=connector.left,
-                right=connector.right,
+                polygon=shape.polygon,
+                baseline=shape.line,
+                block_id=self._pair_ids[self.block_pairs[number]],
+                incoming=[self._lane_ids[connector.source]],
+                outgoing=[self._lane_ids[connector.target]],
+                left=shape.left,
+                right=shape.right,
                 left_id=left_id,
                 right_id=right_id,
-                speed_limit=connector.speed_limit,
+                speed_limit=self._speed_limit(connector.segments),
                 intersection_id=self._group_ids[self._groups[number]],
-                has_traffic_lights=connector.has_light,
-                stop_lines=[self.stop_ids[i] for i in connector.stops],
-                turn_type=turn_type(connector.line),
+                has_traffic_lights=self.light(number) is not None,
+                stop_lines=[self._stop_ids[i] for i in stops],
+                turn_type=turn_type(shape.line),
             )
 
-    def blocks(self) -> list[BlockSpec]:
-        """All roadblocks and roadblock connectors."""
-        return [*self._roadblocks(), *self._roadblock_connectors()]
+    def _speed_limit(self, segments: Sequence[S]) -> float | None:
+        """The limit on most of a lane (nuPlan rule 507), the lower one on ties [m/s]."""
+        lengths: dict[float, float] = defaultdict(float)
+        for segment in segments:
+            for limit, length in self.speed_limits(segment):
+                lengths[np.inf if limit is None else limit] += length
+        best = min(lengths, key=lambda limit: (-round(lengths[limit], 6), limit), default=np.inf)
+        return None if np.isinf(best) else best
 
     def _roadblocks(self) -> Iterator[BlockSpec]:
-        members = _grouped(lane.block for lane in self._lanes)
+        members = _grouped(lane.block for lane in self.graph.lanes)
         order = sorted(members)
         polygons = [self._roadblock_polygon(members[block]) for block in order]
-        polygons, _ = subtract_overlaps(polygons, [p.area for p in polygons], self._stacked)
+        areas = [polygon.area for polygon in polygons]
+        polygons, _ = subtract_overlaps(polygons, areas, self._stacked_blocks())
         for block, polygon in zip(order, polygons, strict=True):
             yield BlockSpec(
-                id=self.block_ids[block],
+                id=self._block_ids[block],
                 is_connector=False,
                 polygon=polygon,
                 incoming=[i for pair, i in self._pair_ids.items() if pair[1] == block],
@@ -187,39 +287,25 @@ class MapBuilder:
         return largest_part(union)
 
     def _roadblock_connectors(self) -> Iterator[BlockSpec]:
-        members = _grouped(self._pairs)
+        members = _grouped(self.block_pairs)
         for pair, block_id in self._pair_ids.items():
             numbers = members[pair]
             yield BlockSpec(
                 id=block_id,
                 is_connector=True,
                 polygon=self._merged(numbers, 0.1),
-                incoming=[self.block_ids[pair[0]]],
-                outgoing=[self.block_ids[pair[1]]],
+                incoming=[self._block_ids[pair[0]]],
+                outgoing=[self._block_ids[pair[1]]],
                 intersection_id=self._group_ids[self._groups[numbers[0]]],
             )
 
-    def intersections(self, kind: Callable[[Sequence[int]], int]) -> list[AreaSpec]:
-        """All intersections; `kind` tells the type number of the one of some connectors."""
-        return [
-            AreaSpec(
-                self._group_ids[group],
-                shapely.Polygon(self._merged(numbers, _CLOSING).exterior),
-                kind(numbers),
-            )
-            for group, numbers in sorted(_grouped(self._groups).items())
-        ]
+    def _intersections(self) -> Iterator[AreaSpec]:
+        for group, numbers in sorted(_grouped(self._groups).items()):
+            area = shapely.Polygon(self._merged(numbers, _CLOSING).exterior)
+            yield AreaSpec(self._group_ids[group], area, self.kind(numbers))
 
     def _merged(self, numbers: Sequence[int], radius: float) -> shapely.Polygon:
         return merge_closed([self._connectors[i].polygon for i in numbers], radius)
-
-    def stop_polygons(self, stops: Iterable[tuple[shapely.Polygon, int]]) -> list[AreaSpec]:
-        """Stop polygons of some areas and type numbers, in the order of their numbers."""
-        return [AreaSpec(i, *stop) for i, stop in zip(self.stop_ids, stops, strict=True)]
-
-    def areas(self, polygons: Sequence[shapely.Polygon]) -> list[AreaSpec]:
-        """The areas of a layer without links."""
-        return [AreaSpec(next(self._next_id), polygon) for polygon in polygons]
 
 
 def turn_type(line: FloatArray) -> int:
@@ -239,4 +325,17 @@ def _grouped(labels: Iterable[T]) -> dict[T, list[int]]:
     out: dict[T, list[int]] = defaultdict(list)
     for index, label in enumerate(labels):
         out[label].append(index)
+    return out
+
+
+def _moved(specs: Iterable[_Spec], offset: FloatArray | None) -> list[_Spec]:
+    """Edges, blocks or areas at their place in the world."""
+    if offset is None:
+        return list(specs)
+    out = []
+    for spec in specs:
+        lines = {name: getattr(spec, name, None) for name in ("baseline", "left", "right")}
+        shapes = {name: line + offset for name, line in lines.items() if line is not None}
+        polygon = shapely.transform(spec.polygon, lambda xy: xy + offset)
+        out.append(replace(spec, polygon=polygon, **shapes))
     return out

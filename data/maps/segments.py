@@ -12,7 +12,14 @@ import numpy as np
 import shapely
 
 from shiftsim.data.maps.opendrive.control import STOP_LINE_DEPTH
-from shiftsim.data.maps.opendrive.shapes import BASELINE_STEP, divide, join_lines, lane_polygon
+from shiftsim.data.maps.opendrive.shapes import (
+    BASELINE_STEP,
+    arc_lengths,
+    divide,
+    join_lines,
+    lane_polygon,
+    points_at,
+)
 from shiftsim.kernels import FloatArray
 
 _APART = 1e-3  # m, closer vertices of a source are one
@@ -43,7 +50,7 @@ class LanePiece:
         shares = [_shares(line) for line in (self.left, self.right)]
         at = np.unique(np.concatenate(shares))
         left, right = (
-            _at(line, s, at) for line, s in zip((self.left, self.right), shares, strict=True)
+            points_at(line, s, at) for line, s in zip((self.left, self.right), shares, strict=True)
         )
         return 0.5 * (left + right)
 
@@ -125,25 +132,25 @@ class Part:
             return line
         shares = _shares(line)
         inside = shares[(shares > self.begin) & (shares < self.end)]
-        return _at(line, shares, np.concatenate([[self.begin], inside, [self.end]]))
+        return points_at(line, shares, np.concatenate([[self.begin], inside, [self.end]]))
 
 
-def joined_borders(parts: Sequence[Part]) -> tuple[FloatArray, FloatArray]:
-    """Borders (K, 2), (K', 2) of parts that follow each other [m]."""
-    left = join_lines([part.cut(part.piece.left) for part in parts])
-    return left, join_lines([part.cut(part.piece.right) for part in parts])
+def joined_borders(segments: Sequence[Part]) -> tuple[FloatArray, FloatArray]:
+    """Borders (K, 2), (K', 2) of segments that follow each other [m]."""
+    left = join_lines([part.cut(part.piece.left) for part in segments])
+    return left, join_lines([part.cut(part.piece.right) for part in segments])
 
 
 def baseline(
-    parts: Sequence[Part], start: FloatArray | None = None, end: FloatArray | None = None
+    segments: Sequence[Part], start: FloatArray | None = None, end: FloatArray | None = None
 ) -> FloatArray:
-    """Centre line of parts that follow each other, with a vertex about every 0.25 m.
+    """Centre line of segments that follow each other, with a vertex about every 0.25 m.
 
     `start` and `end` (2,) are where it must begin and end, near its own ends [m].
     """
-    line = join_lines([part.cut(part.piece.middle) for part in parts])
+    line = join_lines([part.cut(part.piece.middle) for part in segments])
     if start is not None and end is not None:
-        line = _at(line, _shares(line), _dense(line))
+        line = points_at(line, _shares(line), _dense(line))
         share = _shares(line)[:, None]
         line = line + (1.0 - share) * (start - line[0]) + share * (end - line[-1])
     return divide(line)
@@ -165,10 +172,5 @@ def _dense(line: FloatArray) -> FloatArray:
 
 def _shares(line: FloatArray) -> FloatArray:
     """(K,) how far along a line (K, 2) its vertices are, 0 to 1."""
-    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
-    return arc / max(arc[-1], 1e-9)
-
-
-def _at(line: FloatArray, shares: FloatArray, at: FloatArray) -> FloatArray:
-    x, y = (np.interp(at, shares, values) for values in line.T)
-    return np.stack([x, y], axis=1)
+    along = arc_lengths(line)
+    return along / max(along[-1], 1e-9)

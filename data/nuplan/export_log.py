@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 
 from shiftsim.data.nuplan.log import LIDAR_CHANNEL, yaw_of
-from shiftsim.data.nuplan.scenarios import Mapping, ends_early
+from shiftsim.data.nuplan.scenarios import Mapping, ends_early, iteration_rows
 from shiftsim.data.nuplan.sqlite import Value, write_database
 from shiftsim.errors import ConversionError
 from shiftsim.kernels import FloatArray, IntArray
@@ -92,21 +92,12 @@ def cut_of(scenario: Scenario) -> tuple[int, Mapping]:
         starts = time + int(mapping[1] * 1e6)
         fitting = np.flatnonzero(np.searchsorted(time, starts) == rows[0])
         for anchor in fitting[::-1].tolist():  # several where the log starts too late
-            if np.array_equal(_iterations(time, int(time[anchor]), mapping), rows):
+            if np.array_equal(iteration_rows(time, int(time[anchor]), mapping), rows):
                 return anchor, mapping
     raise ConversionError(
         f"scenario {scenario.token!r}: its iterations are not every n-th row of its recording",
         hint="nuPlan cuts a scenario by duration, offset and ratio; convert it so",
     )
-
-
-def _iterations(time: IntArray, anchor_us: int, mapping: Mapping) -> IntArray:
-    """Rows of the iterations as they are cut, nuPlan rule 417."""
-    duration, offset, ratio = mapping
-    start = int(anchor_us + offset * 1e6)
-    first = int(np.searchsorted(time, start))
-    last = int(np.searchsorted(time, int(start + duration * 1e6), side="right"))
-    return np.arange(first, last, int(1.0 / ratio), dtype=np.int64)
 
 
 def log_token(text: str) -> bytes:

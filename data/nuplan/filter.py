@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -13,21 +13,6 @@ import yaml
 from shiftsim.errors import ConfigError
 
 _TOKEN = re.compile(r"[0-9a-f]{16}\Z")
-
-_NEUTRAL = ("_target_", "_convert_")
-# keys of nuPlan's scenario filters with a number, and the field that holds it
-_NUMBERS = {
-    "timestamp_threshold_s": "min_gap_s",
-    "ego_displacement_minimum_m": "min_way",
-    "ego_start_speed_threshold": "start_speed",
-    "ego_stop_speed_threshold": "stop_speed",
-    "speed_noise_tolerance": "speed_noise",
-    "fraction_in_token_set_threshold": "min_share",
-    "ego_route_radius": "route_radius",
-}
-_FLAGS = ("remove_invalid_goals", "shuffle")
-_USED = ("scenario_types", "scenario_tokens", "log_names", "map_names", "token_set_path")
-_COUNTS = ("num_scenarios_per_type", "limit_total_scenarios")
 
 
 @dataclass(frozen=True)
@@ -89,43 +74,39 @@ def _tokens(path: Path, values: list[Any]) -> frozenset[str]:
 
 
 def _from_values(path: Path, values: Mapping[str, Any]) -> ScenarioFilter:
-    tokens = values.get("scenario_tokens")
-    if tokens is not None and not isinstance(tokens, list):
-        raise ConfigError(f"{path}: scenario_tokens is not a list", hint="write it as a list")
     if values.get("expand_scenarios"):
         raise ConfigError(
             f"{path}: expand_scenarios: true makes scenarios of a single row",
             hint="nothing can be simulated in them: set it to false",
         )
-    known = {*_USED, *_NEUTRAL, *_FLAGS, *_NUMBERS, *_COUNTS, "expand_scenarios"}
+    known = {*_KEYS, "_target_", "_convert_", "expand_scenarios", "token_set_path"}
     for key, value in values.items():
         if key not in known and value is not None and value is not False:
             raise ConfigError(
                 f"{path}: {key}: {value!r} is not known",
                 hint=f"leave it out; known are {', '.join(sorted(known))}",
             )
-    numbers: dict[str, Any] = {n: _number(path, values, k) for k, n in _NUMBERS.items()}
-    if numbers["speed_noise"] is None:
-        del numbers["speed_noise"]
-    if not 0.0 <= (numbers["min_share"] or 0.0) <= 1.0:
-        what = f"fraction_in_token_set_threshold is {numbers['min_share']:g}"
+    found = {name: read(path, values, key) for key, (name, read) in _KEYS.items()}
+    if found["speed_noise"] is None:
+        del found["speed_noise"]
+    if not 0.0 <= (found["min_share"] or 0.0) <= 1.0:
+        what = f"fraction_in_token_set_threshold is {found['min_share']:g}"
         raise ConfigError(f"{path}: {what}, not within 0 … 1", hint="give a share")
-    per_type, limit = (_count(path, values, key) for key in _COUNTS)
-    if isinstance(per_type, float):
+    if isinstance(found["per_type"], float):
         raise ConfigError(f"{path}: num_scenarios_per_type is a share", hint="give a whole number")
-    return ScenarioFilter(
-        tokens=None if tokens is None else _tokens(path, tokens),
-        types=_names(path, values, "scenario_types"),
-        logs=_names(path, values, "log_names"),
-        maps=_names(path, values, "map_names"),
-        remove_invalid_goals=values.get("remove_invalid_goals") is True,
-        per_type=per_type,
-        limit=limit,
-        token_set=_token_set(path, values) if numbers["min_share"] is not None else None,
-        shuffle=values.get("shuffle") is True,
-        source=str(path),
-        **numbers,
-    )
+    token_set = _token_set(path, values) if found["min_share"] is not None else None
+    return ScenarioFilter(token_set=token_set, source=str(path), **found)
+
+
+def _token_list(path: Path, values: Mapping[str, Any], key: str) -> frozenset[str] | None:
+    tokens = values.get(key)
+    if tokens is not None and not isinstance(tokens, list):
+        raise ConfigError(f"{path}: {key} is not a list", hint="write it as a list")
+    return None if tokens is None else _tokens(path, tokens)
+
+
+def _flag(path: Path, values: Mapping[str, Any], key: str) -> bool:
+    return values.get(key) is True
 
 
 def _number(path: Path, values: Mapping[str, Any], key: str) -> float | None:
@@ -171,6 +152,26 @@ def _names(path: Path, values: Mapping[str, Any], key: str) -> frozenset[str] | 
     if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
         raise ConfigError(f"{path}: {key} is not a list of names", hint="write it as a list")
     return frozenset(str(item) for item in value)
+
+
+# keys of nuPlan's scenario filters: the field that holds each, and how it is read
+_KEYS: dict[str, tuple[str, Callable[[Path, Mapping[str, Any], str], Any]]] = {
+    "scenario_tokens": ("tokens", _token_list),
+    "scenario_types": ("types", _names),
+    "log_names": ("logs", _names),
+    "map_names": ("maps", _names),
+    "remove_invalid_goals": ("remove_invalid_goals", _flag),
+    "num_scenarios_per_type": ("per_type", _count),
+    "limit_total_scenarios": ("limit", _count),
+    "timestamp_threshold_s": ("min_gap_s", _number),
+    "ego_displacement_minimum_m": ("min_way", _number),
+    "ego_start_speed_threshold": ("start_speed", _number),
+    "ego_stop_speed_threshold": ("stop_speed", _number),
+    "speed_noise_tolerance": ("speed_noise", _number),
+    "fraction_in_token_set_threshold": ("min_share", _number),
+    "ego_route_radius": ("route_radius", _number),
+    "shuffle": ("shuffle", _flag),
+}
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # Any to the checker

@@ -1,13 +1,9 @@
-"""nuPlan logs and maps -> scenarios.
-
-`read_scenario` gives one scenario straight from a log; `convert` writes many to a store.
-"""
+"""Which scenarios a nuPlan log offers, how they are cut from it, and the maps they are on."""
 
 import json
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,7 +11,6 @@ from shiftsim.data.nuplan.boxes import make_tracks, read_boxes
 from shiftsim.data.nuplan.log import (
     Log,
     has_goals,
-    open_log,
     read_ego,
     read_lights,
     read_route,
@@ -23,11 +18,9 @@ from shiftsim.data.nuplan.log import (
 )
 from shiftsim.data.nuplan.map import read_map
 from shiftsim.data.recording import EgoTrace, Recording, Window
-from shiftsim.data.recording import scenario as make_scenario
 from shiftsim.errors import ConfigError, ConversionError, DataError
 from shiftsim.kernels import IntArray
 from shiftsim.world.map import VectorMap
-from shiftsim.world.scenario import Scenario
 
 # duration [s], offset [s] and subsample ratio with which a scenario is cut from a log
 Mapping = tuple[float, float, float]
@@ -111,16 +104,6 @@ def parse_mapping(text: str) -> Mapping:
     return duration, offset, ratio
 
 
-def list_scenarios(path: Path, **choice: Any) -> list[ScenarioEntry]:
-    """As `offered`, of the log in a file.
-
-    Raises:
-        DataError: The log cannot be read.
-    """
-    with open_log(path) as log:
-        return offered(log, **choice)
-
-
 def offered(
     log: Log,
     tokens: frozenset[str] | None = None,
@@ -147,6 +130,15 @@ def offered(
     ]
 
 
+def iteration_rows(time_us: IntArray, anchor_us: int, mapping: Mapping) -> IntArray:
+    """Rows of the iterations of a scenario by the time of its anchor row, nuPlan rule 417."""
+    duration, offset, ratio = mapping
+    start = int(anchor_us + offset * 1e6)
+    first = int(np.searchsorted(time_us, start))
+    last = int(np.searchsorted(time_us, int(start + duration * 1e6), side="right"))
+    return np.arange(first, last, int(1.0 / ratio), dtype=np.int64)
+
+
 def cut_window(
     log: Log, token: str, mapping: Mapping | None = None, scenario_type: str | None = None
 ) -> Window:
@@ -163,13 +155,10 @@ def cut_window(
     row = log.row_of[token]
     scenario_type = scenario_type or log.types[row]
     chosen = mapping_of(scenario_type) if mapping is None else mapping
-    duration, offset, ratio = chosen
-    start = int(int(log.time_us[row]) + offset * 1e6)
-    end = int(start + duration * 1e6)
-    step = int(1.0 / ratio)
-    first = int(np.searchsorted(log.time_us, start))
-    last = int(np.searchsorted(log.time_us, end, side="right"))
-    iterations: IntArray = np.arange(first, last, step, dtype=np.int64)
+    anchor_us = int(log.time_us[row])
+    start = int(anchor_us + chosen[1] * 1e6)
+    end = int(start + chosen[0] * 1e6)
+    iterations = iteration_rows(log.time_us, anchor_us, chosen)
     if len(iterations) < _MIN_ITERATIONS:
         raise ConversionError(
             f"{log.path}: scenario {token!r} has {len(iterations)} iterations",
@@ -190,10 +179,10 @@ def cut_window(
         scenario_type=scenario_type,
         log_name=log.name,
         ego=EGO,
-        first_row=max(min(early, first - PAST_ROWS), 0),
+        first_row=max(min(early, int(iterations[0]) - PAST_ROWS), 0),
         last_row=min(max(late, int(iterations[-1]) + 1 + FUTURE_ROWS), len(log.time_us)),
         iteration_rows=iterations,
-        row_step=step,
+        row_step=int(1.0 / chosen[2]),
         route=route,
         mission_goal=goal,
         mapping=chosen,
@@ -214,27 +203,6 @@ def read_span(
         lights=read_lights(log, first, last, flaws),
     )
     return recording, EgoTrace(name, EGO, 0, read_ego(log, first, last, flaws))
-
-
-def read_scenario(
-    path: Path,
-    token: str,
-    road: VectorMap,
-    mapping: Mapping | None = None,
-    flaws: Counter[str] | None = None,
-) -> Scenario:
-    """One scenario of a log (.db), as `cut_window` cuts it out, on the map of the log.
-
-    Counts of what is wrong in the log and tolerated are added to `flaws`.
-
-    Raises:
-        DataError: The log or the scenario cannot be read.
-    """
-    counts = Counter[str]() if flaws is None else flaws
-    with open_log(path) as log:
-        window = cut_window(log, token, mapping)
-        recording, ego = read_span(log, log.name, window.first_row, window.last_row, counts)
-    return make_scenario(recording, ego, window, road, offset=window.first_row)
 
 
 def find_maps(folder: Path) -> dict[str, Path]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pyproj
 
-from shiftsim.data.maps.build import PieceMap
+from shiftsim.data.maps.builder import BuiltMap
 from shiftsim.data.maps.opendrive.map import build_road_map
 from shiftsim.data.maps.opendrive.reading import read_opendrive
 from shiftsim.data.maps.opendrive.records import OpenDrive
@@ -74,7 +74,7 @@ class Dsc3dReader:
             "map": digest(path),
         }
 
-    def _map(self, path: Path) -> PieceMap:
+    def _map(self, path: Path) -> BuiltMap:
         drive = read_opendrive(path)
         _check_georeference(drive, self.download)
         x, y, *_ = drive.offset or (0.0, 0.0)

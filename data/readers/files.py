@@ -16,7 +16,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import shapely
 
-from shiftsim.data.maps.build import PieceMap
+from shiftsim.data.maps.builder import BuiltMap
 from shiftsim.data.maps.segments import clean_line
 from shiftsim.data.polygons import largest_part
 from shiftsim.data.readers.windows import ConversionConfig
@@ -251,7 +251,7 @@ class SceneFolder:
     name = ""  # of the data set
     pattern = ""  # of the files that scenes are named by
     hint = ""  # where there is none
-    site: PieceMap | None = None
+    site: BuiltMap | None = None
 
     def __init__(self, source: Path, *, vehicles: bool = False) -> None:
         self.source, self.vehicles = source, vehicles

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from shiftsim.data.maps.build import PieceMap, build_lane_map
+from shiftsim.data.maps.build import build_lane_map
+from shiftsim.data.maps.builder import BuiltMap
 from shiftsim.data.maps.lights import LightStates, states_of_lists
 from shiftsim.data.maps.segments import MapSource, StopArea
 from shiftsim.data.readers import codes
@@ -189,7 +190,7 @@ def _read_lights(log: Path) -> LightStates | None:
 
 
 @lru_cache(maxsize=1)  # logs of one city follow each other
-def _read_map(path: Path, name: str, lit: tuple[str, ...]) -> PieceMap:
+def _read_map(path: Path, name: str, lit: tuple[str, ...]) -> BuiltMap:
     """A map; `lit` are the lanes that have a light."""
     file = _File(path)
     elements: dict[str, list[Any]] = {layer: [] for layer in _FEATURES}

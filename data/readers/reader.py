@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from shiftsim.data.maps.build import PieceMap
+from shiftsim.data.maps.builder import BuiltMap
 from shiftsim.data.maps.lights import LightStates
 from shiftsim.data.readers.samples import TrackSamples
 from shiftsim.data.readers.windows import ConversionConfig, Span
@@ -18,7 +18,7 @@ class SourceRecording:
     """One recording with its map, and how scenarios are made of it (`make_scenarios`)."""
 
     samples: TrackSamples
-    map: PieceMap
+    map: BuiltMap
     config: ConversionConfig | None = None
     scenario_type: str = "unknown"
     egos: Sequence[str] | None = None  # ids of the egos; None for every vehicle that can be one
@@ -44,7 +44,7 @@ class Reader(Protocol):
         """Where it is."""
 
     @property
-    def site(self) -> PieceMap | None:
+    def site(self) -> BuiltMap | None:
         """The map that all recordings share, whose report the store gets; None without one."""
 
     @property
@@ -76,6 +76,6 @@ class Reader(Protocol):
         """
 
 
-def site_map(road: VectorMap, warnings: Mapping[str, int]) -> PieceMap:
+def site_map(road: VectorMap, warnings: Mapping[str, int]) -> BuiltMap:
     """The map that all recordings of a site share; none of its connectors has a known light."""
-    return PieceMap(road, dict(warnings), {}, {})
+    return BuiltMap(road, dict(warnings), {}, {})

@@ -55,7 +55,6 @@ EXPECTED: dict[str, Range | tuple[Range, ...]] = {
     "Road.offsets": _rows("laneOffset", "s a b c d"),
     "Road.elevation": _rows("elevation", "s a b c d"),
     "Road.length": OPENDRIVE["road length"],
-    "Road.stated_length": OPENDRIVE["road length"],
     "LaneSection.s": OPENDRIVE["laneSection s"],
     "RoadType.s": OPENDRIVE["type s"],
     "Speed.s": OPENDRIVE["speed sOffset"],
@@ -228,7 +227,7 @@ def _town() -> Any:
 
 
 def _read_log(folder: Path) -> Any:
-    from shiftsim.data.nuplan.scenarios import list_scenarios, read_scenario
+    from nuplan_logs import list_scenarios, read_scenario
 
     path = folder / "log.db"
     offered = list_scenarios(path)

@@ -1,8 +1,7 @@
 """DSC3D conversion against known answers: a real sample, and scripted recordings."""
 
 import shutil
-from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby, product
 from pathlib import Path
@@ -22,8 +21,9 @@ from parity_cases import (
     read_file,
 )
 
+from shiftsim.data.maps.opendrive.graph import LaneSegment
 from shiftsim.data.maps.opendrive.lanes import LaneKey
-from shiftsim.data.maps.opendrive.map import Origin, build_road_map
+from shiftsim.data.maps.opendrive.map import build_road_map
 from shiftsim.data.maps.opendrive.reading import read_opendrive
 from shiftsim.data.readers.annotations import Annotations, Site, read_recording
 from shiftsim.data.readers.dsc3d import find_map, open_site
@@ -52,21 +52,21 @@ class Lanes:
         self.offset, drive = site.offset[:2], read_opendrive(path)
         x, y = self.offset.tolist()
         self.road, built = build_road_map(drive, name=path.stem, offset=(x, y), epsg=site.epsg)
-        self._origins: dict[int, list[Origin]] = defaultdict(list)  # in the direction of travel
-        for origin in built.origins:
-            if (lane := self.road.edges.index.get(origin.id)) is not None:
-                self._origins[lane].append(origin)
+        index = self.road.edges.index
+        self._segments: dict[int, Sequence[LaneSegment]] = {  # in the direction of travel
+            index[edge]: segments for edge, segments in built.segments.items() if edge in index
+        }
 
     def keys_at(self, x: float, y: float) -> list[LaneKey]:
         """OpenDRIVE lanes behind the lanes of ours that hold a point."""
         lanes = self.road.edges.containing(x, y).tolist()
-        return [self._key(lane, x, y) for lane in lanes if lane in self._origins]
+        return [self._key(lane, x, y) for lane in lanes if lane in self._segments]
 
     def _key(self, lane: int, x: float, y: float) -> LaneKey:
-        origins, share = self._origins[lane], self.road.progress_on(lane, x, y)
-        ends = np.cumsum([abs(origin.end - origin.begin) for origin in origins])
+        segments, share = self._segments[lane], self.road.progress_on(lane, x, y)
+        ends = np.cumsum([segment.length for segment in segments])
         share *= ends[-1] / self.road.baselines.length(lane)
-        return origins[int(np.searchsorted(ends[:-1], share, "right"))].key
+        return segments[int(np.searchsorted(ends[:-1], share, "right"))].key
 
     def sequences(self, centers: np.ndarray) -> list[list[LaneKey]]:
         """OpenDRIVE lanes passed by centres (n, 3), without and with short pieces at the ends."""

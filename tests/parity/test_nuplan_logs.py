@@ -14,6 +14,7 @@ import places
 import pyarrow.parquet as pq
 import pytest
 import shapely
+from nuplan_logs import list_scenarios, read_scenario
 from parity_cases import (
     Cases,
     File,
@@ -31,7 +32,7 @@ from parity_cases import (
 from shiftsim.compat import nuplan as compat
 from shiftsim.data.nuplan.boxes import read_boxes
 from shiftsim.data.nuplan.log import Log, open_log, read_ego
-from shiftsim.data.nuplan.scenarios import find_maps, list_scenarios, load_map, read_scenario
+from shiftsim.data.nuplan.scenarios import find_maps, load_map
 from shiftsim.data.readers.routes import follow_blocks
 from shiftsim.verify.rollouts import LOGGED, ego_columns, light_columns, object_columns
 from shiftsim.world.map import VectorMap

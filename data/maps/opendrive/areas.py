@@ -18,7 +18,7 @@ from shiftsim.data.maps.opendrive.records import (
     Signal,
 )
 from shiftsim.data.maps.opendrive.shapes import Shapes, lane_polygon
-from shiftsim.data.polygons import largest_part, touching
+from shiftsim.data.polygons import largest_part, shared_areas
 from shiftsim.kernels import FloatArray, IntArray
 
 _SEAM_WIDTH = 0.5  # m
@@ -57,31 +57,23 @@ def group_connectors(
         for label in (*sorted(connector.junctions), blocks[number])
     ]
     group = linked_groups(links, len(connectors))
-    for i, j in touching(polygons):
+    for (i, j), overlap in shared_areas(polygons).items():
         one, two = connectors[i], connectors[j]
         if group[i] == group[j] or one.source == two.source or one.target == two.target:
             continue
-        overlap = shapely.intersection(polygons[i], polygons[j]).area
         if overlap > _MIN_OVERLAP and not are_stacked(i, j):
             links.append((i, j))
-    group = linked_groups(links, len(connectors))
-    order = {label: n for n, label in enumerate(dict.fromkeys(group.tolist()))}
-    return np.array([order[label] for label in group.tolist()], np.int64)
+    return linked_groups(links, len(connectors))
 
 
 def linked_groups(links: Sequence[tuple[int, int]], count: int) -> IntArray:
-    """(count,) a label for each item; linked ones share it."""
-    above = list(range(count))  # an item of the same group with a smaller number, or itself
+    """(count,) a label for each item, 0 and up by first appearance; linked ones share it."""
+    from scipy.sparse import coo_array, csgraph  # take long to import
 
-    def first(item: int) -> int:
-        while above[item] != item:
-            above[item] = item = above[above[item]]
-        return item
-
-    for one, two in links:
-        low, high = sorted((first(one), first(two)))
-        above[high] = low
-    return np.unique([first(item) for item in range(count)], return_inverse=True)[1]
+    one, two = np.array(links, np.int64).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(links)), (one, two)), shape=(count, count))
+    labels = csgraph.connected_components(graph, directed=False)[1]
+    return np.asarray(labels, np.int64)
 
 
 def merge_closed(polygons: Iterable[shapely.Polygon], radius: float) -> shapely.Polygon:

@@ -1,7 +1,6 @@
 """What governs traffic: lights, signs and stop lines at junctions, and speed limits."""
 
-from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -131,24 +130,18 @@ def _end_box(left: FloatArray, right: FloatArray) -> shapely.Polygon:
     return shapely.Polygon([left[-1], right[-1], right[-1] + back, left[-1] + back])
 
 
-def speed_limit(od: OpenDrive, pieces: Sequence[LaneSegment], country: str) -> float | None:
-    """The limit on most of a lane (nuPlan rule 507), the lower one on ties [m/s]; None for none."""
-    lengths: dict[float, float] = defaultdict(float)
-    for piece in pieces:
-        road = od.roads[piece.key.road]
-        start = road.sections[piece.key.section].s
-        lane = road.sections[piece.key.section].lanes[piece.key.lane]
-        low, high = min(piece.begin, piece.end), max(piece.begin, piece.end)
-        places = [start + r.s for r in lane.speeds] + [t.s for t in road.types]
-        places += [signal.s for signal in road.signals]
-        stops = np.array(sorted({low, high, *(s for s in places if low < s < high)}))
-        for begin, end in pairwise(stops):
-            limit = _limit_at(road, piece, 0.5 * (begin + end), country)
-            lengths[np.inf if limit is None else limit] += end - begin
-    if not lengths:
-        return None
-    best = min(lengths, key=lambda limit: (-round(lengths[limit], 6), limit))
-    return None if np.isinf(best) else best
+def speed_limits(
+    od: OpenDrive, segment: LaneSegment, country: str
+) -> Iterator[tuple[float | None, float]]:
+    """Limits along a segment [m/s], None for none, and over which lengths they hold [m]."""
+    road = od.roads[segment.key.road]
+    start = road.sections[segment.key.section].s
+    lane = road.sections[segment.key.section].lanes[segment.key.lane]
+    low, high = min(segment.begin, segment.end), max(segment.begin, segment.end)
+    places = [start + r.s for r in lane.speeds] + [t.s for t in road.types]
+    places += [signal.s for signal in road.signals]
+    for begin, end in pairwise(sorted({low, high, *(s for s in places if low < s < high)})):
+        yield _limit_at(road, segment, 0.5 * (begin + end), country), end - begin
 
 
 def _limit_at(road: Road, piece: LaneSegment, s: float, country: str) -> float | None:

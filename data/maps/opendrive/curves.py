@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.polynomial.polynomial import polyder, polyval
 
 from shiftsim.data.maps.opendrive.records import ARC, PARAM_POLY3, POLY3, SPIRAL, Geometry
-from shiftsim.kernels import FloatArray, IntArray
+from shiftsim.kernels import FloatArray
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2  # on [0, 1]
@@ -43,13 +44,6 @@ class ReferenceLine:
     """The reference line of one road."""
 
     geometries: tuple[Geometry, ...]  # its records, by s
-    # whether a paramPoly3 that is much longer or shorter than it states is run through evenly from
-    # end to end; else it is cut off where the stated length is used up
-    stretched: bool = True
-
-    def _records_at(self, s: FloatArray) -> IntArray:
-        starts = np.array([g.s for g in self.geometries])
-        return np.maximum(np.searchsorted(starts, s, side="right") - 1, 0)
 
     def evaluate(self, s: FloatArray) -> Poses:
         """Poses at distances `s` (K,) [m]; beyond the ends the line stays at its ends.
@@ -57,22 +51,19 @@ class ReferenceLine:
         nuPlan rule 501: the heading at a joint is that of the later record.
         """
         s = np.asarray(s, np.float64)
-        index = self._records_at(s)
+        starts = np.array([g.s for g in self.geometries])
+        index = np.maximum(np.searchsorted(starts, s, side="right") - 1, 0)
         out = np.empty((3, len(s)))
         for number in np.unique(index):
             record = self.geometries[number]
             here = index == number
             d = np.clip(s[here] - record.s, 0.0, record.length)
-            u, v, turn = evaluate_local(record, d, stretched=self.stretched)
+            u, v, turn = evaluate_local(record, d)
             cos, sin = np.cos(record.heading), np.sin(record.heading)
             out[0, here] = record.x + cos * u - sin * v
             out[1, here] = record.y + sin * u + cos * v
             out[2, here] = record.heading + turn
         return Poses(*out)
-
-    def kinds(self, s: FloatArray) -> list[str]:
-        """Kind of the record at distances `s` (K,) [m]; at a joint the later one."""
-        return [self.geometries[i].kind for i in self._records_at(s)]
 
     def joints(self) -> tuple[FloatArray, FloatArray]:
         """Gap [m] and turn [rad] from the end of each record to the start of the next, (n - 1,)."""
@@ -84,9 +75,7 @@ class ReferenceLine:
         return np.array(gaps), np.array(turns)
 
 
-def evaluate_local(
-    record: Geometry, d: FloatArray, *, stretched: bool = True
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def evaluate_local(record: Geometry, d: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Local u, v [m] and turn [rad] of a record at distances `d` (K,) from its start [m]."""
     if record.kind == ARC:
         return _arc(record.coefficients[0], d)
@@ -94,7 +83,12 @@ def evaluate_local(
         return _clothoid(record, d)
     if len(record.coefficients) == 0:
         return d, np.zeros_like(d), np.zeros_like(d)
-    return _by_arc_length(record, d, stretched=stretched)
+    return _by_arc_length(record, d)
+
+
+def curve_length(record: Geometry) -> float:
+    """True length of a cubic curve [m]."""
+    return float(_arc_table(record)[1][-1])
 
 
 def length_error(record: Geometry) -> float:
@@ -106,24 +100,12 @@ def length_error(record: Geometry) -> float:
     if record.kind != PARAM_POLY3:
         return 0.0
     with np.errstate(over="ignore", invalid="ignore"):
-        true = float(_arc_table(record)[1][-1])
+        true = curve_length(record)
     if not np.isfinite(true):
         return float("inf")
     error = abs(true - record.length)
     allowed = max(_LENGTH_SLACK * record.length, _MIN_LENGTH_SLACK)
     return error / record.length if error > allowed else 0.0
-
-
-def arc_length_deviation(record: Geometry) -> float:
-    """How far a paramPoly3 read by arc length lies from one read by its parameter [m].
-
-    The largest distance at the quarters of its length.
-    """
-    d = record.length * np.array([0.25, 0.5, 0.75])
-    u, v, p_end = _cubic_parts(record)
-    p = d * (p_end / record.length)
-    by_arc = evaluate_local(record, d, stretched=False)
-    return float(np.hypot(by_arc[0] - _polynomial(u, p), by_arc[1] - _polynomial(v, p)).max())
 
 
 def _arc(curvature: float, d: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -163,36 +145,23 @@ def _cubic_parts(record: Geometry) -> tuple[FloatArray, FloatArray, float]:
     return np.array(record.coefficients[:4]), np.array(record.coefficients[4:]), record.p_end
 
 
-def _derivative(coefficients: FloatArray) -> FloatArray:
-    return coefficients[1:] * np.array([1.0, 2.0, 3.0])
-
-
-def _polynomial(coefficients: FloatArray, p: FloatArray) -> FloatArray:
-    out = np.full_like(p, coefficients[-1])
-    for value in coefficients[-2::-1]:
-        out = out * p + value
-    return out
-
-
 def _arc_table(record: Geometry) -> tuple[FloatArray, FloatArray]:
     """Parameter knots and the arc length up to each [m]."""
     u, v, p_end = _cubic_parts(record)
     knots = np.linspace(0.0, p_end, _CUBIC_PANELS + 1)
     step = p_end / _CUBIC_PANELS
     nodes = knots[:-1, None] + step * _NODES
-    speed = np.hypot(_polynomial(_derivative(u), nodes), _polynomial(_derivative(v), nodes))
+    speed = np.hypot(polyval(nodes, polyder(u)), polyval(nodes, polyder(v)))
     arc = np.zeros(_CUBIC_PANELS + 1)
     np.cumsum(speed @ _WEIGHTS * step, out=arc[1:])
     return knots, arc
 
 
-def _by_arc_length(
-    record: Geometry, d: FloatArray, *, stretched: bool
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _by_arc_length(record: Geometry, d: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     u, v, _ = _cubic_parts(record)
-    du, dv = _derivative(u), _derivative(v)
+    du, dv = polyder(u), polyder(v)
     knots, arc = _arc_table(record)
-    if stretched and length_error(record):
+    if length_error(record):  # run through evenly from end to end
         d = d * (arc[-1] / record.length)
     target = np.minimum(d, arc[-1])
     panel = np.clip(np.searchsorted(arc, target, side="right") - 1, 0, _CUBIC_PANELS - 1)
@@ -203,10 +172,10 @@ def _by_arc_length(
     for _ in range(6):  # Newton; quadratic, so six steps reach rounding from a 1/32 panel
         step = p - low
         nodes = low[:, None] + step[:, None] * _NODES
-        speeds = np.hypot(_polynomial(du, nodes), _polynomial(dv, nodes))
+        speeds = np.hypot(polyval(nodes, du), polyval(nodes, dv))
         excess = arc[panel] + (speeds @ _WEIGHTS) * step - target
-        speed = np.hypot(_polynomial(du, p), _polynomial(dv, p))
+        speed = np.hypot(polyval(p, du), polyval(p, dv))
         p = np.clip(p - excess / np.maximum(speed, 1e-12), low, high)
-    slope_u, slope_v = _polynomial(du, p), _polynomial(dv, p)
+    slope_u, slope_v = polyval(p, du), polyval(p, dv)
     turn = np.arctan2(slope_v, slope_u)
-    return _polynomial(u, p), _polynomial(v, p), turn
+    return polyval(p, u), polyval(p, v), turn

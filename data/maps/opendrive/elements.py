@@ -23,7 +23,6 @@ class Reader:
     source: str  # name of the file
     place: str = "header"  # road or junction at hand, for messages
     warnings: Counter[str] = field(default_factory=Counter)  # count by kind
-    counts: Counter[str] = field(default_factory=Counter)  # records by kind
 
     def error(self, what: str, hint: str) -> ConversionError:
         """An error that names file and place."""
@@ -101,7 +100,6 @@ class Reader:
 
 def read_object(element: Any, reader: Reader) -> RoadObject:
     """One object; outlines with numbers that are not finite are left out."""
-    reader.counts[f"object {element.get('type', '')}"] += 1
     outlines = [_read_outline(outline, reader) for outline in element.iter("outline")]
     return RoadObject(
         **{key: element.get(key, "") for key in ("id", "type", "subtype", "name")},
@@ -157,11 +155,6 @@ def read_signal(element: Any, reader: Reader) -> Signal:
     """One signal, or a reference to one."""
     kind, subtype = element.get("type", ""), element.get("subtype", "")
     subtype = "" if subtype in ("-1", "none") else subtype
-    is_reference = element.tag == "signalReference"
-    if not is_reference:
-        label = f"{element.get('country', '')}:{kind}" + (f".{subtype}" if subtype else "")
-        reader.counts[f"signal {label}"] += 1
-    value = _optional(element, "value", reader)
     return Signal(
         **{key: element.get(key, "") for key in ("id", "name", "country", "unit")},
         type=kind,
@@ -170,8 +163,8 @@ def read_signal(element: Any, reader: Reader) -> Signal:
         s=reader.finite(element, "s"),
         t=reader.finite(element, "t"),
         orientation=element.get("orientation", "none"),
-        value=value,
+        value=_optional(element, "value", reader),
         width=_optional(element, "width", reader),
         lanes=_read_validity(element, reader),
-        reference=is_reference,
+        reference=element.tag == "signalReference",
     )

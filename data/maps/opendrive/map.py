@@ -1,10 +1,8 @@
 """OpenDRIVE to the semantic map of nuPlan's kind."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import chain
-from typing import TypeVar
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import shapely
@@ -13,27 +11,27 @@ from shiftsim.data.maps.builder import (
     LIGHT_KIND,
     PASS_THROUGH,
     STOP_SIGN_KIND,
+    BuiltMap,
     MapBuilder,
-    ShapedConnector,
-    ShapedLane,
-    block_pairs,
+    Pairs,
 )
 from shiftsim.data.maps.opendrive import areas, control, records
 from shiftsim.data.maps.opendrive.control import LIGHT, STOP, YIELD
 from shiftsim.data.maps.opendrive.curves import ReferenceLine, length_error
-from shiftsim.data.maps.opendrive.graph import Graph, LaneSegment, build_lane_graph
-from shiftsim.data.maps.opendrive.lanes import LaneKey, border_is_mirrored
-from shiftsim.data.maps.opendrive.overlaps import (
-    Levels,
-    cut_crossings,
-    overlapping,
-    subtract_overlaps,
+from shiftsim.data.maps.opendrive.graph import (
+    Connector,
+    Graph,
+    Lane,
+    LaneSegment,
+    build_lane_graph,
 )
+from shiftsim.data.maps.opendrive.lanes import border_is_mirrored
+from shiftsim.data.maps.opendrive.overlaps import Levels, cut_crossings, overlapping
 from shiftsim.data.maps.opendrive.records import OpenDrive
-from shiftsim.data.maps.opendrive.shapes import Shapes, bend_ends, lane_polygon, widen
+from shiftsim.data.maps.opendrive.shapes import Shapes, lane_polygon, widen
 from shiftsim.errors import MapError
 from shiftsim.kernels import FloatArray, IntArray
-from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
+from shiftsim.world.build import AreaSpec
 from shiftsim.world.map import VectorMap
 from shiftsim.world.ranges import MAP_EXTENT, require
 
@@ -41,27 +39,6 @@ STOP_KINDS = {LIGHT: 2, STOP: 1, YIELD: 4}  # kinds of stop polygons
 GAP_NOTED, GAP_SERIOUS = 0.01, 0.5  # m
 MAX_LENGTH_ERROR = 3.0  # as a share; a cubic that far from its stated length is nonsense
 MAX_LANE_LENGTH = 3e6  # m, of all lanes together
-_Spec = TypeVar("_Spec", EdgeSpec, BlockSpec, AreaSpec)
-
-
-@dataclass(frozen=True)
-class Origin:
-    """Where an edge of the map comes from: its id, and one piece of one OpenDRIVE lane."""
-
-    id: str
-    key: LaneKey
-    begin: float
-    end: float
-
-
-@dataclass(frozen=True)
-class MapReport:
-    """What the conversion did."""
-
-    warnings: dict[str, int]  # what was repaired, inferred or left out: count by kind
-    origins: tuple[Origin, ...]  # pieces of OpenDRIVE lanes behind every lane and connector
-    # ids of pairs of lanes, and of roadblocks, that lie over each other on different levels
-    stacked: frozenset[tuple[str, str]] = frozenset()
 
 
 def build_road_map(
@@ -71,7 +48,7 @@ def build_road_map(
     offset: tuple[float, float] = (0.0, 0.0),
     epsg: int = 0,
     country: str = "DE",
-) -> tuple[VectorMap, MapReport]:
+) -> tuple[VectorMap, BuiltMap]:
     """The semantic map of an OpenDRIVE file.
 
     Args:
@@ -90,7 +67,14 @@ def build_road_map(
     warnings = Counter(od.warnings)
     placed = _prepare(od, warnings)
     graph = build_lane_graph(placed, warnings)
-    return _Maker(placed, graph, warnings, country).build(name, np.array(offset), epsg)
+    shapes = _shapes_of(placed, graph)
+    graph, crossings = cut_crossings(placed, graph, shapes)
+    if crossings:
+        warnings["lanes that cross without a junction, made an intersection"] += crossings
+        shapes = _shapes_of(placed, graph)
+    builder = _RoadMapBuilder(placed, graph, shapes, warnings, country)
+    built = builder.build(name, epsg=epsg, offset=np.array(offset))
+    return built.road, built
 
 
 def _prepare(od: records.OpenDrive, warnings: Counter[str]) -> records.OpenDrive:
@@ -163,161 +147,88 @@ def _note_lanes(road: records.Road, warnings: Counter[str]) -> None:
                 warnings["border of a right lane given on the left, mirrored"] += 1
 
 
-def _chains(graph: Graph) -> list[list[LaneSegment]]:
-    return [lane.segments for lane in graph.lanes] + [c.segments for c in graph.connectors]
-
-
 def _shapes_of(od: OpenDrive, graph: Graph) -> Shapes:
-    return Shapes(od, [*chain.from_iterable(_chains(graph)), *graph.dropped])
+    segments = [segment for lane in graph.lanes for segment in lane.segments]
+    segments += [segment for connector in graph.connectors for segment in connector.segments]
+    return Shapes(od, [*segments, *graph.dropped])
 
 
-class _Maker:
-    def __init__(self, od: OpenDrive, graph: Graph, warnings: Counter[str], country: str) -> None:
-        self.od, self.warnings, self.country = od, warnings, country
-        self.shapes = _shapes_of(od, graph)
-        self.graph, crossings = cut_crossings(od, graph, self.shapes)
-        if crossings:
-            warnings["lanes that cross without a junction, made an intersection"] += crossings
-            self.shapes = _shapes_of(od, self.graph)
-        self.controls = control.connector_controls(od, self.graph)
+class _RoadMapBuilder(MapBuilder[LaneSegment]):
+    larger = "longer"
 
-    def build(self, name: str, offset: FloatArray, epsg: int) -> tuple[VectorMap, MapReport]:
-        lanes, stacked = self._lanes()
-        polygons = [lane.polygon for lane in lanes]
-        stops = control.stop_lines(self.od, self.graph, self.shapes, self.controls, polygons)
-        connectors = self._connectors([lane.line for lane in lanes], stops)
-        blocks = [lane.block for lane in lanes]
-        stacked_blocks = {
-            (min(blocks[i], blocks[j]), max(blocks[i], blocks[j])) for i, j in stacked
-        }
-        parts = MapBuilder(
-            lanes,
-            connectors,
-            groups=self._groups([connector.polygon for connector in connectors]),
-            num_stops=len(stops),
-            stacked=stacked_blocks,
-        )
-        edges, block_specs = parts.edges(), parts.blocks()
-        layers = self._areas(parts, [edge.polygon for edge in edges])
-        layers["stop_polygons"] = parts.stop_polygons(
-            (line.polygon, STOP_KINDS[line.control]) for line in stops
-        )
-        vector_map = build_map(
-            name,
-            edges=_moved(edges, offset),
-            blocks=_moved(block_specs, offset),
-            epsg=epsg,
-            **{layer: _moved(specs, offset) for layer, specs in layers.items()},
-        )
-        levels = {(parts.lane_ids[i], parts.lane_ids[j]) for i, j in stacked}
-        levels |= {(parts.block_ids[a], parts.block_ids[b]) for a, b in stacked_blocks}
-        origins = tuple(self._origins([*parts.lane_ids, *parts.connector_ids]))
-        return vector_map, MapReport(dict(self.warnings), origins, frozenset(levels))
+    def __init__(
+        self, od: OpenDrive, graph: Graph, shapes: Shapes, warnings: Counter[str], country: str
+    ) -> None:
+        super().__init__(graph, shapes, warnings)
+        self.od, self.shapes, self.country = od, shapes, country
+        self.controls = control.connector_controls(od, graph)
+        self.stops: list[control.StopLine] = []
 
-    def _lanes(self) -> tuple[list[ShapedLane], set[tuple[int, int]]]:
-        """All lanes, and the pairs of them that lie on different levels."""
+    def connector_borders(self, connector: Connector) -> tuple[FloatArray, FloatArray]:
         lanes = self.graph.lanes
-        borders = [self.shapes.joined_borders(lane.segments) for lane in lanes]
-        polygons = [lane_polygon(*pair) for pair in borders]
-        levels = Levels(self.od, self.shapes, [lane.segments for lane in lanes], polygons)
-        stacked = {pair for pair in overlapping(polygons) if levels.are_stacked(*pair)}
-        lengths = [sum(piece.length for piece in lane.segments) for lane in lanes]
-        polygons, overlaps = subtract_overlaps(polygons, lengths, stacked)
-        if overlaps:
-            self.warnings["overlap of two lanes, taken from the longer one"] += overlaps
-        shaped = [
-            ShapedLane(
-                *borders[number],
-                self.shapes.baseline(lane.segments),
-                polygons[number],
-                control.speed_limit(self.od, lane.segments, self.country),
-                lane.block,
-                lane.index,
-                number > 0 and _touch(lanes[number - 1].segments[0], lane.segments[0]),
-            )
-            for number, lane in enumerate(lanes)
-        ]
-        return shaped, stacked
+        before = self.shapes.widths(lanes[connector.source].segments)[1]
+        after = self.shapes.widths(lanes[connector.target].segments)[0]
+        return widen(*self.shapes.joined_borders(connector.segments), min(before, after))
 
-    def _connectors(
-        self, lines: Sequence[FloatArray], stops: Sequence[control.StopLine]
-    ) -> list[ShapedConnector]:
-        """All connectors; `lines` are the baselines of the lanes."""
-        lanes, out = self.graph.lanes, []
-        for connector, controls in zip(self.graph.connectors, self.controls, strict=True):
-            left, right = self.shapes.joined_borders(connector.segments)
-            before = self.shapes.widths(lanes[connector.source].segments)[1]
-            after = self.shapes.widths(lanes[connector.target].segments)[0]
-            left, right = widen(left, right, min(before, after))
-            source, target = lines[connector.source], lines[connector.target]
-            line = self.shapes.baseline(connector.segments, source[-1], target[0])
-            here = [i for i, stop in enumerate(stops) if stop.lane == connector.source]
-            out.append(
-                ShapedConnector(
-                    left,
-                    right,
-                    bend_ends(line, source, target),
-                    lane_polygon(left, right),
-                    control.speed_limit(self.od, connector.segments, self.country),
-                    connector.source,
-                    connector.target,
-                    has_light=bool(connector.junctions) and LIGHT in controls,
-                    stops=here if connector.junctions else (),
-                )
-            )
-        return out
+    def speed_limits(self, segment: LaneSegment) -> Iterable[tuple[float | None, float]]:
+        return control.speed_limits(self.od, segment, self.country)
 
-    def _groups(self, polygons: Sequence[shapely.Polygon]) -> IntArray:
-        connectors = self.graph.connectors
-        levels = Levels(self.od, self.shapes, [c.segments for c in connectors], polygons)
-        pairs = block_pairs(self.graph.lanes, connectors)
-        return areas.group_connectors(connectors, polygons, pairs, levels.are_stacked)
+    def sizes(self, polygons: Sequence[shapely.Polygon]) -> list[float]:
+        return [sum(s.length for s in lane.segments) for lane in self.graph.lanes]
 
-    def _kind(self, numbers: Sequence[int]) -> int:
-        """Kind of the intersection of some connectors."""
+    def _levels(
+        self, edges: Sequence[Lane | Connector], areas: Sequence[shapely.Polygon]
+    ) -> Levels:
+        return Levels(self.od, self.shapes, [edge.segments for edge in edges], areas)
+
+    def stacked_lanes(self, polygons: Sequence[shapely.Polygon]) -> Pairs:
+        levels = self._levels(self.graph.lanes, polygons)
+        return {pair for pair in overlapping(polygons) if levels.are_stacked(*pair)}
+
+    def are_adjacent(self, left: Lane, right: Lane) -> bool:
+        """Whether no lane of another use lies between two lanes of one section."""
+        one, other = (lane.segments[0].key.lane for lane in (left, right))
+        return abs(one - other) - (1 if one * other < 0 else 0) == 1
+
+    def stop_areas(self, lanes: Sequence[shapely.Polygon]) -> list[tuple[shapely.Polygon, int]]:
+        self.stops = control.stop_lines(self.od, self.graph, self.shapes, self.controls, lanes)
+        return [(stop.polygon, STOP_KINDS[stop.control]) for stop in self.stops]
+
+    def stops_of(self, number: int, before: FloatArray, line: FloatArray) -> list[int]:
+        connector = self.graph.connectors[number]
+        if not connector.junctions:
+            return []
+        return [i for i, stop in enumerate(self.stops) if stop.lane == connector.source]
+
+    def light(self, number: int) -> str | None:
+        return "" if LIGHT in self.controls[number] else None
+
+    def groups(self, connectors: Sequence[shapely.Polygon]) -> IntArray:
+        levels = self._levels(self.graph.connectors, connectors)
+        return areas.group_connectors(
+            self.graph.connectors, connectors, self.block_pairs, levels.are_stacked
+        )
+
+    def kind(self, numbers: Sequence[int]) -> int:
         found = frozenset(control for i in numbers for control in self.controls[i])
         if not any(self.graph.connectors[i].junctions for i in numbers):
             return PASS_THROUGH
         return LIGHT_KIND if LIGHT in found else STOP_SIGN_KIND if STOP in found else 0
 
-    def _areas(
-        self, parts: MapBuilder, edges: Sequence[shapely.Polygon]
-    ) -> dict[str, list[AreaSpec]]:
-        """Layers without links; `edges` are the areas of all lanes and connectors."""
-        intersections = parts.intersections(self._kind)
+    def areas(
+        self, edges: Sequence[shapely.Polygon], intersections: Sequence[AreaSpec]
+    ) -> dict[str, Sequence[shapely.Polygon]]:
         other = areas.lane_areas(self.od, self.shapes)
         spaces = areas.parking_spaces(self.od, self.shapes)
         car_parks = areas.merge_areas([*other.parking, *spaces], 0.5)
-        pieces = [piece for piece in self.graph.dropped if piece.length > 0.01]
-        dropped = [lane_polygon(*self.shapes.borders(piece)) for piece in pieces]
+        segments = [segment for segment in self.graph.dropped if segment.length > 0.01]
+        dropped = [lane_polygon(*self.shapes.borders(segment)) for segment in segments]
         inner = [spec.polygon for spec in intersections if spec.kind != PASS_THROUGH]
-        drivable = areas.drivable_tiles([*edges, *inner, *other.paved, *car_parks, *dropped])
         return {
-            "intersections": intersections,
-            "crosswalks": parts.areas(areas.crosswalk_polygons(self.od, self.shapes)),
-            "walkways": parts.areas(areas.merge_areas(other.walked, 0.05)),
-            "car_parks": parts.areas(car_parks),
-            "drivable_areas": parts.areas(drivable),
+            "crosswalks": areas.crosswalk_polygons(self.od, self.shapes),
+            "walkways": areas.merge_areas(other.walked, 0.05),
+            "car_parks": car_parks,
+            "drivable_areas": areas.drivable_tiles(
+                [*edges, *inner, *other.paved, *car_parks, *dropped]
+            ),
         }
-
-    def _origins(self, ids: Sequence[str]) -> Iterator[Origin]:
-        for edge_id, pieces in zip(ids, _chains(self.graph), strict=True):
-            for piece in pieces:
-                yield Origin(edge_id, piece.key, piece.begin, piece.end)
-
-
-def _touch(left: LaneSegment, right: LaneSegment) -> bool:
-    """Whether no lane of another use lies between two lanes of one section."""
-    one, other = left.key.lane, right.key.lane
-    return abs(one - other) - (1 if one * other < 0 else 0) == 1
-
-
-def _moved(specs: Iterable[_Spec], offset: FloatArray) -> list[_Spec]:
-    """Edges, blocks or areas at their place in the world."""
-    out = []
-    for spec in specs:
-        lines = {name: getattr(spec, name, None) for name in ("baseline", "left", "right")}
-        shapes = {name: line + offset for name, line in lines.items() if line is not None}
-        polygon = shapely.transform(spec.polygon, lambda xy: xy + offset)
-        out.append(replace(spec, polygon=polygon, **shapes))
-    return out

@@ -74,7 +74,7 @@ def parse_opendrive(data: bytes, source: str) -> OpenDrive:
                 roads[name] = road
         else:
             junctions[name] = _read_junction(element, name, reader)
-    return OpenDrive(source, *header, roads, junctions, dict(reader.counts), dict(reader.warnings))
+    return OpenDrive(source, *header, roads, junctions, dict(reader.warnings))
 
 
 def _strip_junk(data: bytes, reader: Reader) -> bytes:
@@ -106,10 +106,6 @@ def _read_road(element: Any, name: str, reader: Reader) -> Road | None:
     junction = element.get("junction", "-1")
     lanes = element.find("lanes")
     offsets = [] if lanes is None else lanes.findall("laneOffset")
-    reader.counts["road"] += 1
-    reader.counts["laneOffset"] += len(offsets)
-    reader.counts["road in a junction"] += junction != "-1"
-    reader.counts["road with left-hand traffic"] += element.get("rule") == "LHT"
     geometries = _read_plan_view(element.find("planView"), reader)
     stated = reader.number(element, "length", np.nan)
     found = () if lanes is None else lanes.iter("laneSection")
@@ -133,7 +129,6 @@ def _read_road(element: Any, name: str, reader: Reader) -> Road | None:
     return Road(
         id=name,
         length=min(stated, end),
-        stated_length=stated,
         junction=None if junction == "-1" else junction,
         left_hand=element.get("rule") == "LHT",
         geometries=geometries,
@@ -156,7 +151,6 @@ def _read_plan_view(element: Any, reader: Reader) -> tuple[records.Geometry, ...
     for child in () if element is None else element.findall("geometry"):
         shape: Any = next((e for e in child if e.tag in records.SHAPES), None)
         kind = records.LINE if shape is None else shape.tag
-        reader.counts[f"geometry {kind}"] += 1
         length, s = (reader.number(child, k, may_be_any=True) for k in ("length", "s"))
         x, y, heading = (
             reader.number(child, k, np.nan, may_be_any=True) for k in ("x", "y", "hdg")
@@ -227,7 +221,6 @@ def _read_types(elements: list[Any], reader: Reader) -> tuple[records.RoadType, 
 
 def _read_speed(element: Any, reader: Reader) -> records.Speed:
     unit = element.get("unit", "")
-    reader.counts[f"speed {unit or 'm/s'}"] += 1
     begin = reader.finite(element, "sOffset")
     text = element.get("max", "undefined")
     if text in ("no limit", "undefined"):
@@ -242,7 +235,6 @@ def _read_speed(element: Any, reader: Reader) -> records.Speed:
 
 def _read_section(element: Any, reader: Reader) -> records.LaneSection:
     lanes: dict[int, records.Lane] = {}
-    reader.counts["lane section"] += 1
     for child in element.iter("lane"):
         number = reader.integer(child, "id")
         if number is None:
@@ -267,10 +259,7 @@ def _read_section(element: Any, reader: Reader) -> records.LaneSection:
 def _read_lane(element: Any, number: int, reader: Reader) -> records.Lane:
     link = element.find("link")
     widths, borders = element.findall("width"), element.findall("border")
-    reader.counts["width"] += len(widths)
-    reader.counts["border"] += len(borders)
     kind = element.get("type", "")
-    reader.counts[f"lane type {kind or 'none'}"] += 1
     if not widths and not borders:
         reader.warn("lane without width and border")
     lane = records.Lane(
@@ -301,12 +290,9 @@ def _lane_ids(link: Any, name: str, reader: Reader) -> tuple[int, ...]:
 
 def _read_junction(element: Any, name: str, reader: Reader) -> records.Junction:
     kind = element.get("type", "default")
-    reader.counts[f"junction type {kind}"] += 1
     connections = []
     for child in element.findall("connection"):
         links = reader.pairs(child, "laneLink", ("from", "to"))
-        reader.counts["connection"] += 1
-        reader.counts["lane link in a junction"] += len(links)
         into = child.get("connectingRoad") or child.get("linkedRoad") or ""
         connections.append(
             records.Connection(child.get("incomingRoad", ""), into, _contact(child), links)

@@ -146,7 +146,6 @@ class Road:
 
     id: str  # road id
     length: float  # the shorter of what it states and what its geometry has [m]
-    stated_length: float  # as the file has it [m]
     junction: str | None  # junction it lies in; None for a road outside
     left_hand: bool  # whether traffic keeps to the left
     geometries: tuple[Geometry, ...]  # reference line, by s
@@ -195,5 +194,4 @@ class OpenDrive:
     offset: tuple[float, float, float, float] | None  # of the header: x, y, z [m], heading [rad]
     roads: dict[str, Road]  # by id, in the order of the file
     junctions: dict[str, Junction]  # by id, in the order of the file
-    counts: dict[str, int]  # how many records of each kind the file holds, dropped ones included
     warnings: dict[str, int]  # what was repaired or left out: count by kind

@@ -77,9 +77,9 @@ class Shapes:
             inner, outer = inner[::-1], outer[::-1]
         return (inner, outer) if (piece.key.lane < 0) == forward else (outer, inner)
 
-    def joined_borders(self, pieces: Sequence[LaneSegment]) -> tuple[FloatArray, FloatArray]:
-        """Borders of a chain of pieces; ends that nearly meet become one vertex."""
-        left, right = zip(*map(self.borders, pieces), strict=True)
+    def joined_borders(self, segments: Sequence[LaneSegment]) -> tuple[FloatArray, FloatArray]:
+        """Borders of a chain of segments; ends that nearly meet become one vertex."""
+        left, right = zip(*map(self.borders, segments), strict=True)
         return join_lines(left), join_lines(right)
 
     def centers(self, piece: LaneSegment, s: FloatArray) -> FloatArray:
@@ -94,12 +94,12 @@ class Shapes:
 
     def baseline(
         self,
-        pieces: Sequence[LaneSegment],  # in the direction of travel
+        segments: Sequence[LaneSegment],  # in the direction of travel
         start: FloatArray | None = None,  # (2,) where it must begin, near its own start [m]
         end: FloatArray | None = None,  # (2,) where it must end [m]
     ) -> FloatArray:
-        """Centre line of a chain of pieces with a vertex about every 0.25 m."""
-        pieces = [part for piece in pieces for part in self._without_steps(piece)]
+        """Centre line of a chain of segments with a vertex about every 0.25 m."""
+        pieces = [part for segment in segments for part in self._without_steps(segment)]
         firsts = [self.centers(p, np.array([p.begin, p.end])) for p in pieces]
         jumps = np.zeros((len(pieces) + 1, 2))
         for number, (before, after) in enumerate(pairwise(firsts), start=1):
@@ -145,12 +145,20 @@ class Shapes:
         return out[0], out[1]
 
 
+def arc_lengths(line: FloatArray) -> FloatArray:
+    """(K,) distance of each vertex of a line (K, 2) from its start [m]."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+
+
+def points_at(line: FloatArray, along: FloatArray, at: FloatArray) -> FloatArray:
+    """(N, 2) points of a line (K, 2) at `at` (N,); `along` (K,) is where its vertices are."""
+    return np.stack([np.interp(at, along, values) for values in line.T], axis=1)
+
+
 def divide(dense: FloatArray) -> FloatArray:
     """A line through dense points with a vertex about every 0.25 m; sharp corners stay vertices."""
-    steps = np.diff(dense, axis=0)
-    lengths = np.hypot(*steps.T)
-    arc = np.concatenate([[0.0], np.cumsum(lengths)])
-    moving = np.flatnonzero(lengths > 1e-6)
+    steps, arc = np.diff(dense, axis=0), arc_lengths(dense)
+    moving = np.flatnonzero(np.hypot(*steps.T) > 1e-6)
     headings = np.arctan2(steps[moving, 1], steps[moving, 0])
     turns = np.abs((np.diff(headings) + np.pi) % (2 * np.pi) - np.pi)
     stops = [0.0]
@@ -161,8 +169,7 @@ def divide(dense: FloatArray) -> FloatArray:
         np.linspace(a, b, max(round((b - a) / BASELINE_STEP), 1), endpoint=False)
         for a, b in pairwise([*stops, float(arc[-1])])
     ]
-    at = np.concatenate([*parts, arc[-1:]])
-    line = np.stack([np.interp(at, arc, dense[:, 0]), np.interp(at, arc, dense[:, 1])], axis=1)
+    line = points_at(dense, arc, np.concatenate([*parts, arc[-1:]]))
     line[0], line[-1] = dense[0], dense[-1]
     return line
 
@@ -177,15 +184,15 @@ def bend_ends(line: FloatArray, before: FloatArray, after: FloatArray) -> FloatA
 
 
 def _bend_start(line: FloatArray, direction: FloatArray) -> FloatArray:
-    own, wanted = (v / max(float(np.hypot(*v)), 1e-9) for v in (line[1] - line[0], direction))
-    if own @ wanted > np.cos(_KINK) or own @ wanted < np.cos(1.0):
+    heading, wanted = (v / max(float(np.hypot(*v)), 1e-9) for v in (line[1] - line[0], direction))
+    if heading @ wanted > np.cos(_KINK) or heading @ wanted < np.cos(1.0):
         return line
-    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    arc = arc_lengths(line)
     reach = min(_BEND, 0.5 * float(arc[-1]))
     if reach < 2 * BASELINE_STEP:
         return line
     share = np.clip(arc / reach, 0.0, 1.0)
-    return line + (arc * (1.0 - share) ** 2)[:, None] * (wanted - own)
+    return line + (arc * (1.0 - share) ** 2)[:, None] * (wanted - heading)
 
 
 def lane_polygon(left: FloatArray, right: FloatArray) -> shapely.Polygon:

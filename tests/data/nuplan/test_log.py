@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import places
 import pytest
+from nuplan_logs import list_scenarios, read_scenario
 from recordings import require_plausible
 
 from shiftsim.data.nuplan.boxes import read_boxes
@@ -19,10 +20,8 @@ from shiftsim.data.nuplan.map import read_map
 from shiftsim.data.nuplan.scenarios import (
     NAMED_TYPES,
     cut_window,
-    list_scenarios,
     mapping_of,
     parse_mapping,
-    read_scenario,
 )
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError, ConversionError, DataError

@@ -51,11 +51,12 @@ def test_the_map_of_a_town_comes_back(scenes, name):
         assert len(getattr(road, layer)) == len(getattr(before, layer)), layer
     assert (road.num_lanes, road.num_roadblocks) == (before.num_lanes, before.num_roadblocks)
     if name != "commonroad":  # whose signs say something else
-        ends = [before.edges.index[ids[0]] for ids in scenes[name].map.origins.values()]
+        first_pieces = [parts[0].piece.id for parts in scenes[name].map.segments.values()]
+        ends = [before.edges.index[first] for first in first_pieces]
         expected = before.speed_limits[ends] if name != "av2" else np.full(len(ends), np.nan)
         np.testing.assert_array_equal(road.speed_limits, expected)
-    for edge, (first, *_) in zip(road.edges.ids, scenes[name].map.origins.values(), strict=True):
-        new, old = road.edge(edge), before.edge(first)
+    for edge, (first, *_) in zip(road.edges.ids, scenes[name].map.segments.values(), strict=True):
+        new, old = road.edge(edge), before.edge(first.piece.id)
         assert road.is_connector(new) == before.is_connector(old)
         ends = road.baselines.at(new)[[0, -1]]
         np.testing.assert_allclose(ends, before.baselines.at(old)[[0, -1]], atol=0.2)
@@ -99,7 +100,8 @@ def test_lights_of_py123d_are_those_of_the_connector_of_their_lane(scenes):
     scene = scenes["py123d"]
     lights = convert_recording(scene).recording.lights
     (connector,) = lights.connector_ids
-    assert scene.map.origins[connector] == (str(lit_lane(demo_content())),)
+    (part,) = scene.map.segments[connector]
+    assert part.piece.id == str(lit_lane(demo_content()))
     assert lights.status[:, 0].tolist() == [2] * 60 + [0] * (len(lights.status) - 60)
 
 

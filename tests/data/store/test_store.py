@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from nuplan_logs import list_scenarios, read_scenario
 from recordings import GOLDEN, LOG, TOKEN, make_recording, make_window, write_store
 
 from shiftsim.data.nuplan.convert import convert_nuplan
-from shiftsim.data.nuplan.scenarios import list_scenarios, read_scenario
 from shiftsim.data.recording import EgoTrace, Recording
 from shiftsim.data.store import schema
 from shiftsim.data.store.reading import open_store

@@ -8,13 +8,14 @@ from hypothesis import strategies as st
 from map_checks import check_map
 from opendrive_xml import crossroads, document, geometry, lane, parse, road, section, touches
 
-from shiftsim.data.maps.opendrive.map import MapReport, build_road_map
+from shiftsim.data.maps.builder import BuiltMap
+from shiftsim.data.maps.opendrive.map import build_road_map
 from shiftsim.data.maps.opendrive.reading import parse_opendrive
 from shiftsim.data.maps.opendrive.records import OpenDrive
 from shiftsim.world.map import VectorMap
 
 
-def make(od: OpenDrive, **options: object) -> tuple[VectorMap, MapReport]:
+def make(od: OpenDrive, **options: object) -> tuple[VectorMap, BuiltMap]:
     """The map of a file; all self-checks must pass."""
     built, report = build_road_map(od, name="test", **options)
     assert [
@@ -62,7 +63,8 @@ def test_equal_sections_join_to_one_lane():
     built, report = make(parse(road(sections=sections)))
     assert built.num_lanes == 1
     assert built.baselines.length(0) == pytest.approx(100, abs=1e-6)
-    assert [(o.key.section, o.begin, o.end) for o in report.origins] == [(0, 0, 40), (1, 40, 100)]
+    (segments,) = report.segments.values()
+    assert [(s.key.section, s.begin, s.end) for s in segments] == [(0, 0, 40), (1, 40, 100)]
 
 
 def test_lane_that_is_added_gives_seam_connectors_of_three_metres():
