@@ -95,7 +95,7 @@ def _pair(rng: np.random.Generator, *, lanes: int) -> list[Street]:
             mid = replace(mid, junctions=(101, 102))
             out = [mid, *others]
         else:
-            x, y, heading = mid.road().at(np.array([mid.road().length]))[0].tolist()
+            x, y, heading = mid.road.at(np.array([mid.length]))[0].tolist()
             reach = reaches(arms, angles, rounding)[0]
             center = (float(x + reach * np.cos(heading)), float(y + reach * np.sin(heading)))
             around = [angle + heading + np.pi for angle in angles]
@@ -302,8 +302,7 @@ def _inward(street: Street, junction: int) -> float:
     """Heading of a street where it enters a junction [rad]."""
     if street.junctions[0] == junction:
         return street.start[2] + float(np.pi)
-    road = street.road()
-    return float(road.at(np.array([road.length]))[0, 2])
+    return float(street.road.at(np.array([street.length]))[0, 2])
 
 
 KINDS: dict[str, Callable[[np.random.Generator], list[Street]]] = {

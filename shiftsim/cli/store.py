@@ -19,8 +19,7 @@ from shiftsim.cli import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from shiftsim.data.store.check import RecordingRow
-    from shiftsim.data.store.check_map import Problem
+    from shiftsim.data.store.check import Problem, RecordingRow
     from shiftsim.data.store.reading import ScenarioStore
     from shiftsim.runs.filter import FilterResults
 
