@@ -205,10 +205,15 @@ def _add_walker(builder: ScenarioBuilder, walk: Walk) -> tuple[str, ScriptedPede
         -1, start, end[:2], size, speed, walk.ego_within_m, walk.visible
     )
     start_time = np.inf if walk.start_s is None else walk.start_s
-    poses, velocities, valid = (
-        array[:, None] for array in pedestrian.walk(builder.seconds, start_time)
+    poses, velocities, valid = pedestrian.walk(builder.seconds, start_time)
+    builder.add(
+        [name],
+        AgentKind.PEDESTRIAN,
+        size,
+        poses[:, None],
+        valid=valid[:, None],
+        velocities=velocities[:, None],
     )
-    builder.add([name], AgentKind.PEDESTRIAN, size, poses, valid=valid, velocities=velocities)
     return (name, pedestrian) if walk.start_s is None else None
 
 

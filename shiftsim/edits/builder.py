@@ -138,7 +138,7 @@ class ScenarioBuilder:
         *,
         valid: BoolArray | bool = True,
         velocities: FloatArray | float = 0.0,
-        behaviors: Sequence[int] | int = FOLLOW,
+        behaviors: IntArray | int = FOLLOW,
     ) -> None:
         """Add N tracks of one kind.
 
@@ -161,16 +161,14 @@ class ScenarioBuilder:
             np.full(len(tokens), kind, np.int64),
             tuple(tokens),
         )
-        old = self.tracks
-        kinds = np.concatenate([old.kinds, new.kinds])
-        self.tracks = Tracks(
-            *(
-                np.concatenate([getattr(old, name), getattr(new, name)], axis=1)
-                for name in ("valid", "poses", "velocities", "sizes")
-            ),
-            kinds,
-            (*old.tokens, *new.tokens),
+        parts = (self.tracks, new)
+        there, places, moves, boxes = (
+            np.concatenate([getattr(part, name) for part in parts], axis=1)
+            for name in ("valid", "poses", "velocities", "sizes")
         )
+        kinds = np.concatenate([part.kinds for part in parts])
+        names = (*self.tracks.tokens, *tokens)
+        self.tracks = Tracks(there, places, moves, boxes, kinds, names)
         self.behaviors = np.append(self.behaviors, np.broadcast_to(behaviors, len(tokens)))
         # nuPlan rule 410: tracks are ordered by kind, within a kind as listed
         if (np.diff(kinds) < 0).any():
