@@ -271,8 +271,8 @@ def _check_files(store: Path, files: dict[str, str]) -> Iterator[Problem]:
     for path in sorted(store.rglob("*")):
         name = path.relative_to(store).as_posix()
         top = path.relative_to(store).parts[0]
-        beside = top in _BESIDE or (top == REPORTS and path.suffix == ".png")
-        if path.is_file() and not beside and name not in known:
+        is_statement = top in _BESIDE or (top == REPORTS and path.suffix == ".png")
+        if path.is_file() and not is_statement and name not in known:
             yield Problem(name, f"the file is not listed in {MANIFEST}", is_error=False)
 
 

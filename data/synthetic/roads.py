@@ -93,13 +93,13 @@ class RoadSpec:
         """(n, 3) centre of a lane at s; the heading is that of the road."""
         share = s / self.length
 
-        inner, own = np.zeros(len(s)), np.zeros(len(s))
+        inner, lane_width = np.zeros(len(s)), np.zeros(len(s))
         for spec in self.lanes:
             width = spec.width + share * (spec.end_width - spec.width)
             if spec.id * lane > 0 and abs(spec.id) < abs(lane):
                 inner = inner + width
-            own = width if spec.id == lane else own
-        return self.at(s, np.sign(lane) * (inner + 0.5 * own))
+            lane_width = width if spec.id == lane else lane_width
+        return self.at(s, np.sign(lane) * (inner + 0.5 * lane_width))
 
 
 def connect(start: Sequence[float], end: Sequence[float], *, ease: bool) -> tuple[Piece, ...]:

@@ -166,7 +166,7 @@ def _with_places(
     """A path with its zones and crossings, narrow places driven past with care."""
     arc = STEP * np.arange(len(path.points))
     aside, speed = np.zeros(len(arc)), path.speed
-    places, made = [], []
+    places, placed_zones = [], []
     for name, *ends in crossings:
         first, last = sorted(arc_at(path.points, end) for end in ends)
         places.append((name, first, last))
@@ -174,7 +174,8 @@ def _with_places(
         entry, leave = arc_at(path.points, begin), arc_at(path.points, end)
         between = [x for x in places if entry - stop - 0.5 < x[1] and x[2] < entry]
         crosswalk = between[-1][0] if between else ""
-        made.append(replace(zone, entry=entry, exit=leave, stop=entry - stop, crosswalk=crosswalk))
+        ends = {"entry": entry, "exit": leave, "stop": entry - stop}
+        placed_zones.append(replace(zone, **ends, crosswalk=crosswalk))
         if swing or zone.id < 0:
             outside = np.maximum(np.maximum(entry - arc, arc - leave), 0.0) / _NARROW_RAMP
             share = np.clip(1.0 - outside, 0.0, 1.0)
@@ -182,7 +183,7 @@ def _with_places(
         if zone.id < 0:
             speed = np.where(share > 0.5, np.minimum(speed, _NARROW_SPEED), speed)
     path = shifted(replace(path, speed=brake_in_time(speed)), aside)
-    order = tuple(sorted(made, key=lambda zone: zone.entry))
+    order = tuple(sorted(placed_zones, key=lambda zone: zone.entry))
     return replace(path, zones=order, crossings=tuple(places), is_parking=is_parking)
 
 

@@ -172,9 +172,9 @@ def reaches(streets: Sequence[Street], angles: Sequence[float], rounding: float)
         if gap > np.pi - 0.25:
             continue  # they go on from one another
         a, b = streets[one].half, streets[other].half
-        around = rounding / np.tan(0.5 * gap)
-        out[one] = max(out[one], float((b + a * np.cos(gap)) / np.sin(gap) + around))
-        out[other] = max(out[other], float((a + b * np.cos(gap)) / np.sin(gap) + around))
+        kerb = rounding / np.tan(0.5 * gap)
+        out[one] = max(out[one], float((b + a * np.cos(gap)) / np.sin(gap) + kerb))
+        out[other] = max(out[other], float((a + b * np.cos(gap)) / np.sin(gap) + kerb))
     return out
 
 
