@@ -29,7 +29,7 @@ BUDGETS = {
     "data": 5_410,  # goal 3_900
     "data/nuplan": 2_780,  # goal 2_400
     "data/store": 2_310,  # goal 2_200
-    "data/synthetic": 2_600,  # goal 2_100
+    "data/synthetic": 2_590,  # goal 2_100
     "shiftsim/report": 2_750,  # goal 2_200
     "shiftsim/view": 2_100,  # goal 1_800
     "shiftsim/env": 1_100,

@@ -23,7 +23,7 @@ from shiftsim.data.synthetic.streets import (
     with_crossings,
     with_obstacles,
 )
-from shiftsim.data.synthetic.town import Lights, Street, Town, build_town
+from shiftsim.data.synthetic.town import Leg, Lights, Street, Town, build_town
 
 _TRIES = 300
 # km/h, of main roads by lanes per direction
@@ -271,7 +271,8 @@ def _random_lights(town: Town, junction: int, rng: np.random.Generator) -> Light
     for (at, street, _, _), (number, _) in town.connectors.items():
         if at == junction:
             roads.setdefault(street, set()).add(number)
-    phases = _phases({name: _inward(town.streets[name], junction) for name in roads})
+    entering = [Leg(town.streets[x], town.streets[x].junctions[0] != junction) for x in roads]
+    phases = _phases({x.street.name: float(x.pose(1, at_end=True)[2]) for x in entering})
     crossings = {
         town.streets[name].crossing_name(number): place
         for place, phase in enumerate(phases)
@@ -298,13 +299,6 @@ def _phases(headings: dict[str, float]) -> list[list[str]]:
             phase.append(left.pop(int(np.argmin(turn))))
         phases.append(phase)
     return phases
-
-
-def _inward(street: Street, junction: int) -> float:
-    """Heading of a street where it enters a junction [rad]."""
-    if street.junctions[0] == junction:
-        return street.start[2] + float(np.pi)
-    return float(street.road.at(np.array([street.length]))[0, 2])
 
 
 KINDS: dict[str, Callable[[np.random.Generator], list[Street]]] = {

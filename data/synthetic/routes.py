@@ -174,8 +174,8 @@ def _with_places(
         entry, leave = arc_at(path.points, begin), arc_at(path.points, end)
         between = [x for x in places if entry - stop - 0.5 < x[1] and x[2] < entry]
         crosswalk = between[-1][0] if between else ""
-        ends = {"entry": entry, "exit": leave, "stop": entry - stop}
-        placed_zones.append(replace(zone, **ends, crosswalk=crosswalk))
+        zone = replace(zone, entry=entry, exit=leave, stop=entry - stop, crosswalk=crosswalk)
+        placed_zones.append(zone)
         if swing or zone.id < 0:
             outside = np.maximum(np.maximum(entry - arc, arc - leave), 0.0) / _NARROW_RAMP
             share = np.clip(1.0 - outside, 0.0, 1.0)
