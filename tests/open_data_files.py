@@ -33,7 +33,7 @@ CENTER_TO_IMU = 1.3  # m, of the ego's box
 @cache
 def demo_map(site="avenue"):
     """The map of a town of the demo, as OpenDRIVE gives it."""
-    xml = _generated(site)[0].network.xml()
+    xml = _generated(site)[0].xml()
     return build_road_map(parse_opendrive(xml.encode(), site), name=site)[0]
 
 

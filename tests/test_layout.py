@@ -17,8 +17,8 @@ FOLDERS = ("planners", "metrics", "data", "benchmarks")
 BUDGETS = {
     "shiftsim": 1_090,  # goal 900
     "shiftsim/geometry": 1_000,
-    "shiftsim/world": 1_880,  # goal 1_800
-    "shiftsim/edits": 2_450,  # goal 2_100
+    "shiftsim/world": 1_840,  # goal 1_800
+    "shiftsim/edits": 2_270,  # goal 2_100
     "shiftsim/sim": 1_710,  # goal 1_600
     "shiftsim/sim/traffic": 2_400,  # goal 2_200
     "metrics": 2_300,
@@ -28,8 +28,8 @@ BUDGETS = {
     "data/maps": 3_510,  # goal 3_000
     "data": 5_410,  # goal 3_900
     "data/nuplan": 2_740,  # goal 2_400
-    "data/store": 2_430,  # goal 2_200
-    "data/synthetic": 2_610,  # goal 2_100
+    "data/store": 2_310,  # goal 2_200
+    "data/synthetic": 2_590,  # goal 2_100
     "shiftsim/report": 2_750,  # goal 2_200
     "shiftsim/view": 2_100,  # goal 1_800
     "shiftsim/env": 1_010,

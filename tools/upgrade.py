@@ -23,6 +23,8 @@ from shiftsim.data.store.reading import window_of
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import DataError
 from shiftsim.files import store_path
+from shiftsim.geometry.polylines import arc_lengths
+from shiftsim.kernels import readonly
 from shiftsim.runs.filter import RESULTS, SCHEMA
 from shiftsim.runs.results import FORMAT_VERSION, Run
 from shiftsim.runs.rollouts import Task
@@ -30,7 +32,7 @@ from shiftsim.runs.rollouts.columns import COMMAND_COLUMNS, NOISE_COLUMNS, rollo
 from shiftsim.runs.rollouts.files import FOLDER, PartWriter
 from shiftsim.runs.scenarios import open_run_store
 from shiftsim.sim.log import NUM_KEPT, SimulationLog
-from shiftsim.world.layers import Layer, Lists, index_polygons, index_polylines
+from shiftsim.world.layers import Layer, Lists, Polylines, index_polygons
 from shiftsim.world.map import LAYERS, VectorMap
 from shiftsim.world.state import Tracks, TrafficLights
 
@@ -168,7 +170,10 @@ def read_map(path: Path) -> VectorMap:
             xy = np.column_stack([_items(table[f"{name}_{axis}"]) for axis in ("x_m", "y_m")])
         pointers = ("ptr",) if name in LINES else ("ring_ptr", "poly_ptr")
         given = [np.ascontiguousarray(xy), *(_items(table[f"{name}_{part}"]) for part in pointers)]
-        parts[name] = index_polylines(*given) if name in LINES else index_polygons(*given)
+        if name in LINES:
+            parts[name] = Polylines(*map(readonly, (*given, arc_lengths(*given))))
+        else:
+            parts[name] = index_polygons(*given)
     for name in LAYERS:
         parts[name] = Layer(tuple(table[f"{name}_ids"][0].as_py()), parts[name])
     for name in LISTS:

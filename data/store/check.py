@@ -2,27 +2,37 @@
 
 import os
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import groupby, pairwise
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import pyarrow as pa
+import shapely
 
 from shiftsim.data.readers.motion import MAX_SHARE, contradiction, fitted_velocities
-from shiftsim.data.store.check_map import MapCheck, Problem
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.data.store.recordings import ego_span, ego_states
 from shiftsim.data.store.schema import MOTION
 from shiftsim.data.store.tables import MANIFEST, REPORTS, column, digest, read_manifest
 from shiftsim.errors import DataError
-from shiftsim.geometry.boxes import wrap_angles
+from shiftsim.geometry.boxes import boxes_to_corners, wrap_angles
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.map import VectorMap
 from shiftsim.world.ranges import CHECK
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import HEADING, LAST_AGENT_KIND, VX, VY, AgentKind, LightStatus
+from shiftsim.world.state import (
+    HEADING,
+    LAST_AGENT_KIND,
+    PACIFICA,
+    VX,
+    VY,
+    AgentKind,
+    LightStatus,
+    center_poses,
+)
 
 _MAX_SPEED = 100.0  # m/s; anything faster is in the wrong unit
 _LAST_STEPS_S = 0.5  # by which the last iteration may come before the end
@@ -35,7 +45,30 @@ _ROW_S = 0.05
 _FAST = 2.0  # m/s
 _MAX_TURNED = 0.5  # rad, median angle between heading and motion of a vehicle
 _LEAST_ROWS = 20  # of motion that say something of a heading
+_MAX_OFF = 3.0  # m, how far the ego may be beside lanes and drivable area
+_MAX_OFF_SHARE = 0.1  # of the iterations
+_MIN_OVERLAP = 0.5  # m^2, of two lanes; less is hardly ever met
+_REPAIR_LANES = "convert the map again, or repair the polygons of these lanes"
+_CORRECT_ROUTE = "correct the route in shiftsim inspect"
 _CHECK_UNITS = "check the unit and the axes of velocities and positions where they came from"
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing that is wrong."""
+
+    where: str  # file, map or scenario
+    what: str  # what is wrong there: value and limit
+    is_error: bool = True  # whether results cannot be trusted; else it is only unusual
+    remedy: str = ""  # what to do
+    kind: str = ""  # short name of what was checked
+    recording: str = ""  # the recording that it belongs to
+
+
+# kind, what is wrong, and what to do
+_Finding: TypeAlias = tuple[str, str, str]
+# area [m^2] and a point (2,) of the overlap of two lanes, by their numbers
+_Overlaps: TypeAlias = dict[tuple[int, int], tuple[float, FloatArray]]
 
 
 @dataclass(frozen=True)
@@ -88,36 +121,37 @@ def survey_store(path: str | Path) -> CheckReport:
         what = "the store has no scenarios, need at least 1"
         hint = "convert recordings again: the conversion says why it dropped what it dropped"
         problems.append(Problem(str(path), what, remedy=hint, kind="scenarios"))
-    maps: dict[str, MapCheck] = {}
+    overlaps: dict[str, _Overlaps] = {}
     for city in store.cities:
         where = f"map {city}"
         try:
-            maps[city] = MapCheck(store.map(city))
-            problems += [
-                Problem(where, what, remedy=CHECK, kind="map")
-                for what in _check_map(store.map(city))
-            ]
-            problems += maps[city].of_map()
+            road = store.map(city)
+            overlaps[city] = _find_overlaps(road)
+            problems += _check_map(road, overlaps[city])
         except DataError as error:
             problems.append(Problem(where, error.message, remedy=error.hint, kind="map"))
     rows = []
     summary = store.summary().select(["token", "recording", "city", "ego"]).to_pylist()
     summary.sort(key=lambda row: (row["recording"], row["token"]))
     for name, group in groupby(summary, lambda row: row["recording"]):
-        row, found = _check_recording(store, name, list(group), maps)
+        row, found = _check_recording(store, name, list(group), overlaps)
         rows.append(row)
         problems += found
     return CheckReport(problems, rows)
 
 
 def _check_recording(
-    store: ScenarioStore, name: str, scenarios: list[dict[str, str]], maps: dict[str, MapCheck]
+    store: ScenarioStore,
+    name: str,
+    scenarios: list[dict[str, str]],
+    overlaps: dict[str, _Overlaps],
 ) -> tuple[RecordingRow, list[Problem]]:
     """One recording with its egos and scenarios."""
     problems: list[Problem] = []
 
-    def add(where: str, what: str, remedy: str, kind: str, is_error: bool = True) -> None:
-        problems.append(Problem(where, what, is_error, remedy, kind, name))
+    def add(where: str, found: Iterable[_Finding], *, is_error: bool = True) -> None:
+        for kind, what, remedy in found:
+            problems.append(Problem(where, what, is_error, remedy, kind, name))
 
     where, city, duration, tracks = f"recording {name}", scenarios[0]["city"], 0.0, 0
     try:
@@ -128,37 +162,35 @@ def _check_recording(
             [("track", "ascending"), ("row", "ascending")]
         )
         tracks = len(boxes["track"].unique())
-        for kind, what, remedy in _check_boxes(boxes, time_us):
-            add(where, what, remedy, kind)
+        add(where, _check_boxes(boxes, time_us))
         for ego in sorted({row["ego"] for row in scenarios}):
             table = store.ego(name, ego)
             first, last = ego_span(table)
             states = ego_states(table, first, last, plausible=False)
-            for what in _check_ego(states, time_us[first:last]):
-                remedy = f"{_CHECK_UNITS}: the ego's are along and across the vehicle"
-                add(f"{where}, ego {ego}", what, f"{remedy}, at the rear axle", "velocity")
+            add(f"{where}, ego {ego}", _check_ego(states, time_us[first:last]))
     except DataError as error:
-        add(where, error.message, error.hint, "file")
+        add(where, [("file", error.message, error.hint)])
     for row in scenarios:
-        place = f"scenario {row['token']}"
+        where = f"scenario {row['token']}"
         try:
             scene = store.read(row["token"], plausible=False)
-            for what, remedy in _check_scenario(scene):
-                add(place, what, remedy, "range")
-            if row["city"] in maps:
-                problems += maps[row["city"]].of_scenario(scene, name)
-            for kind, what, remedy in _unusual(scene):
-                add(place, what, remedy, kind, is_error=False)
+            add(where, _check_scenario(scene))
+            if row["city"] in overlaps:
+                add(where, _check_lanes(scene, overlaps[row["city"]]))
+                for is_error, found in _check_place(scene):
+                    add(where, [found], is_error=is_error)
+                add(where, _check_route(scene))
+            add(where, _unusual(scene), is_error=False)
         except DataError as error:
-            add(place, error.message, error.hint, "file")
+            add(where, [("file", error.message, error.hint)])
     errors = sum(problem.is_error for problem in problems)
     kinds = dict(sorted(Counter(problem.kind for problem in problems).items()))
     counts = len(scenarios), errors, len(problems) - errors
     return RecordingRow(name, city, duration, tracks, *counts, kinds), problems
 
 
-def _check_boxes(boxes: pa.Table, time_us: IntArray) -> Iterator[tuple[str, str, str]]:
-    """Kind, what is wrong with the boxes of a recording, and what to do.
+def _check_boxes(boxes: pa.Table, time_us: IntArray) -> Iterator[_Finding]:
+    """What is wrong with the boxes of a recording.
 
     `boxes` are rows of `schema.TRACKS`, sorted by track, then by row; `time_us` (R,) are the times.
     """
@@ -209,7 +241,7 @@ def _check_boxes(boxes: pa.Table, time_us: IntArray) -> Iterator[tuple[str, str,
         )
 
 
-def _check_ego(states: FloatArray, time_us: IntArray) -> Iterator[str]:
+def _check_ego(states: FloatArray, time_us: IntArray) -> Iterator[_Finding]:
     """What is wrong with the velocities of an ego, states (R, 11) at times (R,)."""
     if not np.isfinite(states).all() or (np.diff(time_us) <= 0).any():
         return
@@ -221,8 +253,10 @@ def _check_ego(states: FloatArray, time_us: IntArray) -> Iterator[str]:
     is_wrong, share = contradiction(stored, derived, time, track)
     if is_wrong[0]:
         yield (
+            "velocity",
             f"the velocity of the ego contradicts its positions by {share[0]:.0%}, at most"
-            f" {MAX_SHARE:.0%}"
+            f" {MAX_SHARE:.0%}",
+            f"{_CHECK_UNITS}: the ego's are along and across the vehicle, at the rear axle",
         )
 
 
@@ -237,33 +271,126 @@ def _check_files(store: Path, files: dict[str, str]) -> Iterator[Problem]:
     for path in sorted(store.rglob("*")):
         name = path.relative_to(store).as_posix()
         top = path.relative_to(store).parts[0]
-        beside = top in _BESIDE or (top == REPORTS and path.suffix == ".png")
-        if path.is_file() and not beside and name not in known:
+        is_statement = top in _BESIDE or (top == REPORTS and path.suffix == ".png")
+        if path.is_file() and not is_statement and name not in known:
             yield Problem(name, f"the file is not listed in {MANIFEST}", is_error=False)
 
 
-def _check_map(road: VectorMap) -> Iterator[str]:
+def _find_overlaps(road: VectorMap) -> _Overlaps:
+    shapes = np.array([road.edges.shape(lane) for lane in range(road.num_lanes)], object)
+    first, second = shapely.STRtree(shapes).query(shapes, predicate="intersects")
+    is_valid = shapely.is_valid(shapes)
+    chosen = (first < second) & is_valid[first] & is_valid[second]
+    first, second = first[chosen], second[chosen]
+    shared = shapely.intersection(shapes[first], shapes[second])
+    area = shapely.area(shared)
+    return {
+        (int(first[i]), int(second[i])): (
+            float(area[i]),
+            shapely.get_coordinates(shapely.point_on_surface(shared[i]))[0],
+        )
+        for i in np.flatnonzero(area > _MIN_OVERLAP).tolist()
+    }
+
+
+def _check_map(road: VectorMap, overlaps: _Overlaps) -> Iterator[Problem]:
+    where, ids = f"map {road.name}", road.edges.ids
     limits = road.speed_limits[~np.isnan(road.speed_limits)]
     if ((limits < 0.0) | (limits > _MAX_SPEED)).any():
-        yield f"a speed limit is not within 0 … {_MAX_SPEED:g} m/s"
+        what = f"a speed limit is not within 0 … {_MAX_SPEED:g} m/s"
+        yield Problem(where, what, remedy=CHECK, kind="map")
+    if overlaps:
+        (a, b), (area, point) = max(overlaps.items(), key=lambda item: item[1][0])
+        yield Problem(
+            where,
+            f"{len(overlaps)} pairs of lanes overlap by more than {_MIN_OVERLAP:g} m²,"
+            f" most {ids[a]!r} and {ids[b]!r}, by {area:.1f} m² at ({point[0]:.1f},"
+            f" {point[1]:.1f}); a rollout that comes there fails",
+            is_error=False,
+            remedy=_REPAIR_LANES,
+            kind="lanes overlap",
+        )
 
 
-def _check_scenario(scene: Scenario) -> Iterator[tuple[str, str]]:
-    """What is wrong with the numbers, and what to do."""
+def _check_lanes(scene: Scenario, overlaps: _Overlaps) -> Iterator[_Finding]:
+    """Lanes that overlap where the ego is, else on the route."""
+    road, ids = scene.map, scene.map.edges.ids
+    centers = center_poses(scene.expert[:, :3])
+    size = np.array([PACIFICA.length, PACIFICA.width])
+    for iteration, center in enumerate(centers):
+        for x, y in [center[:2].tolist(), *boxes_to_corners(center, size).tolist()]:
+            lanes = road.lanes_at(x, y)
+            if len(lanes) > 1:
+                pair = " and ".join(repr(ids[lane]) for lane in lanes[:2])
+                fate = "will fail" if iteration == 0 else "fail if its lane is looked for there"
+                what = (
+                    f"lanes {pair} overlap at ({x:.2f}, {y:.2f}), where the ego is at"
+                    f" {_seconds(scene)[iteration]:.1f} s; it cannot be assigned to one, so its"
+                    f" tasks {fate}"
+                )
+                yield "lanes overlap", what, _REPAIR_LANES
+                return
+    blocks = {road.blocks.index[name] for name in scene.route if name in road.blocks.index}
+    for (a, b), (area, point) in overlaps.items():
+        if road.block_of[a] in blocks or road.block_of[b] in blocks:
+            what = (
+                f"lanes {ids[a]!r} and {ids[b]!r} on the route overlap by {area:.1f} m² at"
+                f" ({point[0]:.2f}, {point[1]:.2f}), at most {_MIN_OVERLAP:g} m²; tasks that"
+                " come there will fail"
+            )
+            yield "lanes overlap", what, _REPAIR_LANES
+            return
+
+
+def _check_place(scene: Scenario) -> Iterator[tuple[bool, _Finding]]:
+    """Whether the ego is beside the map, and whether that is an error."""
+    layers = [x for x in (scene.map.edges, scene.map.drivable_areas) if len(x)]
+    centers = center_poses(scene.expert[:, :3])[:, :2]
+    if not np.isfinite(centers).all():
+        return
+    off = np.array([min((x.nearest(*at)[1] for x in layers), default=np.inf) for at in centers])
+    beside = off > _MAX_OFF
+    if beside.any():
+        first = int(np.flatnonzero(beside)[0])
+        what = (
+            f"the ego is up to {off.max():.1f} m beside lanes and drivable area, from"
+            f" {_seconds(scene)[first]:.1f} s on, in {beside.mean():.0%} of the iterations,"
+            f" at most {_MAX_OFF:g} m in {_MAX_OFF_SHARE:.0%}"
+        )
+        remedy = "check that map and recording have one origin, or leave the scenario out"
+        yield bool(beside.mean() > _MAX_OFF_SHARE), ("off the map", what, remedy)
+
+
+def _check_route(scene: Scenario) -> Iterator[_Finding]:
+    road = scene.map
+    blocks = [road.blocks.index.get(name, -1) for name in scene.route]
+    for place, (one, other) in enumerate(pairwise(blocks)):
+        if min(one, other) >= 0 and other not in road.block_outgoing.at(one):
+            what = (
+                f"roadblock {place + 2} of {len(blocks)} of the route,"
+                f" {scene.route[place + 1]!r}, does not follow {scene.route[place]!r}"
+            )
+            yield "route", what, _CORRECT_ROUTE
+            return
+
+
+def _seconds(scene: Scenario) -> FloatArray:
+    """(T,) time of the iterations since the first [s]."""
+    seconds: FloatArray = (scene.iteration_times - scene.iteration_times[0]) / 1e6
+    return seconds
+
+
+def _check_scenario(scene: Scenario) -> Iterator[_Finding]:
     for what in _wrong_numbers(scene):
-        yield what, CHECK
-    duration = _duration(scene)
+        yield "range", what, CHECK
+    duration = _seconds(scene)[-1]
     if duration < _LEAST_S and scene.mapping[0] < _LEAST_S:  # else the log ended before
         yield (
+            "range",
             f"it is {duration:.1f} s long, need at least {_LEAST_S:g} s: a time to collision of 3 s"
             " cannot be looked for in less",
             "cut longer windows, or leave the scenario out",
         )
-
-
-def _duration(scene: Scenario) -> float:
-    times = scene.iteration_times
-    return float(times[-1] - times[0]) / 1e6
 
 
 def _wrong_numbers(scene: Scenario) -> Iterator[str]:
@@ -292,21 +419,19 @@ def _wrong_numbers(scene: Scenario) -> Iterator[str]:
     yield from (what for what, is_wrong in wrong.items() if is_wrong)
 
 
-def _unusual(scene: Scenario) -> Iterator[tuple[str, str, str]]:
-    """Kind, what is unusual, and what to do."""
+def _unusual(scene: Scenario) -> Iterator[_Finding]:
     unknown = [block for block in scene.route if block not in scene.map.blocks.index]
-    correct = "correct the route in shiftsim inspect"
     if unknown:
         what = f"the route names {len(unknown)} unknown roadblocks, the first is {unknown[0]!r}"
-        yield "route", what, correct
+        yield "route", what, _CORRECT_ROUTE
     if not scene.route:
-        yield "route", "there is no route, so progress cannot be measured", correct
+        yield "route", "there is no route, so progress cannot be measured", _CORRECT_ROUTE
     gap = np.diff(scene.time_us).max(initial=0)
     if gap > _MAX_STEP_US:
         what = f"the recording has a gap of {gap / 1e6:.2f} s, at most {_MAX_STEP_US / 1e6:g} s"
         yield "gap", what, "leave the scenario out"
     if scene.is_short:
-        lasts = _duration(scene)
+        lasts = _seconds(scene)[-1]
         history = float(scene.iteration_times[0] - scene.time_us[0]) / 1e6
         if scene.mapping[0] - lasts > _LAST_STEPS_S:
             what = f"the log ended before the scenario did, after {lasts:.1f} s"

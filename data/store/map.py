@@ -5,7 +5,6 @@ machine share them. Kernels follow the indices of a map without looking: they ar
 """
 
 import os
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -56,13 +55,24 @@ _PARTS = {  # columns of arrays of several axes, and of floats
 }
 
 
+_KINDS: dict[str, Any] = {  # what has several arrays each
+    **dict.fromkeys(LAYERS, Polygons),
+    **dict.fromkeys(_LINES, Polylines),
+    **dict.fromkeys(_LISTS, Lists),
+}
+
+
+def _parts(name: str) -> list[str]:
+    """Columns of the arrays of a field."""
+    return [f"{name}_{part}{_UNITS.get(part, '')}" for part in _KINDS[name]._fields]
+
+
 def _columns() -> dict[str, pa.DataType]:
     """Type of the items of every list column."""
     out: dict[str, pa.DataType] = {}
-    kinds: dict[str, Any] = dict.fromkeys(LAYERS, Polygons) | dict.fromkeys(_LINES, Polylines)
-    for name, kind in (kinds | dict.fromkeys(_LISTS, Lists)).items():
-        for part in kind._fields:
-            out[f"{name}_{part}{_UNITS.get(part, '')}"] = _PARTS.get(part, _I64)
+    for name, kind in _KINDS.items():
+        types = [_PARTS.get(part, _I64) for part in kind._fields]
+        out |= zip(_parts(name), types, strict=True)
     out |= {f"{name}{_UNITS.get(name, '')}": kind for name, (_, kind, _) in _ARRAYS.items()}
     out |= dict.fromkeys([f"{name}_ids" for name in LAYERS], _TEXT)
     out |= {"left_boundary_ids": _TEXT, "right_boundary_ids": _TEXT}
@@ -86,16 +96,13 @@ def write_map(path: Path, road: VectorMap) -> None:
     """
     require_sound(road, str(path))
     values: dict[str, Any] = {name: getattr(road, name) for name in ("name", *_NUMBERS)}
-    for item in fields(road):
-        value = getattr(road, item.name)
+    values |= {f"{name}{_UNITS.get(name, '')}": getattr(road, name) for name in _ARRAYS}
+    for name in _KINDS:
+        value = getattr(road, name)
         if isinstance(value, Layer):
-            values[f"{item.name}_ids"] = list(value.ids)
+            values[f"{name}_ids"] = list(value.ids)
             value = value.polygons
-        if isinstance(value, np.ndarray):
-            values[f"{item.name}{_UNITS.get(item.name, '')}"] = value
-        elif isinstance(value, Polygons | Polylines | Lists):
-            for part, array in value._asdict().items():
-                values[f"{item.name}_{part}{_UNITS.get(part, '')}"] = array
+        values |= zip(_parts(name), value, strict=True)
     values["left_boundary_ids"] = [left for left, _ in road.boundary_ids]
     values["right_boundary_ids"] = [right for _, right in road.boundary_ids]
     values["flaws"], values["flaw_counts"] = list(road.flaws), list(road.flaws.values())
@@ -165,12 +172,10 @@ def _value(array: pa.Array) -> Any:
 
 def _assemble(values: dict[str, Any]) -> VectorMap:
     parts: dict[str, Any] = {name: values[name] for name in ("name", *_NUMBERS)}
-    kinds: dict[str, Any] = dict.fromkeys(LAYERS, Polygons) | dict.fromkeys(_LINES, Polylines)
-    for name, kind in (kinds | dict.fromkeys(_LISTS, Lists)).items():
-        columns = [f"{name}_{part}{_UNITS.get(part, '')}" for part in kind._fields]
-        parts[name] = kind(*(values[column] for column in columns))
-    for name in LAYERS:
-        parts[name] = Layer(values[f"{name}_ids"], parts[name])
+    for name, kind in _KINDS.items():
+        parts[name] = kind(*(values[column] for column in _parts(name)))
+        if name in LAYERS:
+            parts[name] = Layer(values[f"{name}_ids"], parts[name])
     parts |= {name: values[f"{name}{_UNITS.get(name, '')}"] for name in _ARRAYS}
     pairs = zip(values["left_boundary_ids"], values["right_boundary_ids"], strict=True)
     flaws = dict(zip(values["flaws"], values["flaw_counts"].tolist(), strict=True))
@@ -233,8 +238,8 @@ def _require_polygons(flat: Polygons, where: str) -> None:
 
 def _require_parts(ptr: IntArray, total: int, count: int, where: str, least: int = 0) -> None:
     """Whether `ptr` cuts `total` items into `count` parts of at least so many."""
-    whole = len(ptr) == count + 1 and ptr[0] == 0 and ptr[-1] == total
-    _require(whole and (np.diff(ptr) >= least).all(), where)
+    has_all = len(ptr) == count + 1 and ptr[0] == 0 and ptr[-1] == total
+    _require(has_all and (np.diff(ptr) >= least).all(), where)
 
 
 def _require_index(items: IntArray, lowest: int, count: int, where: str) -> None:

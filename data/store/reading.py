@@ -207,10 +207,10 @@ class ScenarioStore:
         return self._egos[key]
 
 
-def _limit(kept: dict[Any, Any]) -> None:
+def _limit(opened: dict[Any, Any]) -> None:
     """Forget the oldest of too many open files."""
-    if len(kept) >= _OPEN_FILES:
-        kept.pop(next(iter(kept)))
+    if len(opened) >= _OPEN_FILES:
+        opened.pop(next(iter(opened)))
 
 
 def open_store(path: str | Path) -> ScenarioStore:

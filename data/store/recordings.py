@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TypeAlias
 
@@ -22,7 +23,7 @@ from shiftsim.data.store.tables import (
     write_blocks,
 )
 from shiftsim.errors import DataError
-from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.world.state import NUM_STATE, LightStatus, Tracks, TrafficLights
 
 # which of some tracks are wanted, in order, from when they are there, their kinds and tokens
@@ -202,16 +203,20 @@ class StoredRecording:
         track, each = _columns(found, "track")
         tokens: list[str] = found["token"].take(each).to_pylist()
         kinds = column(found, "kind")[each].astype(np.int64)
+        inside = (row >= 0) & (row < last - first)  # row groups hold more than the window
         valid = np.zeros((last - first, len(each)), np.bool_)
-        _mark(row, track, valid)
+        valid[row[inside], track[inside]] = True
         order = choose(valid, kinds, tokens)
         place = np.full(len(each), -1)
         place[order] = np.arange(len(order))
         if len(order) < len(each) or (order != np.arange(len(each))).any():
+            inside &= place[track] >= 0
             valid, kinds, tokens = valid.take(order, 1), kinds[order], [tokens[i] for i in order]
+        boxes = row[inside] * len(order) + place[track[inside]]
         poses, velocities, sizes = (np.full((*valid.shape, n), np.nan) for n in (3, 2, 2))
-        numbers = tuple([column(found, name) for name in schema.BOX])
-        _scatter(numbers, row, track, place, poses, velocities, sizes)
+        axes = [(x.reshape(-1, x.shape[2]).T) for x in (poses, velocities, sizes)]
+        for name, values in zip(schema.BOX, chain(*axes), strict=True):
+            values[boxes] = column(found, name)[inside]
         return Tracks(valid, poses, velocities, sizes, kinds, tuple(tokens))
 
 
@@ -233,37 +238,6 @@ def _columns(found: pa.Table, name: str) -> tuple[IntArray, pa.Array]:
     _, each, place = np.unique(numbers[starts], return_index=True, return_inverse=True)
     lengths = np.diff(starts, append=len(numbers))
     return np.repeat(place, lengths), starts[each]
-
-
-@kernel
-def _mark(row: IntArray, track: IntArray, valid: BoolArray) -> None:
-    """Mark in `valid` (R, N) which tracks have a box in which row; other rows are left out."""
-    for box in range(len(row)):
-        if 0 <= row[box] < len(valid):
-            valid[row[box], track[box]] = True
-
-
-@kernel
-def _scatter(
-    numbers: tuple[FloatArray, ...],
-    row: IntArray,
-    track: IntArray,
-    place: IntArray,
-    poses: FloatArray,
-    velocities: FloatArray,
-    sizes: FloatArray,
-) -> None:
-    """Spread `schema.BOX` of rows of a table over dense arrays (R, N, ...).
-
-    `place` is the column of each track, -1 where it is left out; so are other rows.
-    """
-    x, y, heading, vx, vy, length, width = numbers
-    for box in range(len(row)):
-        t, n = row[box], place[track[box]]
-        if n >= 0 and 0 <= t < len(poses):
-            poses[t, n, 0], poses[t, n, 1], poses[t, n, 2] = x[box], y[box], heading[box]
-            velocities[t, n, 0], velocities[t, n, 1] = vx[box], vy[box]
-            sizes[t, n, 0], sizes[t, n, 1] = length[box], width[box]
 
 
 def _rows(table: Table, first: int, last: int, plausible: bool) -> pa.Table:

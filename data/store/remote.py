@@ -41,8 +41,8 @@ class RemoteFiles:
             self.path = self._identify(user_cache("stores"))
         except OSError as error:
             _LOG.warning("copies of %s are not kept: %s", self.url, error)
-            self._own = tempfile.TemporaryDirectory()  # goes away with this object
-            self.path = self._identify(Path(self._own.name))
+            self._temporary = tempfile.TemporaryDirectory()  # goes away with this object
+            self.path = self._identify(Path(self._temporary.name))
         self.need(SCENARIOS)
         for name in self._overlays():
             self._fetch(name, safe_join(self.path, name))
@@ -89,8 +89,8 @@ class RemoteFiles:
         target.parent.mkdir(parents=True, exist_ok=True)
         try:
             # workers may fetch one file at the same time: each into a folder of its own
-            with tempfile.TemporaryDirectory(dir=target.parent, prefix=".") as draft:
-                partial = Path(draft) / target.name
+            with tempfile.TemporaryDirectory(dir=target.parent, prefix=".") as folder:
+                partial = Path(folder) / target.name
                 with (
                     self._remote.open_input_stream(f"{self._root}/{name}") as source,
                     partial.open("wb") as copy,

@@ -59,8 +59,8 @@ class Reviews(Mapping[str, Review]):
     @property
     def hash(self) -> str:
         """Digest of everything that changes a run: decisions and routes; empty without reviews."""
-        said = [self[t] for t in self if self[t].decision or self[t].route is not None]
-        return _digest([[review.token, review.decision, review.route] for review in said])
+        decided = [self[t] for t in self if self[t].decision or self[t].route is not None]
+        return _digest([[review.token, review.decision, review.route] for review in decided])
 
     @property
     def route_hash(self) -> str:
@@ -71,12 +71,12 @@ class Reviews(Mapping[str, Review]):
 
     def usable(self, tokens: Iterable[str], accepted: Iterable[str]) -> tuple[str, ...]:
         """Those of all `tokens` to use: a decision goes before what the filter `accepted`."""
-        kept = set(accepted)
+        passed = set(accepted)
         decided = {token: self[token].decision for token in self}
         return tuple(
             token
             for token in tokens
-            if decided.get(token) == ACCEPT or (token in kept and decided.get(token) != REJECT)
+            if decided.get(token) == ACCEPT or (token in passed and decided.get(token) != REJECT)
         )
 
     def with_review(self, review: Review) -> "Reviews":

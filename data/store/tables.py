@@ -6,9 +6,7 @@ import os
 import re
 import sys
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from functools import cached_property
-from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -37,42 +35,6 @@ _REPEATING = (
     *("connector", "status", "token", "kind", "length_m", "width_m"),
 )
 _NAMED = ("token", "connector")  # columns that name what a row is about
-
-
-class _HiddenPandas:
-    """Has pyarrow look for pandas when somebody imports it, not at its first array.
-
-    That takes half a second of every command where pandas is installed, which shiftsim does not
-    use.
-    """
-
-    is_hidden = True  # while pyarrow looks for it
-
-    @classmethod
-    def find_spec(cls, name: str, path: Any = None, target: Any = None) -> Any:
-        """How pandas is imported, and pyarrow informed of it; None for any other module."""
-        if name != "pandas":
-            return None
-        if cls.is_hidden:
-            raise ModuleNotFoundError("No module named 'pandas'", name=name)
-        sys.meta_path.remove(cls)
-        spec = find_spec("pandas")
-        if spec is not None and spec.loader is not None:
-            execute = spec.loader.exec_module
-
-            def exec_module(module: Any) -> None:
-                execute(module)
-                with suppress(ImportError):  # too old for pyarrow
-                    _ = pa.lib._pandas_api.version  # looks again
-
-            spec.loader.exec_module = exec_module  # type: ignore[method-assign]
-        return spec
-
-
-if "pandas" not in sys.modules:
-    sys.meta_path.insert(0, _HiddenPandas)
-    pa.array([0])  # pyarrow looks, and finds none
-    _HiddenPandas.is_hidden = False
 
 
 def file_name(name: str) -> str:

@@ -23,7 +23,7 @@ from shiftsim.data.synthetic.streets import (
     with_crossings,
     with_obstacles,
 )
-from shiftsim.data.synthetic.town import Lights, Street, Town, build_town
+from shiftsim.data.synthetic.town import Leg, Lights, Street, Town, build_town
 
 _TRIES = 300
 # km/h, of main roads by lanes per direction
@@ -95,11 +95,11 @@ def _pair(rng: np.random.Generator, *, lanes: int) -> list[Street]:
             mid = replace(mid, junctions=(101, 102))
             out = [mid, *others]
         else:
-            x, y, heading = mid.road().at(np.array([mid.road().length]))[0].tolist()
+            x, y, heading = mid.road.at(np.array([mid.length]))[0].tolist()
             reach = reaches(arms, angles, rounding)[0]
             center = (float(x + reach * np.cos(heading)), float(y + reach * np.sin(heading)))
-            around = [angle + heading + np.pi for angle in angles]
-            out += fan(arms, around, rounding, center=center, junction=102)[1:]
+            turned = [angle + heading + np.pi for angle in angles]
+            out += fan(arms, turned, rounding, center=center, junction=102)[1:]
     return out
 
 
@@ -124,17 +124,17 @@ def _arms(
     out = []
     for place, number in enumerate(numbers):
         is_main = place in mains
-        own = lanes
+        num_lanes = lanes
         has_sign = False
         if not is_main:
-            own = 2 if lanes > 1 and lit and rng.random() < 0.4 else 1
+            num_lanes = 2 if lanes > 1 and lit and rng.random() < 0.4 else 1
             has_sign = not all_main and rng.random() < 0.7
         if like is not None and place in alike:
             street = random_street(rng, number, lanes=lanes, limit=like.limit, parking=0.0)
             street = replace(street, width=like.width, sidewalk=like.sidewalk)
             is_main, has_sign = True, False
         else:
-            street = random_street(rng, number, lanes=own, limit=limit if is_main else None)
+            street = random_street(rng, number, lanes=num_lanes, limit=limit if is_main else None)
             street = with_crossings(rng, street, crossings)
             if street.lanes == 1 and rng.random() < 0.4:
                 street = with_obstacles(rng, street)
@@ -196,8 +196,8 @@ def _street(rng: np.random.Generator) -> list[Street]:
         is_side = place == 1
         parking = 0.0 if is_side else round(float(rng.uniform(2.1, 2.4)), 2)
         length = float(rng.uniform(50.0, 80.0) if is_side else rng.uniform(120.0, 160.0))
-        own = 20.0 if is_side else limit
-        arm = random_street(rng, place + 1, limit=own, length=length, parking=parking)
+        kmh = 20.0 if is_side else limit
+        arm = random_street(rng, place + 1, limit=kmh, length=length, parking=parking)
         arm = replace(arm, width=width, is_main=not is_side, has_stop_sign=is_side)
         arm = with_crossings(rng, arm, 0.6)
         if not is_side and rng.random() < 0.5:
@@ -232,11 +232,13 @@ def _car_park(rng: np.random.Generator) -> list[Street]:
         stalls=((18.0, aisle - 6.0), (length - aisle + 6.0, length - 18.0)),
         empty=tuple(free.tolist()), crossings=((0.5 * aisle, 0.5 * aisle + 3.0),), is_marked=False,
     )  # fmt: skip
-    made = partial(random_street, rng, limit=limit, parking=0.0)
+    through_road = partial(random_street, rng, limit=limit, parking=0.0)
     begins = ((x + start, 0.0, east), (x - start, 0.0, west), (start - x, 0.0, east))
-    mid = replace(made(2, pieces=(Piece(2.0 * (apart - start)),)), junctions=(101, 102), stop=1.0)
-    one = replace(with_crossings(rng, made(1), 0.0), junctions=(101, 0))
-    two = replace(with_crossings(rng, made(3), 0.0), junctions=(102, 0))
+    mid = replace(
+        through_road(2, pieces=(Piece(2.0 * (apart - start)),)), junctions=(101, 102), stop=1.0
+    )
+    one = replace(with_crossings(rng, through_road(1), 0.0), junctions=(101, 0))
+    two = replace(with_crossings(rng, through_road(3), 0.0), junctions=(102, 0))
     mid, one, two = (
         replace(street, start=begin, width=width)
         for street, begin in zip((mid, one, two), begins, strict=True)
@@ -269,7 +271,8 @@ def _random_lights(town: Town, junction: int, rng: np.random.Generator) -> Light
     for (at, street, _, _), (number, _) in town.connectors.items():
         if at == junction:
             roads.setdefault(street, set()).add(number)
-    phases = _phases({name: _inward(town.streets[name], junction) for name in roads})
+    entering = [Leg(town.streets[x], town.streets[x].junctions[0] != junction) for x in roads]
+    phases = _phases({x.street.name: float(x.pose(1, at_end=True)[2]) for x in entering})
     crossings = {
         town.streets[name].crossing_name(number): place
         for place, phase in enumerate(phases)
@@ -296,14 +299,6 @@ def _phases(headings: dict[str, float]) -> list[list[str]]:
             phase.append(left.pop(int(np.argmin(turn))))
         phases.append(phase)
     return phases
-
-
-def _inward(street: Street, junction: int) -> float:
-    """Heading of a street where it enters a junction [rad]."""
-    if street.junctions[0] == junction:
-        return street.start[2] + float(np.pi)
-    road = street.road()
-    return float(road.at(np.array([road.length]))[0, 2])
 
 
 KINDS: dict[str, Callable[[np.random.Generator], list[Street]]] = {

@@ -68,12 +68,15 @@ def _driver(
         eager = float(rng.uniform(0.7, 0.92))
     elif rng.random() < _SLOW:
         eager = float(rng.uniform(0.35, 0.65))
-    made = Driver(category, path, s, 0.0, round(eager, 3), start)
+    driver = Driver(category, path, s, 0.0, round(eager, 3), start)
     if rng.random() < 0.16:
-        made.wave = (round(float(rng.uniform(0.15, 0.65)), 2), round(float(rng.uniform(6, 15)), 1))
+        driver.wave = (
+            round(float(rng.uniform(0.15, 0.65)), 2),
+            round(float(rng.uniform(6, 15)), 1),
+        )
     if rng.random() < _HALTS.get(category, _HALTS_ELSE) and not path.is_parking:
-        made.halt = _halt(path, made, rng)
-    return made
+        driver.halt = _halt(path, driver, rng)
+    return driver
 
 
 def _halt(path: Path, driver: Driver, rng: np.random.Generator) -> tuple[float, float]:
@@ -268,8 +271,8 @@ def _pairs(now: FloatArray, moving: int) -> list[tuple[int, int]]:
     gap = np.hypot(*np.moveaxis(now[:moving, None, 2:4] - now[None, :, 2:4], -1, 0))
     reach = 0.5 * np.hypot(now[:, 5], now[:, 6])
     i, j = np.nonzero(gap < reach[:moving, None] + reach + 2.0 * _MARGIN)
-    kept = (j > i) & ((now[i, 5] >= _ON_FOOT) | (now[j, 5] >= _ON_FOOT))
-    i, j = i[kept], j[kept]
+    counts = (j > i) & ((now[i, 5] >= _ON_FOOT) | (now[j, 5] >= _ON_FOOT))
+    i, j = i[counts], j[counts]
     sizes = now[:, 5:7] + np.where(now[:, 1:2] == _PARKED, 0.0, _MARGIN)
     shapes = shapely.polygons(boxes_to_corners(now[:, 2:5], sizes))
     meet = shapely.intersects(shapes[i], shapes[j])

@@ -103,7 +103,7 @@ def generate_town(spec: TownSpec, attempt: int = 0) -> tuple[Town, list[Traffic]
 def write_recordings(folder: Path, spec: TownSpec, town: Town, traffics: list[Traffic]) -> None:
     """Write a town and its traffic as one DSC3D folder, always the same bytes."""
     (folder / "map").mkdir(parents=True, exist_ok=True)
-    (folder / "map/map.xodr").write_text(town.network.xml(), encoding="utf-8")
+    (folder / "map/map.xodr").write_text(town.xml(), encoding="utf-8")
     categories: set[str] = set()
     for start, traffic in zip(spec.starts, traffics, strict=True):
         table = _annotations(traffic.record(DURATION), town.parked())
@@ -226,8 +226,7 @@ def _lit_connectors(
     """Connectors of the map that have a light, whose lights, and their phase."""
     ends = {
         number: np.concatenate([line[0], line[-1]])
-        for number, spec in town.network.roads.items()
-        if spec.junction >= 0
+        for number, spec in town.connecting.items()
         for line in [spec.center_of(-1, np.array([0.0, spec.length]))[:, :2] + offset]
     }
     numbers, places = list(ends), np.array(list(ends.values()))

@@ -4,8 +4,8 @@ A road is a start pose and a list of pieces (line, arc, clothoid, cubic); what t
 is sampled from the same pieces that go into the file.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,18 +22,6 @@ class Piece:
     start: float = 0.0  # curvature at the start [1/m]
     end: float = 0.0  # curvature at the end [1/m]
     cubic: tuple[float, ...] = ()  # (8,) aU bU cU dU aV bV cV dV over p in [0, 1], or empty
-
-    def xml(self) -> str:
-        """The shape element."""
-        if self.cubic:
-            names = ("aU", "bU", "cU", "dU", "aV", "bV", "cV", "dV")
-            values = " ".join(f'{n}="{v!r}"' for n, v in zip(names, self.cubic, strict=True))
-            return f'<paramPoly3 pRange="normalized" {values}/>'
-        if self.start == self.end == 0.0:
-            return "<line/>"
-        if self.start == self.end:
-            return f'<arc curvature="{self.start!r}"/>'
-        return f'<spiral curvStart="{self.start!r}" curvEnd="{self.end!r}"/>'
 
 
 @dataclass(frozen=True)
@@ -80,6 +68,12 @@ class RoadSpec:
         """Length of the reference line [m]."""
         return sum(piece.length for piece in self.pieces)
 
+    @property
+    def incoming(self) -> tuple[int, int | None]:
+        """Road before a connecting road, and its lane."""
+        assert self.predecessor is not None
+        return self.predecessor[1], self.lanes[0].predecessor
+
     def at(self, s: FloatArray, t: FloatArray | float = 0.0) -> FloatArray:
         """(n, 3) x [m], y [m], heading [rad] at road coordinates (s, t)."""
         out = np.empty((len(s), 3))
@@ -99,42 +93,13 @@ class RoadSpec:
         """(n, 3) centre of a lane at s; the heading is that of the road."""
         share = s / self.length
 
-        inner, own = np.zeros(len(s)), np.zeros(len(s))
+        inner, lane_width = np.zeros(len(s)), np.zeros(len(s))
         for spec in self.lanes:
             width = spec.width + share * (spec.end_width - spec.width)
             if spec.id * lane > 0 and abs(spec.id) < abs(lane):
                 inner = inner + width
-            own = width if spec.id == lane else own
-        return self.at(s, np.sign(lane) * (inner + 0.5 * own))
-
-
-@dataclass
-class RoadNetwork:
-    """All roads of a town, in the order of the file."""
-
-    name: str
-    roads: dict[int, RoadSpec] = field(default_factory=dict)
-    # connections of junctions: incoming road, connecting road, lane of the incoming road
-    links: list[tuple[int, int, int]] = field(default_factory=list)
-
-    def xml(self) -> str:
-        """The OpenDRIVE file."""
-        parts = [
-            '<?xml version="1.0" encoding="UTF-8"?>\n<OpenDRIVE>',
-            f'<header revMajor="1" revMinor="7" name="{self.name}" version="1"/>',
-            *(_road_xml(road) for road in self.roads.values()),
-        ]
-        for junction in sorted({self.roads[road].junction for _, road, _ in self.links}):
-            parts.append(f'<junction id="{junction}" name="{self.name}{junction}">')
-            inside = (link for link in self.links if self.roads[link[1]].junction == junction)
-            for number, (incoming, connecting, lane) in enumerate(inside):
-                parts.append(
-                    f'<connection id="{number}" incomingRoad="{incoming}" '
-                    f'connectingRoad="{connecting}" contactPoint="start">'
-                    f'<laneLink from="{lane}" to="-1"/></connection>'
-                )
-            parts.append("</junction>")
-        return "\n".join([*parts, "</OpenDRIVE>", ""])
+            lane_width = width if spec.id == lane else lane_width
+        return self.at(s, np.sign(lane) * (inner + 0.5 * lane_width))
 
 
 def connect(start: Sequence[float], end: Sequence[float], *, ease: bool) -> tuple[Piece, ...]:
@@ -215,80 +180,104 @@ def _along(piece: Piece, pose: Sequence[float], d: FloatArray) -> FloatArray:
     )
 
 
+def town_xml(name: str, roads: Sequence[RoadSpec]) -> str:
+    """The OpenDRIVE file of all roads of a town."""
+    header = {"revMajor": 1, "revMinor": 7, "name": name, "version": 1}
+    parts = ['<?xml version="1.0" encoding="UTF-8"?>\n<OpenDRIVE>', _xml("header", header)]
+    parts += map(_road_xml, roads)
+    for junction in sorted({road.junction for road in roads} - {-1}):
+        parts.append(f'<junction id="{junction}" name="{name}{junction}">')
+        inside = (road for road in roads if road.junction == junction)
+        for number, road in enumerate(inside):
+            incoming, lane = road.incoming
+            ends = {"incomingRoad": incoming, "connectingRoad": road.id, "contactPoint": "start"}
+            link = _xml("laneLink", {"from": lane, "to": -1})
+            parts.append(_xml("connection", {"id": number, **ends}, link))
+        parts.append("</junction>")
+    return "\n".join([*parts, "</OpenDRIVE>", ""])
+
+
+def _xml(tag: str, attributes: Mapping[str, object], *children: str) -> str:
+    """An element; numbers are written so that they are read back as they are."""
+    begin = "".join([f"<{tag}", *(f' {name}="{value}"' for name, value in attributes.items())])
+    return f"{begin}>{''.join(children)}</{tag}>" if children else f"{begin}/>"
+
+
 def _road_xml(road: RoadSpec) -> str:
     geometry = []
     begin, pose = 0.0, road.start
     for piece in road.pieces:
-        x, y, heading = pose
-        geometry.append(
-            f'<geometry s="{begin!r}" x="{x!r}" y="{y!r}" hdg="{heading!r}" '
-            f'length="{piece.length!r}">{piece.xml()}</geometry>'
-        )
+        place = dict(zip(("s", "x", "y", "hdg"), (begin, *pose), strict=True))
+        geometry.append(_xml("geometry", {**place, "length": piece.length}, _shape_xml(piece)))
         pose = tuple(_along(piece, pose, np.array([piece.length]))[0].tolist())
         begin += piece.length
-    ends = "".join(
-        f'<{name} elementType="{end[0]}" elementId="{end[1]}"'
-        + (f' contactPoint="{end[2]}"/>' if end[2] else "/>")
-        for name, end in (("predecessor", road.predecessor), ("successor", road.successor))
-        if end
+    ends = []
+    for name, end in (("predecessor", road.predecessor), ("successor", road.successor)):
+        if end:
+            contact = {"contactPoint": end[2]} if end[2] else {}
+            ends.append(_xml(name, {"elementType": end[0], "elementId": end[1], **contact}))
+    speed = _xml("speed", {"max": f"{road.limit_kmh:g}", "unit": "km/h"})
+    center = _xml("lane", {"id": 0, "type": "none", "level": "false"})
+    sides = {"left": "", "right": ""}
+    for lane in sorted(road.lanes, key=lambda lane: -lane.id):
+        sides["left" if lane.id > 0 else "right"] += _lane_xml(lane, road)
+    left, right = (_xml(side, {}, lanes) if lanes else "" for side, lanes in sides.items())
+    section = _xml("laneSection", {"s": 0}, left, _xml("center", {}, center), right)
+    objects, signals = map(_crosswalk_xml, road.crosswalks), _signals_xml(road)
+    return _xml(
+        "road",
+        {"id": road.id, "length": road.length, "junction": road.junction, "rule": "RHT"},
+        _xml("link", {}, "", *ends),
+        _xml("type", {"s": 0, "type": "town"}, speed),
+        _xml("planView", {}, *geometry),
+        _xml("lanes", {}, section),
+        _xml("objects", {}, *objects) if road.crosswalks else "",
+        _xml("signals", {}, *signals) if signals else "",
     )
-    lanes = sorted(road.lanes, key=lambda lane: -lane.id)
-    left = "".join(_lane_xml(lane, road) for lane in lanes if lane.id > 0)
-    right = "".join(_lane_xml(lane, road) for lane in lanes if lane.id < 0)
-    return (
-        f'<road id="{road.id}" length="{road.length!r}" junction="{road.junction}" rule="RHT">'
-        f"<link>{ends}</link>"
-        f'<type s="0" type="town"><speed max="{road.limit_kmh:g}" unit="km/h"/></type>'
-        f"<planView>{''.join(geometry)}</planView>"
-        f'<lanes><laneSection s="0">'
-        + (f"<left>{left}</left>" if left else "")
-        + '<center><lane id="0" type="none" level="false"/></center>'
-        + (f"<right>{right}</right>" if right else "")
-        + f"</laneSection></lanes>{_objects_xml(road)}{_signals_xml(road)}</road>"
-    )
+
+
+def _shape_xml(piece: Piece) -> str:
+    if piece.cubic:
+        names = ("aU", "bU", "cU", "dU", "aV", "bV", "cV", "dV")
+        values = dict(zip(names, piece.cubic, strict=True))
+        return _xml("paramPoly3", {"pRange": "normalized", **values})
+    if piece.start == piece.end:
+        return _xml("arc", {"curvature": piece.start}) if piece.start else _xml("line", {})
+    return _xml("spiral", {"curvStart": piece.start, "curvEnd": piece.end})
 
 
 def _lane_xml(lane: LaneSpec, road: RoadSpec) -> str:
-    links = "".join(
-        f'<{name} id="{target}"/>'
-        for name, target in (("predecessor", lane.predecessor), ("successor", lane.successor))
-        if target is not None
-    )
+    ends = {"predecessor": lane.predecessor, "successor": lane.successor}
+    links = [_xml(name, {"id": other}) for name, other in ends.items() if other is not None]
     slope = (lane.end_width - lane.width) / road.length
-    return (
-        f'<lane id="{lane.id}" type="{lane.type}" level="false"><link>{links}</link>'
-        f'<width sOffset="0" a="{lane.width!r}" b="{slope!r}" c="0" d="0"/></lane>'
+    return _xml(
+        "lane",
+        {"id": lane.id, "type": lane.type, "level": "false"},
+        _xml("link", {}, "", *links),
+        _xml("width", {"sOffset": 0, "a": lane.width, "b": slope, "c": 0, "d": 0}),
     )
 
 
-def _objects_xml(road: RoadSpec) -> str:
-    objects = []
-    for walk in road.crosswalks:
-        half = 0.5 * (walk.last - walk.first)
-        corners = "".join(
-            f'<cornerLocal u="{u * half!r}" v="{v * walk.half!r}" z="0" height="0"/>'
-            for u, v in ((-1, -1), (1, -1), (1, 1), (-1, 1))
-        )
-        objects.append(
-            f'<object id="{walk.name}" type="crosswalk" name="{walk.name}" '
-            f's="{0.5 * (walk.first + walk.last)!r}" t="0" zOffset="0" hdg="0" '
-            f'orientation="none" length="{2 * half!r}" width="{2 * walk.half!r}">'
-            f"<outline>{corners}</outline></object>"
-        )
-    return f"<objects>{''.join(objects)}</objects>" if objects else ""
+def _crosswalk_xml(walk: CrosswalkSpec) -> str:
+    half = 0.5 * (walk.last - walk.first)
+    corners = (
+        _xml("cornerLocal", {"u": u * half, "v": v * walk.half, "z": 0, "height": 0})
+        for u, v in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+    )
+    names = {"id": walk.name, "type": "crosswalk", "name": walk.name}
+    place = {"s": 0.5 * (walk.first + walk.last), "t": 0, "zOffset": 0, "hdg": 0}
+    size = {"orientation": "none", "length": 2 * half, "width": 2 * walk.half}
+    return _xml("object", {**names, **place, **size}, _xml("outline", {}, *corners))
 
 
-def _signals_xml(road: RoadSpec) -> str:
+def _signals_xml(road: RoadSpec) -> list[str]:
+    stop = {"dynamic": "no", "orientation": "-", "zOffset": 2, "country": "DE", "type": 206}
+    light = {"zOffset": 4, "country": "OpenDRIVE", "type": 1000001, "subtype": -1, "value": -1}
     signals = []
     if road.stop_sign is not None:
-        signals.append(
-            f'<signal id="{road.id}1" s="{road.stop_sign!r}" t="5" name="stop" dynamic="no" '
-            'orientation="-" zOffset="2" country="DE" type="206" subtype="-1" value="-1"/>'
-        )
+        place = {"id": f"{road.id}1", "s": road.stop_sign, "t": 5, "name": "stop"}
+        signals.append(_xml("signal", {**place, **stop, "subtype": -1, "value": -1}))
     for number, (s, orientation) in enumerate(road.lights, start=2):
-        signals.append(
-            f'<signal id="{road.id}{number}" s="{s!r}" t="5" name="light" dynamic="yes" '
-            f'orientation="{orientation}" zOffset="4" country="OpenDRIVE" type="1000001" '
-            'subtype="-1" value="-1"/>'
-        )
-    return f"<signals>{''.join(signals)}</signals>" if signals else ""
+        place = {"id": f"{road.id}{number}", "s": s, "t": 5, "name": "light", "dynamic": "yes"}
+        signals.append(_xml("signal", {**place, "orientation": orientation, **light}))
+    return signals

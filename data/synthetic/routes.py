@@ -14,8 +14,7 @@ from shiftsim.data.synthetic.agents import (
     path_along,
     shifted,
 )
-from shiftsim.data.synthetic.roads import RoadSpec
-from shiftsim.data.synthetic.town import Leg, Street, Town, turn_angle
+from shiftsim.data.synthetic.town import Leg, Street, Town
 from shiftsim.kernels import FloatArray
 
 _CHANGING = 70.0  # m, shortest street to change lanes on
@@ -69,7 +68,7 @@ class RandomRoutes:
         is_bicycle = category == "bicycle"
         while junction:
             ahead = self._ahead(junction, street, set(names))
-            is_long = town.network.roads[street.id].length >= _CHANGING
+            is_long = street.length >= _CHANGING
             if not is_long or is_bicycle:
                 ahead = {name: lanes for name, lanes in ahead.items() if lane in lanes}
             if not ahead:
@@ -114,14 +113,14 @@ class RandomRoutes:
 def make_path(town: Town, route: Route) -> Path:
     """The path of a route, with its zones and crossings."""
     parts, limits, zones, crossings = [], [], [], []
-    roads, lane = town.network.roads, route.lane
+    lane = route.lane
     first, second = (town.streets[name] for name in route.streets[:2])
     leg = Leg(first, first.junctions[1] in (set(second.junctions) - {0}))
     for number, name in enumerate(route.streets):
-        street, road = town.streets[name], roads[town.streets[name].id]
-        line, origin = leg.lane(road, lane), f"{name}{lane}"
+        street = town.streets[name]
+        line, origin = leg.centers(lane), f"{name}{lane}"
         if route.lane_changes[number]:
-            line = _change_lanes(line, leg.lane(road, route.lane_changes[number]))
+            line = _change_lanes(line, leg.centers(route.lane_changes[number]))
             lane = route.lane_changes[number]
         is_last = number == len(route.streets) - 1
         if is_last and route.bay is not None:
@@ -129,18 +128,18 @@ def make_path(town: Town, route: Route) -> Path:
         parts.append(line)
         limits.append(street.limit)
         crossings += [
-            (street.crossing_name(n), *_ends(road, leg, lane, ends))
+            (street.crossing_name(n), *leg.centers(lane, ends))
             for n, ends in enumerate(street.crossings)
         ]
         if street.narrow:
-            ends = _ends(road, leg, lane, street.narrow)
-            zones.append((_narrow_zone(leg), *ends, 2.0, street.swings[not leg.is_forward]))
+            begin, end = leg.centers(lane, street.narrow)
+            zones.append((_narrow_zone(leg), begin, end, 2.0, street.swings[not leg.is_forward]))
         if is_last:
             break
         onward = town.streets[route.streets[number + 1]]
         connector, to_lane = town.connectors[leg.enters, name, lane, onward.name]
-        target, inner = Leg(onward, leg.enters == onward.junctions[0]), roads[connector]
-        turn = turn_angle(town, leg, target)
+        target, inner = Leg(onward, leg.enters == onward.junctions[0]), town.connecting[connector]
+        turn = leg.turn_to(target)
         rank = (0 if street.is_main else 2) + (turn > 0.5 and not street.is_one_way)
         points = inner.center_of(-1, np.arange(0.0, inner.length, STEP))[:, :2]
         parts.append(points)
@@ -167,7 +166,7 @@ def _with_places(
     """A path with its zones and crossings, narrow places driven past with care."""
     arc = STEP * np.arange(len(path.points))
     aside, speed = np.zeros(len(arc)), path.speed
-    places, made = [], []
+    places, placed_zones = [], []
     for name, *ends in crossings:
         first, last = sorted(arc_at(path.points, end) for end in ends)
         places.append((name, first, last))
@@ -175,7 +174,8 @@ def _with_places(
         entry, leave = arc_at(path.points, begin), arc_at(path.points, end)
         between = [x for x in places if entry - stop - 0.5 < x[1] and x[2] < entry]
         crosswalk = between[-1][0] if between else ""
-        made.append(replace(zone, entry=entry, exit=leave, stop=entry - stop, crosswalk=crosswalk))
+        zone = replace(zone, entry=entry, exit=leave, stop=entry - stop, crosswalk=crosswalk)
+        placed_zones.append(zone)
         if swing or zone.id < 0:
             outside = np.maximum(np.maximum(entry - arc, arc - leave), 0.0) / _NARROW_RAMP
             share = np.clip(1.0 - outside, 0.0, 1.0)
@@ -183,7 +183,7 @@ def _with_places(
         if zone.id < 0:
             speed = np.where(share > 0.5, np.minimum(speed, _NARROW_SPEED), speed)
     path = shifted(replace(path, speed=brake_in_time(speed)), aside)
-    order = tuple(sorted(made, key=lambda zone: zone.entry))
+    order = tuple(sorted(placed_zones, key=lambda zone: zone.entry))
     return replace(path, zones=order, crossings=tuple(places), is_parking=is_parking)
 
 
@@ -193,14 +193,6 @@ def _narrow_zone(leg: Leg) -> Zone:
     ahead, back = leg.street.swings
     goes_first = leg.is_forward if ahead == back else (ahead < back) == leg.is_forward
     return Zone(number, 1 - goes_first, name)
-
-
-def _ends(
-    road: RoadSpec, leg: Leg, lane: int, ends: tuple[float, float]
-) -> tuple[FloatArray, FloatArray]:
-    """Centre of a lane at two places, in the direction of the leg."""
-    points = road.center_of(-lane if leg.is_forward else lane, np.array(ends))[:, :2]
-    return (points[0], points[1]) if leg.is_forward else (points[1], points[0])
 
 
 def _change_lanes(first: FloatArray, second: FloatArray) -> FloatArray:

@@ -2,7 +2,8 @@
 
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -44,9 +45,7 @@ def demo_store(path: Path) -> Path:
     """The store of the demo at `path`, which is returned; made anew unless it is there."""
     if (path / MANIFEST).is_file():
         return path
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as scratch:
-        parts, store = Path(scratch) / "parts", Path(scratch) / "store"
+    with _made_in_place(path) as (parts, store):
         for town in DEMO_TOWNS:
             make_town(parts, town)
         _join(parts, DEMO_TOWNS, store, {"name": "demo"})
@@ -55,8 +54,18 @@ def demo_store(path: Path) -> Path:
         listed = "".join(f'    "{token}",\n' for token in tokens)
         text = f'name = "{DEMO_SPLIT}"\ntokens = [\n{listed}]\n'
         (store / f"splits/{DEMO_SPLIT}.toml").write_text(text, encoding="utf-8")
-        store.rename(path)
     return path
+
+
+@contextmanager
+def _made_in_place(path: Path) -> Iterator[tuple[Path, Path]]:
+    """Folders for the parts of a store and for the store, which is at `path` in the end."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as scratch:
+        parts, store = Path(scratch).resolve() / "parts", Path(scratch) / "store"
+        parts.mkdir()
+        yield parts, store
+        store.rename(path)
 
 
 def write_demo(folder: Path, only: str = "") -> None:
@@ -104,18 +113,14 @@ def write_towns(
             f"{str(path)!r} holds something else", hint="name a new folder with --out"
         )
     specs = town_specs(towns, seed)
-    path.parent.mkdir(parents=True, exist_ok=True)
     progress(0, towns, "")
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as scratch:
-        parts, store = Path(scratch).resolve() / "parts", Path(scratch) / "store"
-        parts.mkdir()
+    with _made_in_place(path) as (parts, store):
         outcomes = spread(partial(partial, make_town, parts), specs)
         for done, outcome in enumerate(outcomes, start=1):
             if outcome.death:
                 raise DataError(f"town {outcome.task.name!r}: {outcome.death}", hint="start again")
             progress(done, towns, outcome.task.name)
         _join(parts, specs, store, provenance)
-        store.rename(path)
     return ScenarioStore(path)
 
 

@@ -172,9 +172,9 @@ def reaches(streets: Sequence[Street], angles: Sequence[float], rounding: float)
         if gap > np.pi - 0.25:
             continue  # they go on from one another
         a, b = streets[one].half, streets[other].half
-        around = rounding / np.tan(0.5 * gap)
-        out[one] = max(out[one], float((b + a * np.cos(gap)) / np.sin(gap) + around))
-        out[other] = max(out[other], float((a + b * np.cos(gap)) / np.sin(gap) + around))
+        kerb = rounding / np.tan(0.5 * gap)
+        out[one] = max(out[one], float((b + a * np.cos(gap)) / np.sin(gap) + kerb))
+        out[other] = max(out[other], float((a + b * np.cos(gap)) / np.sin(gap) + kerb))
     return out
 
 
@@ -182,8 +182,8 @@ def are_apart(streets: Sequence[Street]) -> bool:
     """Whether no two streets come too close away from the junctions that they share."""
     ways = {}
     for street in streets:
-        road = street.road()
-        ways[street.id] = road.at(np.append(np.arange(0.0, road.length, _STEP), road.length))[:, :2]
+        places = np.append(np.arange(0.0, street.length, _STEP), street.length)
+        ways[street.id] = street.road.at(places)[:, :2]
     return not any(
         _come_close(one, two, ways)
         for one in streets

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import permutations, product
 
 import numpy as np
@@ -11,9 +12,9 @@ from shiftsim.data.synthetic.roads import (
     CrosswalkSpec,
     LaneSpec,
     Piece,
-    RoadNetwork,
     RoadSpec,
     connect,
+    town_xml,
 )
 from shiftsim.kernels import FloatArray
 from shiftsim.world.state import LightStatus
@@ -70,6 +71,7 @@ class Street:
         """Name of one of its crossings."""
         return f"crosswalk_{self.id}_{number}"
 
+    @cached_property
     def road(self) -> RoadSpec:
         """The same as a road of the map."""
         strips = [("driving", self.width)] * self.lanes
@@ -147,19 +149,30 @@ class Leg:
         """Junction it leads to."""
         return self.street.junctions[self.is_forward]
 
-    def pose(self, road: RoadSpec, lane: int, *, at_end: bool) -> FloatArray:
+    def pose(self, lane: int, *, at_end: bool) -> FloatArray:
         """(3,) left border of a lane where the leg begins or ends."""
+        road = self.street.road
         s = np.array([road.length if at_end == self.is_forward else 0.0])
         sign = -1.0 if self.is_forward else 1.0
         pose: FloatArray = road.at(s, sign * (lane - 1) * self.street.width)[0]
         pose[2] += 0.0 if self.is_forward else np.pi
         return pose
 
-    def lane(self, road: RoadSpec, lane: int) -> FloatArray:
-        """(n, 2) centre of a lane, in its direction."""
-        s = np.arange(0.0, road.length, STEP)
-        center = road.center_of(-lane if self.is_forward else lane, s)[:, :2]
+    def lane_id(self, lane: int) -> int:
+        """Number of a lane in the map."""
+        return -lane if self.is_forward else lane
+
+    def centers(self, lane: int, s: FloatArray | Sequence[float] | None = None) -> FloatArray:
+        """(n, 2) centre of a lane in its direction: at some places along the street, or all."""
+        road = self.street.road
+        places = np.arange(0.0, road.length, STEP) if s is None else np.array(s)
+        center = road.center_of(self.lane_id(lane), places)[:, :2]
         return center if self.is_forward else center[::-1]
+
+    def turn_to(self, target: "Leg") -> float:
+        """Change of heading through the junction between them [rad]."""
+        turn = target.pose(1, at_end=False)[2] - self.pose(1, at_end=True)[2]
+        return float((turn + np.pi) % (2 * np.pi) - np.pi)
 
 
 @dataclass
@@ -168,7 +181,7 @@ class Town:
 
     name: str  # of the town
     streets: dict[str, Street] = field(default_factory=dict)  # by name
-    network: RoadNetwork = field(default_factory=lambda: RoadNetwork(""))  # all roads
+    connecting: dict[int, RoadSpec] = field(default_factory=dict)  # roads of junctions, by id
     # connecting road and lane behind it by junction, street, lane, next street
     connectors: dict[tuple[int, str, int, str], tuple[int, int]] = field(default_factory=dict)
     # connecting roads and narrow places that cannot be used at once
@@ -176,6 +189,11 @@ class Town:
     walks: list[Walk] = field(default_factory=list)
     bays: dict[str, FloatArray] = field(default_factory=dict)  # (n, 3) parking spaces by street
     lights: tuple[Lights, ...] = ()  # of its junctions
+
+    def xml(self) -> str:
+        """The OpenDRIVE file of its roads."""
+        streets = [street.road for street in self.streets.values()]
+        return town_xml(self.name, [*streets, *self.connecting.values()])
 
     def parked(self) -> FloatArray:
         """(n, 3) poses of parked cars."""
@@ -185,7 +203,7 @@ class Town:
         ]
         for street in self.streets.values():
             for s, t in street.obstacles:
-                pose = self.network.roads[street.id].at(np.array([s]), t)
+                pose = street.road.at(np.array([s]), t)
                 pose[:, 2] += np.pi * (t > 0.0)
                 poses.append(pose)
         return np.concatenate([np.zeros((0, 3)), *poses])
@@ -193,77 +211,63 @@ class Town:
 
 def build_town(name: str, streets: Sequence[Street]) -> Town:
     """A town from its streets; junctions connect all that meet there."""
-    town = Town(name, {street.name: street for street in streets}, RoadNetwork(name))
+    town = Town(name, {street.name: street for street in streets})
     legs = [Leg(street, True) for street in streets]
     legs += [Leg(street, False) for street in streets if not street.is_one_way]
-    for street in streets:
-        town.network.roads[street.id] = street.road()
-    lines: dict[int, FloatArray] = {}
     for source, target in product(legs, legs):
         meet = source.enters and source.enters == target.leaves
         if meet and source.street is not target.street:
-            _connect(town, source, target, lines)
-    roads = town.network.roads
-    starts = {number: (street, lane) for street, number, lane in town.network.links}
-    for a, b in permutations(lines, 2):
-        if roads[a].junction == roads[b].junction and starts[a] != starts[b]:
-            gaps = np.hypot(*np.moveaxis(lines[a][:, None] - lines[b], -1, 0))
+            _connect(town, source, target)
+    lines = {
+        number: road.center_of(-1, np.arange(0.0, road.length, STEP))[:, :2]
+        for number, road in town.connecting.items()
+    }
+    for a, b in permutations(town.connecting.values(), 2):
+        if a.junction == b.junction and a.incoming != b.incoming:
+            gaps = np.hypot(*np.moveaxis(lines[a.id][:, None] - lines[b.id], -1, 0))
             if gaps.min() < _CLOSE:
-                town.conflicts.add((a, b))
+                town.conflicts.add((a.id, b.id))
     for street in streets:
         if street.narrow:
             one, other = -2 * street.id, -2 * street.id - 1
             town.conflicts |= {(one, other), (other, one)}
-    for street in streets:
         if not street.is_one_way:
             _add_walks(town, street)
         if street.parking > 0.0:
-            town.bays[street.name] = _bays(town, street)
+            town.bays[street.name] = _bays(street)
     return town
 
 
-def _connect(town: Town, source: Leg, target: Leg, lines: dict[int, FloatArray]) -> None:
+def _connect(town: Town, source: Leg, target: Leg) -> None:
     """Connecting roads from one street to another, one per lane that leads there."""
-    turn, roads = turn_angle(town, source, target), town.network.roads
-    a, b = source.street, target.street
+    turn, a, b = source.turn_to(target), source.street, target.street
     if abs(turn) < 0.5:
         pairs = [(n, n) for n in range(1, min(a.lanes, b.lanes) + 1)]
     else:
         pairs = [(1, 1)] if turn > 0.0 else [(a.lanes, b.lanes)]
     for from_lane, to_lane in pairs:
         number = 1000 * (source.enters - 100) + 100 * from_lane + 10 * a.id + b.id
-        start = source.pose(roads[a.id], from_lane, at_end=True)
-        end = target.pose(roads[b.id], to_lane, at_end=False)
-        incoming = -from_lane if source.is_forward else from_lane
-        outgoing = -to_lane if target.is_forward else to_lane
-        road = RoadSpec(
+        start = source.pose(from_lane, at_end=True).tolist()
+        end = target.pose(to_lane, at_end=False).tolist()
+        lanes = source.lane_id(from_lane), target.lane_id(to_lane)
+        town.connecting[number] = RoadSpec(
             number,
-            (float(start[0]), float(start[1]), float(start[2])),
-            connect(start.tolist(), end.tolist(), ease=turn > 0.0 and not a.is_one_way),
-            (LaneSpec(-1, "driving", a.width, b.width, incoming, outgoing),),
+            (start[0], start[1], start[2]),
+            connect(start, end, ease=turn > 0.0 and not a.is_one_way),
+            (LaneSpec(-1, "driving", a.width, b.width, *lanes),),
             min(a.limit, b.limit),
             junction=source.enters,
             predecessor=("road", a.id, "end" if source.is_forward else "start"),
             successor=("road", b.id, "start" if target.is_forward else "end"),
         )
-        roads[number] = road
-        town.network.links.append((a.id, number, incoming))
         town.connectors[source.enters, a.name, from_lane, b.name] = (number, to_lane)
-        lines[number] = road.center_of(-1, np.arange(0.0, road.length, STEP))[:, :2]
-
-
-def turn_angle(town: Town, source: Leg, target: Leg) -> float:
-    """Change of heading through a junction [rad]."""
-    a = source.pose(town.network.roads[source.street.id], 1, at_end=True)
-    b = target.pose(town.network.roads[target.street.id], 1, at_end=False)
-    return float((b[2] - a[2] + np.pi) % (2 * np.pi) - np.pi)
 
 
 def _add_walks(town: Town, street: Street) -> None:
     """Add ways over the crossings of a street, and along its sidewalks."""
     for number in range(len(street.crossings)):
         _add_crossing(town, street, number)
-    road = town.network.roads[street.id]
+    road = street.road
     first = 0.5 * sum(street.crossings[0]) + 8.0 if street.crossings else 3.0
     s = np.arange(first, road.length - 3.0, STEP)
     left, right = (road.at(s, sign * (street.half + 2.5))[:, :2] for sign in (1.0, -1.0))
@@ -272,7 +276,7 @@ def _add_walks(town: Town, street: Street) -> None:
 
 def _add_crossing(town: Town, street: Street, number: int) -> None:
     """Four ways over a crossing: two to either side, which never meet."""
-    road = town.network.roads[street.id]
+    road = street.road
     half, middle = street.half, 0.5 * sum(street.crossings[number])
     far = min(middle + 30.0, road.length - 3.0)
     for sign, offsets in ((1.0, (-0.9, -0.2)), (-1.0, (0.5, 1.2))):
@@ -288,9 +292,9 @@ def _add_crossing(town: Town, street: Street, number: int) -> None:
             town.walks.append(Walk(points, street.crossing_name(number), kerb, across))
 
 
-def _bays(town: Town, street: Street) -> FloatArray:
+def _bays(street: Street) -> FloatArray:
     """(n, 3) poses of parking spaces, right ones first, away from crossings and junctions."""
-    road = town.network.roads[street.id]
+    road = street.road
     step, clear = (_BAY_STEP, 4.0) if street.parking > _DIAGONAL else (_PARKING_STEP, 9.0)
     stalls = street.stalls or ((14.0, road.length - 8.0),)
     places = np.concatenate([np.arange(*ends, step) for ends in stalls])

@@ -96,14 +96,14 @@ class Traffic:
     def _admit(self, drivers: list[Driver]) -> None:
         """Let drivers into zones, by priority, where nobody in there is in their way."""
         for driver in drivers:
-            for held in driver.path.zones if driver.admitted else ():
+            for admitted in driver.path.zones if driver.admitted else ():
                 must_stop = (  # a light has turned, and who was let in before can still stop
-                    held.id in self._closed
-                    and driver.is_before(held)
-                    and driver.needed(held.stop - _REACTION * driver.v) < _AT_YELLOW
+                    admitted.id in self._closed
+                    and driver.is_before(admitted)
+                    and driver.needed(admitted.stop - _REACTION * driver.v) < _AT_YELLOW
                 )
-                if driver.rear > held.exit or driver.waits(held) or must_stop:
-                    driver.admitted.discard(held.id)
+                if driver.rear > admitted.exit or driver.waits(admitted) or must_stop:
+                    driver.admitted.discard(admitted.id)
         asking = [(d, zone) for d in drivers if (zone := d.next_zone())]
         asking.sort(key=lambda x: (x[0].rank(x[1]), x[0].arrival(x[1]), x[0].track))
         refused: list[Zone] = []
@@ -305,9 +305,9 @@ def _leader(driver: Driver, drivers: list[Driver], bodies: FloatArray) -> tuple[
     nearest = square.argmin(axis=1)
     aside = np.sqrt(square[np.arange(len(square)), nearest]) - parts[:, 2]
     along = driver.s + nearest * 2 * STEP
-    own = 0.5 * driver.width + _SIDE_MARGIN
+    half_way = 0.5 * driver.width + _SIDE_MARGIN
     best, speed = inf, 0.0
-    for part in np.flatnonzero((aside < own) & (nearest > 0)).tolist():
+    for part in np.flatnonzero((aside < half_way) & (nearest > 0)).tolist():
         other = drivers[near[part // 3]]
         turn = other.pose[2] - driver.path.at(float(along[part]))[2]
         gap = float(along[part]) - 0.3 - driver.front

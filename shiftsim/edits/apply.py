@@ -3,35 +3,38 @@
 Order: window, remove, move, slow, stop, reroute, density, spawn, block_lane, walk, light, speed.
 """
 
-import random
 from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
-from shiftsim.edits.builder import ScenarioBuilder, begin
+from shiftsim.edits.builder import ScenarioBuilder
 from shiftsim.edits.density import fill_lanes
-from shiftsim.edits.interplan.build import assemble, build
+from shiftsim.edits.interplan.build import InterplanEditor
 from shiftsim.edits.interplan.path import DrivenLanes
-from shiftsim.edits.places import EgoPath, ego_path, require_on_map
+from shiftsim.edits.places import require_on_map
 from shiftsim.edits.route import reroute
 from shiftsim.edits.spec import (
     KIND_CODES,
     LIGHT_CODES,
     MANNERS,
     At,
+    Block,
     Edit,
     Light,
+    Place,
+    Remove,
     Slow,
     Spawn,
+    Stop,
+    Walk,
     digest_of,
-    edited_id,
 )
 from shiftsim.errors import ConfigError, ShiftsimError
 from shiftsim.kernels import FloatArray, IntArray
-from shiftsim.world.events import CAUTIOUS, FOLLOW, OFF, STOPPED, RolloutEvents, ScriptedPedestrian
+from shiftsim.world.events import CAUTIOUS, FOLLOW, OFF, STOPPED, ScriptedPedestrian
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import VX, AgentKind, LightStatus, TrafficLights
+from shiftsim.world.state import AgentKind, LightStatus, TrafficLights
 
 SIZES = {  # length, width [m]
     "vehicle": (4.6, 1.9),
@@ -55,209 +58,163 @@ def apply_edit(scenario: Scenario, edit: Edit, driven_lanes: DrivenLanes | None 
     """
     try:
         if not edit.code:
-            return _Editor(scenario, edit).result()
+            return _apply_tables(scenario, edit)
         if driven_lanes is None:
             raise ConfigError(
                 f"the code {edit.code!r} is applied in runs only",
                 hint='write it into a file with profile = "interplan", and run that',
             )
-        return assemble(scenario, build(scenario, edit.code, edit.details, driven_lanes), edit)
+        return InterplanEditor(scenario, edit, driven_lanes).result()
     except ShiftsimError as error:
         text = f"edit {edit.name!r} of scenario {scenario.token!r}: {error.message}"
         raise ConfigError(text, error.hint) from error
 
 
-def seed_of(edit: Edit, token: str) -> int:
-    """Seed of what an edit draws: its own, or made from the id."""
-    if edit.seed is not None:
-        return edit.seed
-    return int(digest_of([token, edit.name])[:12], 16)
+def _apply_tables(scenario: Scenario, edit: Edit) -> Scenario:
+    seed = edit.seed  # of what is drawn
+    if seed is None:
+        seed = int(digest_of([scenario.token, edit.name])[:12], 16)
+    builder, speed = ScenarioBuilder(scenario, edit, seed), edit.speed
+    if edit.window_s is not None:
+        _set_window(builder, edit.window_s)
+    for remove in edit.remove:
+        _remove(builder, remove)
+    _change_motion(builder)
+    if edit.reroute:
+        reroute(builder, edit.reroute, ends=edit.ends_at_goal)
+    if speed and speed.ego_mps is not None:
+        builder.set_ego_speed(speed.ego_mps)
+    if edit.density:
+        fill_lanes(builder, edit.density)
+    for spawn in edit.spawn:
+        _spawn(builder, spawn)
+    for block in edit.block_lane:
+        _block_lane(builder, block)
+    walkers = dict(filter(None, [_add_walker(builder, walk) for walk in edit.walk]))
+    for light in edit.light:
+        _set_lights(builder, light)
+    if speed and speed.limit != 1.0:
+        road = builder.scenario.map
+        builder.change(map=replace(road, speed_limits=road.speed_limits * speed.limit))
+    tokens = builder.tracks.tokens
+    return builder.finish(
+        edit.type or scenario.scenario_type,
+        MANNERS.index(edit.agents) if edit.agents else OFF,
+        pedestrians=tuple(replace(x, track=tokens.index(name)) for name, x in walkers.items()),
+        seed=seed,
+    )
 
 
-class _Editor:
-    def __init__(self, scenario: Scenario, edit: Edit) -> None:
-        self.edit, self.base = edit, scenario
-        self.builder = begin(scenario)
-        self.seed = seed_of(edit, scenario.token)
-        self.random = random.Random(self.seed)
-        self.count: dict[str, int] = {}
-        self._path: EgoPath | None = None
+def _pose_of(builder: ScenarioBuilder, place: Place | Spawn | Block, what: str) -> FloatArray:
+    """(3,) pose of a place."""
+    pose = builder.path.pose(place.at) if place.at else np.array(place.pose, np.float64)
+    require_on_map(builder.recorded.map, pose, what)
+    return pose
 
-    @property
-    def path(self) -> EgoPath:
-        """The recorded path, which places are counted along; that of the recording, always."""
-        if self._path is None:
-            self._path = ego_path(self.base)
-        return self._path
 
-    def result(self) -> Scenario:
-        edit, builder = self.edit, self.builder
-        if edit.window_s is not None:
-            _set_window(builder, edit.window_s)
-        self._remove()
-        self._change_motion()
-        if edit.reroute:
-            reroute(builder, edit.reroute, ends=edit.ends_at_goal)
-        if edit.speed and edit.speed.ego_mps is not None:
-            ego = np.array(builder.scenario.ego)
-            ego[builder.now, VX] = edit.speed.ego_mps
-            builder.change(ego=ego)
-        if edit.density:
-            fill_lanes(builder, edit.density, self.random, self.name)
-        for spawn in edit.spawn:
-            self._spawn(spawn)
-        self._block_lanes()
-        self._walk()
-        for light in edit.light:
-            _set_lights(builder, light)
-        if edit.speed and edit.speed.limit != 1.0:
-            road = builder.scenario.map
-            builder.change(map=replace(road, speed_limits=road.speed_limits * edit.speed.limit))
-        return self._finished()
+def _remove(builder: ScenarioBuilder, remove: Remove) -> None:
+    chosen = builder.which(remove.kinds, remove.tokens)
+    if remove.near:
+        x, y, radius = remove.near
+        poses = builder.tracks.poses[builder.now, chosen]
+        chosen = chosen[np.hypot(poses[:, 0] - x, poses[:, 1] - y) <= radius]
+    if remove.share < 1.0:
+        count = round(remove.share * len(chosen))
+        chosen = np.array(builder.draws.sample(chosen.tolist(), count), np.int64)
+    builder.select(np.delete(np.arange(builder.tracks.num_tracks), chosen))
 
-    def _finished(self) -> Scenario:
-        edit, builder = self.edit, self.builder
-        places = {token: i for i, token in enumerate(builder.tracks.tokens)}
-        pedestrians = tuple(
-            replace(pedestrian, track=places[token]) for token, pedestrian in builder.pedestrians
-        )
-        script = RolloutEvents(
-            base=self.base.token,
-            name=edit.name,
-            digest=edit.digest,
-            words=edit.words,
-            tokens=tuple(token for token in builder.touched if token in places),
-            behaviors=builder.behaviors,
-            yielding=MANNERS.index(edit.agents) if edit.agents else OFF,
-            pedestrians=pedestrians,
-            termination=builder.termination,
-            seed=self.seed,
-        )
-        return replace(
-            builder.scenario,
-            token=edited_id(self.base.token, edit),
-            scenario_type=edit.type or self.base.scenario_type,
-            tracks=builder.tracks,
-            script=script,
-        )
 
-    def name(self, what: str) -> str:
-        """A new token for a track."""
-        self.count[what] = number = self.count.get(what, -1) + 1
-        return f"{self.edit.name}.{what}{number}"
+def _change_motion(builder: ScenarioBuilder) -> None:
+    edit = builder.edit
+    if edit.move or edit.slow or edit.stop or edit.speed:
+        builder.tracks = builder.tracks.copy()
+    for move in edit.move:
+        for track in builder.which((), move.tokens).tolist():
+            _shift(builder, track, move.ahead_m, move.left_m)
+    slows = list(edit.slow)
+    if edit.speed and edit.speed.tracks != 1.0:
+        if edit.speed.tracks > 1.0:
+            raise ConfigError("speed: tracks is above 1", "a recording cannot be sped up")
+        slows.append(Slow(edit.speed.tracks, kinds=("vehicle",)))
+    seconds = builder.seconds
+    for slow in slows:
+        late = np.maximum(seconds - slow.from_s, 0.0)
+        recorded = np.minimum(seconds, slow.from_s) + slow.factor * late
+        for track in builder.which(slow.kinds, slow.tokens).tolist():
+            _warp(builder, track, recorded)
+    for stop in edit.stop:
+        for track in builder.which((), stop.tokens).tolist():
+            _stop(builder, track, stop)
 
-    def pose(self, place: object, what: str) -> FloatArray:
-        """(3,) pose of a place."""
-        at, pose = getattr(place, "at", None), getattr(place, "pose", None)
-        found = self.path.pose(at) if isinstance(at, At) else np.array(pose, np.float64)
-        require_on_map(self.base.map, found, what)
-        return found
 
-    def _remove(self) -> None:
-        builder = self.builder
-        for remove in self.edit.remove:
-            chosen = builder.which(remove.kinds, remove.tokens)
-            if remove.near:
-                x, y, radius = remove.near
-                poses = builder.tracks.poses[builder.now, chosen]
-                chosen = chosen[np.hypot(poses[:, 0] - x, poses[:, 1] - y) <= radius]
-            if remove.share < 1.0:
-                count = round(remove.share * len(chosen))
-                chosen = np.array(sorted(self.random.sample(chosen.tolist(), count)), np.int64)
-            stays = np.ones(builder.tracks.num_tracks, np.bool_)
-            stays[chosen] = False
-            builder.keep(stays)
+def _stop(builder: ScenarioBuilder, track: int, stop: Stop) -> None:
+    seconds = builder.seconds
+    row = min(int(np.searchsorted(seconds, stop.from_s)), len(seconds) - 1)
+    speed = float(np.hypot(*np.nan_to_num(builder.tracks.velocities[row, track])))
+    # the clock of the recording slows down evenly until it stands
+    needed = max(speed / max(stop.decel_mps2, 0.1), 1e-3)
+    late = np.clip(seconds - stop.from_s, 0.0, needed)
+    _warp(builder, track, np.minimum(seconds, stop.from_s) + late - 0.5 * late**2 / needed)
 
-    def _change_motion(self) -> None:
-        builder, edit = self.builder, self.edit
-        if edit.move or edit.slow or edit.stop or edit.speed:
-            builder.own()
-        for move in edit.move:
-            for track in builder.which((), move.tokens).tolist():
-                _shift(builder, track, move.ahead_m, move.left_m)
-        slows = list(edit.slow)
-        if edit.speed and edit.speed.tracks != 1.0:
-            if edit.speed.tracks > 1.0:
-                raise ConfigError("speed: tracks is above 1", "a recording cannot be sped up")
-            slows.append(Slow(edit.speed.tracks, kinds=("vehicle",)))
-        seconds = builder.seconds
-        for slow in slows:
-            late = np.maximum(seconds - slow.from_s, 0.0)
-            recorded = np.minimum(seconds, slow.from_s) + slow.factor * late
-            _warp(builder, builder.which(slow.kinds, slow.tokens), seconds, recorded)
-        for stop in edit.stop:
-            for track in builder.which((), stop.tokens):
-                row = min(int(np.searchsorted(seconds, stop.from_s)), len(seconds) - 1)
-                speed = float(np.hypot(*np.nan_to_num(builder.tracks.velocities[row, track])))
-                # the clock of the recording slows down evenly until it stands
-                needed = max(speed / max(stop.decel_mps2, 0.1), 1e-3)
-                late = np.clip(seconds - stop.from_s, 0.0, needed)
-                recorded = np.minimum(seconds, stop.from_s) + late - 0.5 * late**2 / needed
-                _warp(builder, np.array([track]), seconds, recorded)
 
-    def _spawn(self, spawn: Spawn) -> None:
-        builder, kind = self.builder, KIND_CODES[spawn.kind]
-        name = self.name(spawn.kind)
-        what = f"spawned {spawn.kind.replace('_', ' ')}"
-        pose, size = self.pose(spawn, what), np.array(spawn.size_m or SIZES[spawn.kind])
-        is_mover = kind == AgentKind.VEHICLE and spawn.behavior != "stopped"
-        if not is_mover:
-            builder.require_free(pose[None], size, what)
-            builder.add_standing([name], kind, size, pose[None])
-            return
+def _spawn(builder: ScenarioBuilder, spawn: Spawn) -> None:
+    kind, name = KIND_CODES[spawn.kind], builder.name(spawn.kind)
+    what = f"spawned {spawn.kind.replace('_', ' ')}"
+    pose, size = _pose_of(builder, spawn, what), np.array(spawn.size_m or SIZES[spawn.kind])
+    if kind == AgentKind.VEHICLE and spawn.behavior != "stopped":
         builder.add_vehicle(name, pose, size, spawn.speed_mps, _BEHAVIORS[spawn.behavior])
+        return
+    builder.require_free(pose[None], size, what)
+    builder.add([name], kind, size, pose[None], behaviors=STOPPED)
 
-    def _block_lanes(self) -> None:
-        for block in self.edit.block_lane:
-            pose, size = self.pose(block, "closed lane"), np.array(SIZES[block.kind])
-            spacing = max(block.spacing_m, 0.5)
-            count = int(block.length_m / spacing) + 1
-            left = [np.zeros(count)]
-            ahead = [spacing * np.arange(count)]
-            if block.taper_m > 0.0:  # a slanted row before, from the right border of the lane
-                slanted = int(np.ceil(max(block.taper_m, block.width_m) / spacing))
-                share = np.arange(slanted) / slanted
-                left.insert(0, -block.width_m * 0.5 * (1.0 - share))
-                ahead.insert(0, -block.taper_m * (1.0 - share))
-            places: list[FloatArray] = []
-            offsets = zip(
-                np.concatenate(ahead).tolist(), np.concatenate(left).tolist(), strict=True
-            )
-            for distance, aside in offsets:
-                if block.at:
-                    at = replace(
-                        block.at,
-                        ahead_m=block.at.ahead_m + distance,
-                        left_m=block.at.left_m + aside,
-                    )
-                    place = self.path.pose(at)
-                else:
-                    place = _ahead_of(pose, distance, aside)
-                places.append(place)
-            poses, what = np.array(places), block.kind.replace("_", " ")
-            self.builder.require_free(poses, size, f"{what} of a closed lane")
-            names = [self.name(block.kind) for _ in places]
-            self.builder.add_standing(names, KIND_CODES[block.kind], size, poses)
 
-    def _walk(self) -> None:
-        builder, size = self.builder, np.array(SIZES["pedestrian"])
-        for walk in self.edit.walk:
-            start, end = (self.pose(place, "pedestrian") for place in (walk.start, walk.end))
-            step = end[:2] - start[:2]
-            length = float(np.hypot(*step))
-            if length < 1e-3:
-                raise ConfigError("a pedestrian walks from a place to the same place")
-            start[2] = np.arctan2(step[1], step[0])
-            builder.require_free(start[None], size, "pedestrian")
-            name, speed = self.name("pedestrian"), max(walk.speed_mps, 1e-3)
-            pedestrian = ScriptedPedestrian(
-                -1, start, end[:2], size, speed, walk.ego_within_m, walk.visible
-            )
-            start_time = np.inf if walk.start_s is None else walk.start_s
-            poses, velocities, valid = pedestrian.walk(builder.seconds, start_time)
-            builder.add(name, AgentKind.PEDESTRIAN, size, poses, valid=valid, velocities=velocities)
-            if walk.start_s is None:
-                builder.pedestrians.append((name, pedestrian))
+def _block_lane(builder: ScenarioBuilder, block: Block) -> None:
+    pose, size = _pose_of(builder, block, "closed lane"), np.array(SIZES[block.kind])
+    spacing = max(block.spacing_m, 0.5)
+    ahead = spacing * np.arange(int(block.length_m / spacing) + 1)
+    left = np.zeros(len(ahead))
+    if block.taper_m > 0.0:  # a slanted row before, from the right border of the lane
+        slanted = int(np.ceil(max(block.taper_m, block.width_m) / spacing))
+        rest = 1.0 - np.arange(slanted) / slanted
+        left = np.concatenate([-block.width_m * 0.5 * rest, left])
+        ahead = np.concatenate([-block.taper_m * rest, ahead])
+    poses = np.array(
+        [
+            builder.path.pose(At(block.at.ahead_m + along, block.at.left_m + aside, block.at.turn))
+            if block.at
+            else _ahead_of(pose, along, aside)
+            for along, aside in zip(ahead.tolist(), left.tolist(), strict=True)
+        ]
+    )
+    builder.require_free(poses, size, f"{block.kind.replace('_', ' ')} of a closed lane")
+    names = [builder.name(block.kind) for _ in poses]
+    builder.add(names, KIND_CODES[block.kind], size, poses, behaviors=STOPPED)
+
+
+def _add_walker(builder: ScenarioBuilder, walk: Walk) -> tuple[str, ScriptedPedestrian] | None:
+    """Add a pedestrian; its token, and how it walks, where it waits for the ego."""
+    size = np.array(SIZES["pedestrian"])
+    start, end = (_pose_of(builder, place, "pedestrian") for place in (walk.start, walk.end))
+    step = end[:2] - start[:2]
+    if float(np.hypot(*step)) < 1e-3:
+        raise ConfigError("a pedestrian walks from a place to the same place")
+    start[2] = np.arctan2(step[1], step[0])
+    builder.require_free(start[None], size, "pedestrian")
+    name, speed = builder.name("pedestrian"), max(walk.speed_mps, 1e-3)
+    pedestrian = ScriptedPedestrian(
+        -1, start, end[:2], size, speed, walk.ego_within_m, walk.visible
+    )
+    start_time = np.inf if walk.start_s is None else walk.start_s
+    poses, velocities, valid = pedestrian.walk(builder.seconds, start_time)
+    builder.add(
+        [name],
+        AgentKind.PEDESTRIAN,
+        size,
+        poses[:, None],
+        valid=valid[:, None],
+        velocities=velocities[:, None],
+    )
+    return (name, pedestrian) if walk.start_s is None else None
 
 
 def _ahead_of(pose: FloatArray, ahead: float, left: float) -> FloatArray:
@@ -300,33 +257,28 @@ def _shift(builder: ScenarioBuilder, track: int, ahead: float, left: float) -> N
     builder.touched.append(tracks.tokens[track])
 
 
-def _warp(
-    builder: ScenarioBuilder, which: IntArray, seconds: FloatArray, recorded: FloatArray
-) -> None:
-    """Have tracks be at each time (R,) where they were at another one (R,), never a later one."""
-    tracks = builder.tracks
-    pace = np.gradient(recorded, seconds)
+def _warp(builder: ScenarioBuilder, track: int, recorded: FloatArray) -> None:
+    """Have a track be at each time where it was at another one (R,) [s], never a later one."""
+    tracks, seconds = builder.tracks, builder.seconds
+    valid, poses = tracks.valid[:, track].copy(), tracks.poses[:, track].copy()
+    if not valid.any():
+        return
     low = np.clip(np.searchsorted(seconds, recorded, side="right") - 1, 0, len(seconds) - 2)
     span = seconds[low + 1] - seconds[low]
     share = np.clip((recorded - seconds[low]) / np.where(span > 0.0, span, 1.0), 0.0, 1.0)
-    late = recorded < seconds - 1e-9
-    for track in which.tolist():
-        valid, poses = tracks.valid[:, track].copy(), tracks.poses[:, track].copy()
-        if not valid.any():
-            continue
-        poses[valid, 2] = np.unwrap(poses[valid, 2])
-        velocities, sizes = tracks.velocities[:, track].copy(), tracks.sizes[:, track].copy()
-        both = valid[low] & valid[low + 1]
-        part = np.where(both, share, 0.0)[:, None]
-        near = np.where(valid[low], low, low + 1)
-        to = np.where(both, low + 1, near)
-        moved = poses[near] + part * (poses[to] - poses[near])
-        moved[:, 2] = (moved[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
-        tracks.valid[late, track] = valid[near][late]
-        tracks.poses[late, track] = moved[late]
-        tracks.velocities[late, track] = (velocities[near] * pace[:, None])[late]
-        tracks.sizes[late, track] = sizes[near][late]
-        builder.touched.append(tracks.tokens[track])
+    poses[valid, 2] = np.unwrap(poses[valid, 2])
+    both = valid[low] & valid[low + 1]
+    near = np.where(valid[low], low, low + 1)
+    other = np.where(both, low + 1, near)
+    moved = poses[near] + np.where(both, share, 0.0)[:, None] * (poses[other] - poses[near])
+    moved[:, 2] = (moved[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
+    velocities = tracks.velocities[near, track] * np.gradient(recorded, seconds)[:, None]
+    sizes, late = tracks.sizes[near, track], recorded < seconds - 1e-9
+    tracks.valid[late, track] = valid[near][late]
+    tracks.poses[late, track] = moved[late]
+    tracks.velocities[late, track] = velocities[late]
+    tracks.sizes[late, track] = sizes[late]
+    builder.touched.append(tracks.tokens[track])
 
 
 def _set_lights(builder: ScenarioBuilder, light: Light) -> None:

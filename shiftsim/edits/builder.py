@@ -1,85 +1,88 @@
-"""The builder of edited scenarios: writable arrays, and what the edit has made so far."""
+"""The builder of edited scenarios: what an edit has made so far, and the scenario at its end.
 
+Both profiles build with it: the tables of an edit (`shiftsim.edits.apply`) and interPlan's codes
+(`shiftsim.edits.interplan.build`).
+"""
+
+import random
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
+from shiftsim.edits.places import EgoPath, ego_path
+from shiftsim.edits.spec import Edit, edited_id
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.polylines import arc_lengths
 from shiftsim.geometry.rings import convex_intersect
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
-from shiftsim.world.events import FOLLOW, STOPPED, ScriptedPedestrian, TerminationCondition
+from shiftsim.world.events import FOLLOW, RolloutEvents, TerminationCondition
 from shiftsim.world.lanes import find_start
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import (
-    LAST_AGENT_KIND,
-    PACIFICA,
-    AgentKind,
-    Tracks,
-    center_poses,
-)
+from shiftsim.world.state import LAST_AGENT_KIND, PACIFICA, VX, AgentKind, Tracks, center_poses
 
 EGO_SIZE = np.array([PACIFICA.length, PACIFICA.width])
 
 
-@dataclass
 class ScenarioBuilder:
-    """A scenario while it is edited."""
+    """A scenario while it is edited.
 
-    scenario: Scenario  # as recorded, but for what does not move
-    joined: Tracks
-    joined_behaviors: IntArray  # (N,) behaviours of these tracks, as in `RolloutEvents`
-    touched: list[str] = field(default_factory=list)  # tokens of tracks made or changed
-    # with the token of their track
-    pedestrians: list[tuple[str, ScriptedPedestrian]] = field(default_factory=list)
-    termination: TerminationCondition | None = None
-    waiting: list[tuple[Tracks, Sequence[int]]] = field(
-        default_factory=list
-    )  # new, with their behaviours
+    Attributes:
+        recorded: As it was recorded.
+        edit: What is asked for.
+        draws: Random numbers of everything that is drawn.
+        scenario: As edited so far, but for its tracks.
+        tracks: The tracks so far; in arrays that may be written once they are copied.
+        behaviors: (N,) their behaviours, as in `RolloutEvents`.
+        touched: Tokens of tracks that were made or changed.
+        termination: Where a rollout ends before its time.
+    """
 
-    @property
-    def tracks(self) -> Tracks:
-        """All tracks; in arrays that may be written after `own`."""
-        self._join()
-        return self.joined
+    def __init__(self, recorded: Scenario, edit: Edit, seed: int | str) -> None:
+        """`seed` is that of the draws."""
+        self.recorded = self.scenario = recorded
+        self.edit, self.draws = edit, random.Random(seed)
+        self.tracks = recorded.tracks
+        self.behaviors: IntArray = np.full(recorded.tracks.num_tracks, FOLLOW, np.int64)
+        self.touched: list[str] = []
+        self.termination: TerminationCondition | None = None
+        self.now = int(recorded.iteration_rows[0])  # row of the first iteration
+        self._count: dict[str, int] = {}
 
-    @property
-    def behaviors(self) -> IntArray:
-        """(N,) behaviours of the tracks, as in `RolloutEvents`."""
-        self._join()
-        return self.joined_behaviors
-
-    def _join(self) -> None:
-        """Put new tracks where they belong."""
-        if not self.waiting:
-            return
-        parts = [self.joined, *(tracks for tracks, _ in self.waiting)]
-        kinds = np.concatenate([part.kinds for part in parts])
-        # nuPlan rule 410: tracks are ordered by kind, within a kind as listed
-        order = np.argsort(kinds, kind="stable")
-        part_of = np.repeat(np.arange(len(parts)), [part.num_tracks for part in parts])[order]
-        ends = np.flatnonzero((np.diff(order) != 1) | (np.diff(part_of) != 0)) + 1
-        starts = np.cumsum([0, *(part.num_tracks for part in parts)])
-        runs = []  # what stays together is copied at once
-        for run, number in zip(np.split(order, ends), part_of[[0, *ends]].tolist(), strict=True):
-            first = int(run[0] - starts[number])
-            runs.append((parts[number], slice(first, first + len(run))))
-        valid, poses, velocities, sizes = (
-            np.concatenate([getattr(part, name)[:, where] for part, where in runs], axis=1)
-            for name in ("valid", "poses", "velocities", "sizes")
+    def finish(self, scenario_type: str, yielding: int, **events: Any) -> Scenario:
+        """The edited scenario; `events` are further fields of its `RolloutEvents`."""
+        edit, tokens = self.edit, set(self.tracks.tokens)
+        script = RolloutEvents(
+            base=self.recorded.token,
+            name=edit.name,
+            digest=edit.digest,
+            words=edit.words,
+            tokens=tuple(token for token in self.touched if token in tokens),
+            behaviors=self.behaviors,
+            yielding=yielding,
+            termination=self.termination,
+            **events,
         )
-        tokens = tuple(token for part, where in runs for token in part.tokens[where])
-        self.joined = Tracks(valid, poses, velocities, sizes, kinds[order], tokens)
-        behaviors = [self.joined_behaviors, *(np.array(new, np.int64) for _, new in self.waiting)]
-        self.joined_behaviors = np.concatenate(behaviors)[order]
-        self.waiting = []
+        return replace(
+            self.scenario,
+            token=edited_id(self.recorded.token, edit),
+            scenario_type=scenario_type,
+            tracks=self.tracks,
+            script=script,
+        )
 
     @property
-    def now(self) -> int:
-        """Row of the first iteration."""
-        return int(self.scenario.iteration_rows[0])
+    def center(self) -> FloatArray:
+        """(3,) centre of the ego at the first iteration."""
+        return center_poses(self.scenario.ego[None, self.now, :3])[0]
+
+    @cached_property
+    def path(self) -> EgoPath:
+        """The path that places are counted along; that of the recording, always."""
+        return ego_path(self.recorded)
 
     @property
     def seconds(self) -> FloatArray:
@@ -87,13 +90,20 @@ class ScenarioBuilder:
         times = self.scenario.time_us
         return (times - times[self.now]) * 1e-6
 
-    def own(self) -> None:
-        """Copy the arrays of the tracks, so that they may be written."""
-        self.joined = self.tracks.rows(np.arange(len(self.scenario.time_us)))
+    def name(self, what: str) -> str:
+        """A new token for a track."""
+        self._count[what] = number = self._count.get(what, -1) + 1
+        return f"{self.edit.name}.{what}{number}"
 
-    def change(self, **values: object) -> None:
+    def change(self, **values: Any) -> None:
         """Replace fields of the scenario."""
-        self.scenario = replace(self.scenario, **values)  # type: ignore[arg-type]
+        self.scenario = replace(self.scenario, **values)
+
+    def set_ego_speed(self, speed: float) -> None:
+        """Change the ego's speed at the first iteration [m/s]."""
+        ego = np.array(self.scenario.ego)
+        ego[self.now, VX] = speed
+        self.change(ego=ego)
 
     def which(self, kinds: Iterable[str], tokens: Iterable[str]) -> IntArray:
         """Indices of the tracks of these kinds and of these tokens; of all where empty.
@@ -115,65 +125,55 @@ class ScenarioBuilder:
             chosen &= np.isin(self.tracks.kinds, codes)
         return np.flatnonzero(chosen)
 
-    def keep(self, which: BoolArray) -> None:
-        """Keep some of the tracks (a mask) only."""
-        self.joined, self.joined_behaviors = self.tracks.select(which), self.behaviors[which]
+    def select(self, which: BoolArray | IntArray) -> None:
+        """Leave out all tracks but these, or put them into this order."""
+        self.tracks, self.behaviors = self.tracks.select(which), self.behaviors[which]
 
     def add(
-        self,
-        token: str,
-        kind: int,
-        size: FloatArray,
-        poses: FloatArray,
-        *,
-        valid: BoolArray | None = None,
-        velocities: FloatArray | None = None,
-        behavior: int = FOLLOW,
-    ) -> None:
-        """Add a track: poses (R, 3) of its centre, velocities (R, 2), standing where None."""
-        rows = len(self.scenario.time_us)
-        there = np.ones(rows, np.bool_) if valid is None else valid
-        moves = np.zeros((rows, 2)) if velocities is None else velocities
-        arrays = (poses[:, None], there[:, None], moves[:, None])
-        self.add_all([token], kind, size[None], *arrays, behaviors=[behavior])
-
-    def add_standing(
-        self, tokens: Sequence[str], kind: int, size: FloatArray, poses: FloatArray
-    ) -> None:
-        """Add N tracks of a size (2,) that stand at poses (N, 3) all the time."""
-        shape = (len(self.scenario.time_us), len(tokens))
-        there, places = np.ones(shape, np.bool_), np.broadcast_to(poses, (*shape, 3))
-        sizes, moves = np.broadcast_to(size, (len(tokens), 2)), np.zeros((*shape, 2))
-        behaviors = [STOPPED] * len(tokens)
-        self.add_all(tokens, kind, sizes, places, there, moves, behaviors=behaviors)
-
-    def add_all(
         self,
         tokens: Sequence[str],
         kind: int,
         sizes: FloatArray,
         poses: FloatArray,
-        valid: BoolArray,
-        velocities: FloatArray,
         *,
-        behaviors: Sequence[int],
+        valid: BoolArray | bool = True,
+        velocities: FloatArray | float = 0.0,
+        behaviors: IntArray | int = FOLLOW,
     ) -> None:
-        """Add N tracks: sizes (N, 2), poses (R, N, 3), valid (R, N), velocities (R, N, 2)."""
-        blank = np.where(valid, 0.0, np.nan)[..., None]
+        """Add N tracks of one kind.
+
+        Args:
+            tokens: Their tokens.
+            kind: Their AgentKind code.
+            sizes: (N, 2) length, width [m]; or (2,) of all.
+            poses: (R, N, 3) poses of their centres; or (N, 3) at all times.
+            valid: (R, N) when they are there.
+            velocities: (R, N, 2) in the map frame [m/s].
+            behaviors: Behaviour of each, or of all, as in `RolloutEvents`.
+        """
+        shape = (len(self.scenario.time_us), len(tokens))
+        blank = np.where(np.broadcast_to(valid, shape), 0.0, np.nan)[..., None]
         new = Tracks(
-            valid,
+            ~np.isnan(blank[..., 0]),
             poses + blank,
             (velocities if kind <= LAST_AGENT_KIND else np.nan) + np.repeat(blank, 2, axis=2),
             sizes + blank,
             np.full(len(tokens), kind, np.int64),
             tuple(tokens),
         )
-        self.waiting.append((new, behaviors))
+        parts = (self.tracks, new)
+        there, places, moves, boxes = (
+            np.concatenate([getattr(part, name) for part in parts], axis=1)
+            for name in ("valid", "poses", "velocities", "sizes")
+        )
+        kinds = np.concatenate([part.kinds for part in parts])
+        names = (*self.tracks.tokens, *tokens)
+        self.tracks = Tracks(there, places, moves, boxes, kinds, names)
+        self.behaviors = np.append(self.behaviors, np.broadcast_to(behaviors, len(tokens)))
+        # nuPlan rule 410: tracks are ordered by kind, within a kind as listed
+        if (np.diff(kinds) < 0).any():
+            self.select(np.argsort(kinds, kind="stable"))
         self.touched += tokens
-
-    def still(self, pose: FloatArray) -> FloatArray:
-        """(R, 3) a pose in all rows."""
-        return np.tile(pose, (len(self.scenario.time_us), 1))
 
     def require_free(self, poses: FloatArray, size: FloatArray, what: str) -> None:
         """Refuse boxes at poses (N, 3) that touch the ego or a track at the first iteration.
@@ -182,9 +182,8 @@ class ScenarioBuilder:
             ConfigError: One does.
         """
         now, tracks = self.now, self.tracks
-        ego = center_poses(self.scenario.ego[now : now + 1, :3])
         there = np.flatnonzero(tracks.valid[now])
-        others = np.concatenate([ego, tracks.poses[now, there]])
+        others = np.concatenate([self.center[None], tracks.poses[now, there]])
         sizes = np.concatenate([EGO_SIZE[None], tracks.sizes[now, there]])
         boxes = boxes_to_corners(poses, np.broadcast_to(size, (len(poses), 2)))
         reach = np.hypot(*size) + np.hypot(sizes[:, 0], sizes[:, 1])
@@ -232,13 +231,13 @@ class ScenarioBuilder:
         poses = poses_along(xy, arc, along + arc[-1] - road.baselines.length(start.edge))
         headings = poses[:, 2]
         self.add(
-            token,
+            [token],
             AgentKind.VEHICLE,
             size,
-            poses,
-            valid=seconds <= 0.0,
-            velocities=speed * np.stack([np.cos(headings), np.sin(headings)], -1),
-            behavior=behavior,
+            poses[:, None],
+            valid=seconds[:, None] <= 0.0,
+            velocities=speed * np.stack([np.cos(headings), np.sin(headings)], -1)[:, None],
+            behaviors=behavior,
         )
 
 
@@ -248,9 +247,3 @@ def poses_along(xy: FloatArray, arc: FloatArray, along: FloatArray) -> FloatArra
     segment = np.clip(np.searchsorted(arc, along, side="right") - 1, 0, len(steps) - 1)
     x, y = (np.interp(along, arc, xy[:, column]) for column in (0, 1))
     return np.column_stack([x, y, np.arctan2(steps[segment, 1], steps[segment, 0])])
-
-
-def begin(scenario: Scenario) -> ScenarioBuilder:
-    """A builder of a scenario in which nothing is changed yet."""
-    tracks = scenario.tracks
-    return ScenarioBuilder(scenario, tracks, np.full(tracks.num_tracks, FOLLOW, np.int64))

@@ -6,7 +6,9 @@ same vehicles; what it does with them is in `shiftsim.edits.interplan`.
 
 import math
 import random
-from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from itertools import takewhile
 from typing import NamedTuple
 
 import numpy as np
@@ -18,8 +20,8 @@ from shiftsim.errors import ConfigError
 from shiftsim.kernels import FloatArray
 from shiftsim.world.events import FOLLOW
 from shiftsim.world.lanes import find_start, initial_curvature, poses_on_line
+from shiftsim.world.layers import Lists
 from shiftsim.world.map import VectorMap
-from shiftsim.world.state import VX, center_poses
 
 NEAR_EGO = 10.0  # m, a vehicle nearer to the ego in its lane becomes the ego
 _DEFAULT_LIMIT = 10.0  # m/s, where the map has none
@@ -35,32 +37,25 @@ class Slot(NamedTuple):
     speed: float  # [m/s]
 
 
-def fill_lanes(
-    builder: ScenarioBuilder, density: Density, draws: random.Random, name: Callable[[str], str]
-) -> None:
+def fill_lanes(builder: ScenarioBuilder, density: Density) -> None:
     """Add vehicles that drive; those for which there is no space are left out.
 
     Raises:
         ConfigError: The ego is on no lane.
     """
-    road, now = builder.scenario.map, builder.now
-    center = center_poses(builder.scenario.ego[now : now + 1, :3])[0]
+    road, center = builder.scenario.map, builder.center
     start = find_start(road, center)
     if start is None:
         raise ConfigError("density: the ego is on no lane at the start")
     gap = density.gap_m or LEVELS[density.level]
     slots, speed = draw_slots(
-        road, start.edge, center, gap, density.also_at, draws, reach=density.reach_m
+        road, start.edge, center, gap, density.also_at, builder.draws, reach=density.reach_m
     )
     if speed is not None:
-        ego = np.array(builder.scenario.ego)
-        ego[now, VX] = speed
-        builder.change(ego=ego)
+        builder.set_ego_speed(speed)
     for slot in slots:
-        try:
-            builder.add_vehicle(name("vehicle"), slot.pose, _SIZE, slot.speed, FOLLOW)
-        except ConfigError:
-            continue  # no space: density is a matter of chance
+        with suppress(ConfigError):  # no space: density is a matter of chance
+            builder.add_vehicle(builder.name("vehicle"), slot.pose, _SIZE, slot.speed, FOLLOW)
 
 
 def draw_slots(
@@ -153,24 +148,23 @@ def blocks_at(road: VectorMap, x: float, y: float) -> list[int]:
 def extended(road: VectorMap, lane: int, center: FloatArray, reach: float) -> list[int]:
     """A lane and those before and behind it, `reach` [m] beyond the ego, up to traffic lights."""
     along = road.progress_on(lane, center[0], center[1])
-    length = road.baselines.length(lane)
-    out = [lane]
-    for neighbours, at, beyond in (
-        (road.incoming, 0, along),
-        (road.outgoing, len(out), length - along),
-    ):
+
+    def chain(neighbours: Lists, beyond: float) -> list[int]:
+        edges = [lane]
         while beyond < reach:
-            open_edges: list[int] = []
-            for edge in neighbours.at(out[0] if at == 0 else out[-1]).tolist():
-                if road.has_traffic_lights[edge]:
-                    break  # interPlan: not this edge only, all after it as well
-                open_edges.append(edge)
-            if not open_edges:
+            # interPlan: lights close not their own edge only, but all listed after it as well
+            following = takewhile(
+                lambda edge: not road.has_traffic_lights[edge], neighbours.at(edges[-1]).tolist()
+            )
+            curvature = partial(initial_curvature, road.baselines)
+            if (chosen := min(following, key=curvature, default=None)) is None:
                 break
-            chosen = min(open_edges, key=lambda edge: initial_curvature(road.baselines, edge))
             beyond += road.baselines.length(chosen)
-            out.insert(0 if at == 0 else len(out), chosen)
-    return out
+            edges.append(chosen)
+        return edges
+
+    before = chain(road.incoming, along)
+    return before[:0:-1] + chain(road.outgoing, road.baselines.length(lane) - along)
 
 
 def lane_line(road: VectorMap, edges: list[int]) -> shapely.LineString:

@@ -96,14 +96,11 @@ def _lanes_ahead(scenario: Scenario, path: FloatArray) -> FloatArray:
     return _spaced(np.concatenate([end[None], points]))[1:]
 
 
-def nearest_edge(
-    road: VectorMap, x: float, y: float, heading: float, lanes_only: bool = False
-) -> int | None:
+def nearest_edge(road: VectorMap, x: float, y: float, heading: float) -> int | None:
     """The lane, else the connector, that holds a point and whose heading is nearest; or None."""
-    edges = road.lanes_at(x, y) or ([] if lanes_only else road.connectors_at(x, y))
-    if not edges:
-        return None
-    return min(edges, key=lambda edge: abs(wrap_angle(edge_heading(road, edge, x, y) - heading)))
+    edges = road.lanes_at(x, y) or road.connectors_at(x, y)
+    turns = (abs(wrap_angle(edge_heading(road, edge, x, y) - heading)) for edge in edges)
+    return min(zip(turns, edges, strict=True), default=(0.0, None))[1]
 
 
 def edge_heading(road: VectorMap, edge: int, x: float, y: float) -> float:

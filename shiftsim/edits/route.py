@@ -17,7 +17,7 @@ from shiftsim.kernels import FloatArray
 from shiftsim.world.events import TerminationCondition
 from shiftsim.world.lanes import find_start, pose_on_line
 from shiftsim.world.map import VectorMap
-from shiftsim.world.state import NUM_STATE, VX, center_poses, rear_poses
+from shiftsim.world.state import NUM_STATE, VX, rear_poses
 
 TURNS = {"left": math.pi / 2.0, "straight": 0.0, "right": -math.pi / 2.0}  # rad
 DEFAULT_LIMIT = 15.0  # m/s, where the map has none
@@ -32,27 +32,24 @@ def reroute(builder: ScenarioBuilder, wanted: Reroute, *, ends: bool) -> None:
     Raises:
         ConfigError: There is no such route.
     """
-    road, now = builder.scenario.map, builder.now
-    center = center_poses(builder.scenario.ego[now : now + 1, :3])[0]
+    road, center = builder.scenario.map, builder.center
     start = find_start(road, center)
     if start is None:
         raise ConfigError("reroute: the ego is on no lane at the start")
     first = int(road.block_of[start.edge])
-    times = builder.scenario.iteration_times
-    seconds = float(times[-1] - times[0]) * 1e-6
     if wanted.goal:
         goal_edge = edge_at(road, *wanted.goal)
-        lanes = plan_lanes(road, first, goal_edge, set(range(len(road.edges))), _MAX_DEPTH)
+        lanes = plan_lanes(road, first, goal_edge, range(len(road.blocks)), depth=_MAX_DEPTH)
     else:
         blocks = _blocks(road, wanted, first, max(3, len(builder.scenario.route)))
         goal_edge = int(road.block_edges.at(blocks[-1])[-1])
-        within = {int(edge) for block in blocks for edge in road.block_edges.at(block)}
-        lanes = plan_lanes(road, first, goal_edge, within, len(blocks))
+        lanes = plan_lanes(road, first, goal_edge, blocks)
     if not lanes:
         what = wanted.command or wanted.goal or "the roadblocks given"
         raise ConfigError(f"reroute: no lanes lead from the ego to {what}")
     if wanted.command:
-        lanes = cut_by_time(road, lanes, seconds)
+        times = builder.scenario.iteration_times
+        lanes = cut_by_time(road, lanes, float(times[-1] - times[0]) * 1e-6)
     line = plan_line(road, lanes, center)[:, :2]
     end = line[-1] if not wanted.goal else np.array(wanted.goal)
     path = shapely.LineString(line)
@@ -136,17 +133,20 @@ def plan_lanes(
     road: VectorMap,
     first: int,
     goal: int,
-    candidates: set[int],
-    depth: int,
+    blocks: Sequence[int],
     *,
+    depth: int = 0,
     keeps_oddities: bool = False,
 ) -> list[int]:
     """Lanes from a roadblock to an edge, without a lane change where there is such a way.
 
-    The last change of lane, where one is needed, is within the roadblock of the goal. Empty where
-    there is no way, and with interPlan's oddities where there is none from the last lane tried:
-    nuPlan rule 711.
+    They are those of `blocks`, at most `depth`, or one of each block where that is 0. The last
+    change of lane, where one is needed, is within the roadblock of the goal. Empty where there is
+    no way, and with interPlan's oddities where there is none from the last lane tried: nuPlan rule
+    711.
     """
+    candidates = {int(edge) for block in blocks for edge in road.block_edges.at(block)}
+    depth = depth or len(blocks)
     lanes: list[int] = []
     found = False
     for start in road.block_edges.at(first).tolist():

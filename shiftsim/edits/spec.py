@@ -8,7 +8,7 @@ import hashlib
 import json
 import math
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass
 from functools import cached_property
 from typing import Any, Union, get_args, get_origin, get_type_hints
@@ -263,52 +263,49 @@ def make_edit(table: Mapping[str, Any], where: str) -> Edit:
             f"{where}: name is not of up to {_MAX_NAME} letters, digits and underscores",
             hint='for example name = "closed_lane"',
         )
-    edits = [item.name for item in fields(edit)[11:] if getattr(edit, item.name)]
-    if edit.code and edits:
-        raise ConfigError(
-            f"{where}: code and {edits[0]} exclude each other", hint="write an edit for each"
-        )
-    if not edit.code and not edits and edit.window_s is None:
-        raise ConfigError(f"{where}: nothing is edited", hint="add a table, such as spawn")
-    for name in ("spawn", "block_lane"):
-        for item in getattr(edit, name):
-            _one_place(item, f"{where}, {name}")
-    for walk in edit.walk:
-        _one_place(walk.start, f"{where}, walk from")
-        _one_place(walk.end, f"{where}, walk to")
-    if edit.density and bool(edit.density.level) == bool(edit.density.gap_m):
-        raise ConfigError(f"{where}, density: give either level or gap_m")
-    if (
-        edit.density
-        and edit.density.gap_m
-        and not 1 <= edit.density.gap_m[0] < edit.density.gap_m[1]
-    ):
-        raise ConfigError(f"{where}, density: gap_m is not [least, largest], from 1 m on")
-    route = edit.reroute
-    if route and sum(map(bool, (route.command, route.goal, route.route))) != 1:
-        raise ConfigError(f"{where}, reroute: give one of command, goal and route")
-    if edit.split and edit.tokens:
-        raise ConfigError(f"{where}: give either tokens or a split")
-    for light in edit.light:
-        if bool(light.connectors) == light.route:
-            raise ConfigError(f"{where}, light: give either connectors or route = true")
-    for name in ("slow", "stop"):
-        for item in getattr(edit, name):
-            if not item.tokens and not getattr(item, "kinds", ()):
-                raise ConfigError(f"{where}, {name}: say which tracks, by tokens or kinds")
-    if any(not slow.factor <= 1.0 for slow in edit.slow):
-        raise ConfigError(f"{where}, slow: factor is above 1", hint="a recording cannot be sped up")
-    if any(not remove.share <= 1.0 for remove in edit.remove):
-        raise ConfigError(f"{where}, remove: share is above 1")
+    for what, hint in _contradictions(edit):
+        raise ConfigError(f"{where}{what}", hint)
     return edit
 
 
-def _one_place(item: Any, where: str) -> None:
-    if (item.at is None) == (item.pose is None):
-        raise ConfigError(
-            f"{where}: give either pose or a place by the recorded path",
-            hint="pose = [x, y, heading], or at = {ahead_m = 30, left_m = -2}",
-        )
+def _contradictions(edit: Edit) -> Iterator[tuple[str, str]]:
+    """What is wrong with keys that are right by themselves, and what to do."""
+    edits = [item.name for item in fields(edit)[11:] if getattr(edit, item.name)]
+    if edit.code and edits:
+        yield f": code and {edits[0]} exclude each other", "write an edit for each"
+    if not edit.code and not edits and edit.window_s is None:
+        yield ": nothing is edited", "add a table, such as spawn"
+    places: list[tuple[str, Place | Spawn | Block]] = [
+        *(("spawn", spawn) for spawn in edit.spawn),
+        *(("block_lane", block) for block in edit.block_lane),
+        *(("walk from", walk.start) for walk in edit.walk),
+        *(("walk to", walk.end) for walk in edit.walk),
+    ]
+    for name, place in places:
+        if (place.at is None) == (place.pose is None):
+            yield (
+                f", {name}: give either pose or a place by the recorded path",
+                "pose = [x, y, heading], or at = {ahead_m = 30, left_m = -2}",
+            )
+    if density := edit.density:
+        if bool(density.level) == bool(density.gap_m):
+            yield ", density: give either level or gap_m", ""
+        if density.gap_m and not 1 <= density.gap_m[0] < density.gap_m[1]:
+            yield ", density: gap_m is not [least, largest], from 1 m on", ""
+    if (new := edit.reroute) and sum(map(bool, (new.command, new.goal, new.route))) != 1:
+        yield ", reroute: give one of command, goal and route", ""
+    if edit.split and edit.tokens:
+        yield ": give either tokens or a split", ""
+    if any(bool(light.connectors) == light.route for light in edit.light):
+        yield ", light: give either connectors or route = true", ""
+    if any(not slow.tokens and not slow.kinds for slow in edit.slow):
+        yield ", slow: say which tracks, by tokens or kinds", ""
+    if any(not stop.tokens for stop in edit.stop):
+        yield ", stop: say which tracks, by tokens or kinds", ""
+    if any(not slow.factor <= 1.0 for slow in edit.slow):
+        yield ", slow: factor is above 1", "a recording cannot be sped up"
+    if any(not remove.share <= 1.0 for remove in edit.remove):
+        yield ", remove: share is above 1", ""
 
 
 def _renamed(table: Mapping[str, Any]) -> dict[str, Any]:
@@ -318,17 +315,17 @@ def _renamed(table: Mapping[str, Any]) -> dict[str, Any]:
     if isinstance(listed, Mapping):
         listed = [listed]
     if isinstance(listed, (list, tuple)):
-        names = {"from": "start", "to": "end"}
-        walks = []
-        for walk in listed:
-            items = walk.items() if isinstance(walk, Mapping) else ()
-            named = {names.get(name, name): value for name, value in items}
-            for name in ("start", "end"):
-                place = named.get(name)
-                if isinstance(place, Mapping) and not {"at", "pose"} & set(place):
-                    named[name] = {"at": place}
-            walks.append(named if isinstance(walk, Mapping) else walk)
-        out["walk"] = walks
+        out["walk"] = [_walk(walk) if isinstance(walk, Mapping) else walk for walk in listed]
+    return out
+
+
+def _walk(table: Mapping[str, Any]) -> dict[str, Any]:
+    names = {"from": "start", "to": "end"}
+    out = {names.get(name, name): value for name, value in table.items()}
+    for name in ("start", "end"):
+        place = out.get(name)
+        if isinstance(place, Mapping) and not {"at", "pose"} & set(place):
+            out[name] = {"at": place}
     return out
 
 
@@ -340,9 +337,8 @@ def _make(cls: Any, table: Any, where: str) -> Any:
         if name not in known:
             near = nearest(str(name), list(known))
             hint = f"did you mean {near!r}? " if near else ""
-            raise ConfigError(
-                f"{where}: key {name!r} unknown", hint=f"{hint}available: {', '.join(known)}"
-            )
+            hint += f"available: {', '.join(known)}"
+            raise ConfigError(f"{where}: key {name!r} unknown", hint)
     hints = get_type_hints(cls)
     values = {}
     for name, item in known.items():

@@ -30,31 +30,27 @@ def find_start(map: VectorMap, pose: FloatArray) -> Start | None:
 
     A lane is preferred to a connector, and among several the one whose heading differs least.
     """
-    edges = _edges_at(map, float(pose[0]), float(pose[1]))
-    return nearest_heading(map, edges, pose) if edges else None
+    return find_starts(map, pose[None])[0]
 
 
 def find_starts(map: VectorMap, poses: FloatArray) -> list[Start | None]:
     """As `find_start`, of vehicles at poses (N, 3)."""
-    edges = [_edges_at(map, x, y) for x, y in poses[:, :2].tolist()]
+    edges: list[list[int]] = []
+    for x, y in poses[:, :2].tolist():
+        edges.append(map.lanes_at(x, y))
+        if not edges[-1] and len(map.intersections.containing(x, y)):
+            edges[-1] = map.connectors_at(x, y)
     used = sorted({edge for choice in edges for edge in choice})
     lines = dict(zip(used, (shapely.LineString(map.baselines.at(e)) for e in used), strict=True))
     beside = np.array([lines[edge] for choice in edges for edge in choice], object)
     owners = [index for index, choice in enumerate(edges) for _ in choice]
-    progress, found = _place_on_lines(beside, shapely.points(poses[np.array(owners, np.int64), :2]))
-    starts = iter(zip(progress.tolist(), found, strict=True))
+    points = shapely.points(poses[np.array(owners, np.int64), :2])
+    progress = shapely.line_locate_point(beside, points)
+    starts = iter(zip(progress.tolist(), _poses_at(beside, progress), strict=True))
     return [
         _nearest([Start(edge, *next(starts)) for edge in choice], pose) if choice else None
         for choice, pose in zip(edges, poses, strict=True)
     ]
-
-
-def _edges_at(map: VectorMap, x: float, y: float) -> list[int]:
-    """Lanes that hold a point, or connectors where none does."""
-    edges = map.lanes_at(x, y)
-    if not edges and len(map.intersections.containing(x, y)):
-        edges = map.connectors_at(x, y)
-    return edges
 
 
 def nearest_heading(map: VectorMap, edges: list[int], pose: FloatArray) -> Start:
@@ -82,13 +78,7 @@ def pose_on_line(line: shapely.LineString, x: float, y: float) -> tuple[float, F
 
 def poses_on_line(line: shapely.LineString, points: np.ndarray) -> FloatArray:
     """As `pose_on_line`, the poses (N, 3) of N shapely points."""
-    return _place_on_lines(line, points)[1]
-
-
-def _place_on_lines(lines: Any, points: np.ndarray) -> tuple[FloatArray, FloatArray]:
-    """Arc lengths (N,) [m] and poses (N, 3) of N points on one line, or on N of them."""
-    progress = shapely.line_locate_point(lines, points)
-    return progress, _poses_at(lines, progress)
+    return _poses_at(line, shapely.line_locate_point(line, points))
 
 
 def _poses_at(lines: Any, progress: FloatArray) -> FloatArray:

@@ -5,7 +5,7 @@ kernels see one type of array for all of them. Point queries cost one grid look-
 exact point-in-polygon tests; results come in the order of the layer, as nuPlan's tables do.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Sized
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
@@ -83,36 +83,29 @@ class Polygons(NamedTuple):
 
 def make_lists(rows: Iterable[Sequence[int]]) -> Lists:
     """Ragged lists from Python lists."""
-    kept = [np.asarray(row, np.int64) for row in rows]
-    ptr = np.zeros(len(kept) + 1, np.int64)
-    np.cumsum([len(row) for row in kept], out=ptr[1:])
-    items = np.concatenate(kept) if kept else np.zeros(0, np.int64)
-    return Lists(readonly(ptr), readonly(items))
+    lists = [np.asarray(row, np.int64) for row in rows]
+    items = np.concatenate([np.zeros(0, np.int64), *lists])
+    return Lists(readonly(_starts(lists)), readonly(items))
+
+
+def _starts(parts: Sequence[Sized]) -> IntArray:
+    """(n + 1,) where each of n parts begins when they stand in a row, and where the last ends."""
+    return np.cumsum([0, *map(len, parts)], dtype=np.int64)
 
 
 def make_polylines(lines: Sequence[FloatArray]) -> Polylines:
     """Polylines from (K, 2) vertex arrays [m]; an empty array stands for a missing line."""
-    ptr = np.zeros(len(lines) + 1, np.int64)
-    np.cumsum([len(line) for line in lines], out=ptr[1:])
+    ptr = _starts(lines)
     parts = [np.asarray(line, np.float64).reshape(-1, 2) for line in lines]
-    xy = np.ascontiguousarray(np.concatenate(parts)) if parts else np.zeros((0, 2))
-    return index_polylines(xy, ptr)
-
-
-def index_polylines(xy: FloatArray, ptr: IntArray) -> Polylines:
-    """Add arc lengths to flat polylines (arrays as in `Polylines`)."""
+    xy = np.concatenate([np.zeros((0, 2)), *parts])
     return Polylines(readonly(xy), readonly(ptr), readonly(arc_lengths(xy, ptr)))
 
 
 def make_polygons(polygons: Sequence[Sequence[FloatArray]]) -> Polygons:
     """Polygons from lists of rings (shell first, then holes), each ring (V, 2) [m]."""
     rings = [_open_ring(ring) for polygon in polygons for ring in polygon]
-    ring_ptr = np.zeros(len(rings) + 1, np.int64)
-    np.cumsum([len(ring) for ring in rings], out=ring_ptr[1:])
-    poly_ptr = np.zeros(len(polygons) + 1, np.int64)
-    np.cumsum([len(polygon) for polygon in polygons], out=poly_ptr[1:])
-    xy = np.ascontiguousarray(np.concatenate(rings)) if rings else np.zeros((0, 2))
-    return index_polygons(xy, ring_ptr, poly_ptr)
+    xy = np.concatenate([np.zeros((0, 2)), *rings])
+    return index_polygons(xy, _starts(rings), _starts(polygons))
 
 
 def index_polygons(xy: FloatArray, ring_ptr: IntArray, poly_ptr: IntArray) -> Polygons:

@@ -4,8 +4,8 @@ Everything is an array with one row per time; the few objects here name the colu
 the rear axle, a track's pose is the centre of its box.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -128,45 +128,30 @@ class Tracks:
         """Number of tracks, present or not."""
         return len(self.tokens)
 
+    def _with(self, change: Callable[[np.ndarray], np.ndarray]) -> "Tracks":
+        """The same tracks, all arrays over the rows changed."""
+        arrays = (self.valid, self.poses, self.velocities, self.sizes)
+        valid, poses, velocities, sizes = map(change, arrays)
+        return Tracks(valid, poses, velocities, sizes, self.kinds, self.tokens)
+
     def rows(self, index: slice | IntArray) -> "Tracks":
         """The same tracks over other rows: a view for a slice, a copy for an index array."""
-        return Tracks(
-            self.valid[index],
-            self.poses[index],
-            self.velocities[index],
-            self.sizes[index],
-            self.kinds,
-            self.tokens,
-        )
+        return self._with(lambda array: array[index])
 
     def select(self, index: BoolArray | IntArray) -> "Tracks":
         """A subset (or another order) of the tracks, over the same rows."""
         where = np.flatnonzero(index) if index.dtype == np.bool_ else index
-        return Tracks(
-            self.valid[:, where],
-            self.poses[:, where],
-            self.velocities[:, where],
-            self.sizes[:, where],
-            self.kinds[where],
-            tuple(self.tokens[i] for i in where),
-        )
+        tokens = tuple(self.tokens[i] for i in where)
+        chosen = self._with(lambda array: array[:, where])
+        return replace(chosen, kinds=self.kinds[where], tokens=tokens)
 
     def copy(self) -> "Tracks":
         """The same tracks in arrays of their own, which can be written."""
-        return Tracks(
-            self.valid.copy(),
-            self.poses.copy(),
-            self.velocities.copy(),
-            self.sizes.copy(),
-            self.kinds,
-            self.tokens,
-        )
+        return self._with(np.copy)
 
     def readonly(self) -> "Tracks":
         """The same tracks in arrays that cannot be written."""
-        arrays = (self.valid, self.poses, self.velocities, self.sizes, self.kinds)
-        valid, poses, velocities, sizes, kinds = map(readonly, arrays)
-        return Tracks(valid, poses, velocities, sizes, kinds, self.tokens)
+        return replace(self._with(readonly), kinds=readonly(self.kinds))
 
     @staticmethod
     def empty(num_rows: int) -> "Tracks":
@@ -381,17 +366,18 @@ class Trajectory:
 
 def center_poses(rear_poses: FloatArray, vehicle: VehicleParameters = PACIFICA) -> FloatArray:
     """Box centres of rear-axle poses, both (..., 3) x [m], y [m], heading [rad]."""
-    out = np.array(rear_poses, np.float64)
-    out[..., 0] += vehicle.rear_axle_to_center * np.cos(rear_poses[..., 2])
-    out[..., 1] += vehicle.rear_axle_to_center * np.sin(rear_poses[..., 2])
-    return out
+    return _moved_ahead(rear_poses, vehicle.rear_axle_to_center)
 
 
 def rear_poses(centers: FloatArray, vehicle: VehicleParameters = PACIFICA) -> FloatArray:
     """Rear-axle poses of box centres, both (..., 3) x [m], y [m], heading [rad]."""
-    out = np.array(centers, np.float64)
-    out[..., 0] -= vehicle.rear_axle_to_center * np.cos(centers[..., 2])
-    out[..., 1] -= vehicle.rear_axle_to_center * np.sin(centers[..., 2])
+    return _moved_ahead(centers, -vehicle.rear_axle_to_center)
+
+
+def _moved_ahead(poses: FloatArray, distance: float) -> FloatArray:
+    out = np.array(poses, np.float64)
+    out[..., 0] += distance * np.cos(poses[..., 2])
+    out[..., 1] += distance * np.sin(poses[..., 2])
     return out
 
 

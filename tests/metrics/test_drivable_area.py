@@ -238,7 +238,7 @@ def check_files(paths: list[Path], count: int) -> int:
 @pytest.mark.slow
 def test_ten_thousand_boxes_in_the_towns_of_the_demo_agree_with_shapely(tmp_path):
     for town in DEMO_TOWNS:
-        xml = generate_town(town)[0].network.xml()
+        xml = generate_town(town)[0].xml()
         (tmp_path / f"{town.name}.xodr").write_text(xml, "utf-8")
     check_files(sorted(tmp_path.glob("*.xodr")), 10_000)
 

@@ -17,7 +17,7 @@ from parity_cases import Cases, File, Scenes, name_unknown, open_scenes, read_fi
 
 from shiftsim.edits.density import safe_speed
 from shiftsim.edits.interplan import codes
-from shiftsim.edits.interplan.build import SORTS, Built, assemble, build
+from shiftsim.edits.interplan.build import HISTORY, SORTS, InterplanEditor
 from shiftsim.edits.spec import MANNERS, make_edit
 from shiftsim.errors import ConfigError, DataError, ShiftsimError
 from shiftsim.metrics import compute_metrics
@@ -166,14 +166,14 @@ def items(table: Mapping[str, Any]) -> list[str]:
 
 def apply_edit(
     scenario: Scenario, code: str, details: Mapping[str, Any], manner: str = ""
-) -> tuple[Built, Scenario]:
+) -> tuple[InterplanEditor, Scenario]:
     edit = make_edit({"name": code, "code": code, "details": details}, f"code {code}")
-    built = build(scenario, code, details, driven_lanes)
-    edited = assemble(scenario, built, edit)
+    editor = InterplanEditor(scenario, edit, driven_lanes)
+    edited = editor.result()
     if manner and edited.script:
         index = MANNERS.index(manner.lower())
         edited = replace(edited, script=replace(edited.script, yielding=index))
-    return built, edited
+    return editor, edited
 
 
 def compare_build(case: File, where: str, scenario: Scenario, details: Any) -> None:
@@ -182,45 +182,45 @@ def compare_build(case: File, where: str, scenario: Scenario, details: Any) -> N
         expected = [ours for text, ours in _FAILURES.items() if theirs.startswith(text)]
         case.match(where, {"token": scenario.token})
         try:
-            build(scenario, case["code"], details, driven_lanes)
+            apply_edit(scenario, case["code"], details)
         except ShiftsimError as error:
             fits = bool(expected) and expected[0] in error.message
             case.report.compare("build error", where, fits, True)
             return
         case.report.fail("build error", where, f"no error, not {theirs!r}")
         return
-    built, edited = apply_edit(scenario, case["code"], details)
+    editor, edited = apply_edit(scenario, case["code"], details)
     ids = scenario.map.edges.ids
-    agents = codes.edits_agents(built.changes)
-    name = f"{scenario.token}-{code_name(built.changes)}"
+    agents = codes.edits_agents(editor.changes)
+    name = f"{scenario.token}-{code_name(editor.changes)}"
     ours = {
         "token": scenario.token,
         "scenario_name": name,
         "scenario_type": edited.scenario_type,
         "iterations": edited.num_iterations,
         "route": list(edited.route),
-        "lanes": [ids[lane] for lane in built.plan.lanes],
-        "ego_lane": ids[built.ego_edge] if agents else None,
+        "lanes": [ids[lane] for lane in editor.plan.lanes],
+        "ego_lane": ids[editor.ego_edge] if agents else None,
     }
     case.match(where, ours)
-    changes = items({**_ACCELERATIONS, **built.changes})
+    changes = items({**_ACCELERATIONS, **editor.changes})
     case.report.compare("build modification", where, changes, items(case["modification"]))
     numbers = {
         "goal": edited.mission_goal,
         "initial_ego": edited.expert[0, :5],
-        "modified_initial_ego_speed": built.ego_speed if agents else None,
+        "modified_initial_ego_speed": editor.ego_speed if agents else None,
     }
     case.match(where, numbers, POSE)
-    compare_objects(case, where, edited, built)
+    compare_objects(case, where, edited, editor)
     line = case.each("expert_line")[0]
-    plan = built.plan.line
+    plan = editor.plan.line
     line.match(where, {"n": len(plan), "first": plan[0], "last": plan[-1]}, POSE)
     states = case["expert_states"]
-    centers = built.plan.centers[[int(i) for i in states]]
+    centers = editor.plan.centers[[int(i) for i in states]]
     case.report.compare("build expert_states", where, centers, list(states.values()), atol=POSE)
     if agents:
         for number, (theirs, walker) in enumerate(
-            zip(case.each("pedestrians"), built.pedestrians, strict=True)
+            zip(case.each("pedestrians"), editor.crossings, strict=True)
         ):
             length = float(np.hypot(*(walker.end - walker.start[:2])))
             walk = {"start": walker.start, "length": length}
@@ -228,12 +228,12 @@ def compare_build(case: File, where: str, scenario: Scenario, details: Any) -> N
             theirs.match(f"{where} pedestrian {number}", {"activation": walker.iteration or None})
 
 
-def compare_objects(case: File, where: str, edited: Scenario, built: Built) -> None:
+def compare_objects(case: File, where: str, edited: Scenario, editor: InterplanEditor) -> None:
     """Objects at iteration 0; where only the goal is changed, also those of the log."""
     row, tracks = int(edited.iteration_rows[0]), edited.tracks
     there = np.flatnonzero(tracks.valid[row]).tolist()
     place = {tracks.tokens[i]: i for i in there}
-    behaviors = {vehicle.token: vehicle.behavior for vehicle in built.vehicles}
+    behaviors = {vehicle.token: vehicle.behavior for vehicle in editor.vehicles}
     objects = case.each("objects0")
     theirs = [thing["token"] for thing in objects]
     case.report.compare("build objects0 tokens", where, sorted(place), sorted(theirs))
@@ -260,12 +260,15 @@ def compare_objects(case: File, where: str, edited: Scenario, built: Built) -> N
 
 def compare_traffic(case: File, where: str, scenario: Scenario, details: Any) -> None:
     """Agents beside the logged ego, and where they were before."""
-    built, edited = apply_edit(scenario, case["code"], details, case["behavior"])
+    editor, edited = apply_edit(scenario, case["code"], details, case["behavior"])
     where = f"{where} {case['behavior']}"
-    case.match(where, {"past_frames": len(built.past)})
-    for name, poses in (("past_first", built.past[0]), ("past_last", built.past[-1])):
-        theirs = case[name]
-        tokens = [vehicle.token for vehicle in built.vehicles]
+    case.match(where, {"past_frames": HISTORY})
+    tokens = [vehicle.token for vehicle in editor.vehicles]
+    columns = [edited.tracks.tokens.index(token) for token in tokens]
+    rows = edited.iteration_rows[0] - edited.row_step * np.array([HISTORY, 1])
+    assert rows[0] >= 0
+    for name, poses in zip(("past_first", "past_last"), edited.tracks.poses[rows], strict=True):
+        theirs, poses = case[name], poses[columns]
         case.report.compare(f"traffic {name}", where, tokens, [row[0] for row in theirs])
         numbers = np.array([row[1:] for row in theirs]).reshape(-1, 3)
         case.report.compare(f"traffic {name} poses", where, poses, numbers, atol=POSE)

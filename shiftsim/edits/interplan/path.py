@@ -69,18 +69,29 @@ def make_plan(
         raise ConfigError(f"goal {letter!r} is not one of {', '.join(COMMANDS)}")
     command = COMMANDS[letter]
     text = (details.get("goal") or {}).get(command)
-    first = _first_block(road, center)
+    beside = edges_under(road, center, EGO_SIZE)
+    if not beside:
+        raise ConfigError("the ego is on no lane at the start")
+    first = int(road.block_of[nearest_heading(road, beside, center).edge])
     if text:
         x, y = (float(word) for word in str(text).split(","))
-        lanes = _to_goal(road, center, first, edge_at(road, x, y))
+        blocks = road.blocks.within_box(float(center[0]), float(center[1]), _NEAR).tolist()
+        edge = edge_at(road, x, y)
+        if int(road.block_of[edge]) not in blocks:
+            raise ConfigError("the goal is too far away")
+    else:
+        blocks = by_command(road, first, command, len(scenario.route))
+        edge = int(road.block_edges.at(blocks[-1])[-1])
+    lanes = plan_lanes(road, first, edge, blocks, keeps_oddities=True)
+    if not lanes:
+        raise ConfigError("no lanes lead to the goal from the last lane beside the ego")
+    if text:
         blocks = list(dict.fromkeys(road.block_of[lanes].tolist()))
         goal = start_on(road, lanes[-1], x, y).pose
     else:
-        blocks = by_command(road, first, command, len(scenario.route))
-        lanes = _by_command(road, blocks)
-        duration = scenario.mapping[0]
-        lanes = cut_by_time(road, lanes, duration)
-        goal = plan_line_end(road, lanes[-1])
+        lanes = cut_by_time(road, lanes, scenario.mapping[0])
+        xy = road.baselines.at(lanes[-1])
+        goal = np.array([*xy[-1], vertex_headings(xy)[-1]])
     line = plan_line(road, lanes, center)
     count = scenario.num_iterations
     # nuPlan rule 710: the expert goes from vertex to vertex, on to the end of the last lane
@@ -90,45 +101,17 @@ def make_plan(
     return Plan(route, tuple(lanes), goal, line, centers, _end(line, goal))
 
 
-def plan_line_end(road: VectorMap, lane: int) -> FloatArray:
-    """(3,) the last vertex of a lane with its heading."""
-    xy = road.baselines.at(lane)
-    return np.array([*xy[-1], vertex_headings(xy)[-1]])
-
-
 def _end(line: FloatArray, goal: FloatArray) -> float:
     path = shapely.LineString(line[:, :2])
     return float(shapely.line_locate_point(path, shapely.Point(goal[:2]))) - TOLERANCE
 
 
-def _first_block(road: VectorMap, center: FloatArray) -> int:
-    x, y = float(center[0]), float(center[1])
+def edges_under(road: VectorMap, pose: FloatArray, size: FloatArray) -> list[int]:
+    """Lanes, else connectors, at a pose (3,); at a corner of a box (2,) there on a gap of them."""
+    x, y = float(pose[0]), float(pose[1])
     is_lane = bool(road.lanes_at(x, y))
-    points = [(x, y), *boxes_to_corners(center, EGO_SIZE).tolist()]
-    if is_lane or len(road.intersections.containing(x, y)):
-        for px, py in points:
-            edges = road.lanes_at(px, py) if is_lane else road.connectors_at(px, py)
-            if edges:
-                return int(road.block_of[nearest_heading(road, edges, center).edge])
-    raise ConfigError("the ego is on no lane at the start")
-
-
-def _by_command(road: VectorMap, blocks: list[int]) -> list[int]:
-    within = {int(edge) for block in blocks for edge in road.block_edges.at(block)}
-    goal = int(road.block_edges.at(blocks[-1])[-1])
-    return _plan_lanes(road, blocks[0], goal, within, len(blocks))
-
-
-def _to_goal(road: VectorMap, center: FloatArray, first: int, goal: int) -> list[int]:
-    near = road.blocks.within_box(float(center[0]), float(center[1]), _NEAR).tolist()
-    within = {int(edge) for block in near for edge in road.block_edges.at(block)}
-    if goal not in within:
-        raise ConfigError("the goal is too far away")
-    return _plan_lanes(road, first, goal, within, len(near))
-
-
-def _plan_lanes(road: VectorMap, first: int, goal: int, within: set[int], depth: int) -> list[int]:
-    lanes = plan_lanes(road, first, goal, within, depth, keeps_oddities=True)
-    if not lanes:
-        raise ConfigError("no lanes lead to the goal from the last lane beside the ego")
-    return lanes
+    if not is_lane and not len(road.intersections.containing(x, y)):
+        return []
+    at = road.lanes_at if is_lane else road.connectors_at
+    points = [(x, y), *boxes_to_corners(pose, size).tolist()]
+    return next(filter(None, (at(*point) for point in points)), [])

@@ -149,7 +149,7 @@ def test_a_generator_that_is_no_table_is_an_error(tmp_path):
 def test_the_map_of_every_kind_passes_the_checks_of_the_reader(kind, tmp_path):
     town, _ = _town(kind)
     path = tmp_path / "map.xodr"
-    path.write_text(town.network.xml())
+    path.write_text(town.xml())
     road, report = build_road_map(read_opendrive(path), name=kind)
     assert {name for name, good in check_map(road, report.stacked)[0].items() if not good} == set()
     assert report.warnings == {}
@@ -206,7 +206,7 @@ def test_some_people_step_out_between_parked_cars():
         town = _town("street", number)[0]
         for street in town.streets.values():
             for ends in street.crossings if street.parking else ():
-                middle = town.network.roads[street.id].at(np.array([sum(ends) / 2]))[0, :2]
+                middle = street.road.at(np.array([sum(ends) / 2]))[0, :2]
                 found[street.is_marked].append(np.hypot(*(town.parked()[:, :2] - middle).T).min())
     assert min(found[True]) > 11.0 > min(found[False])
 
