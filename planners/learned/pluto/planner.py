@@ -253,12 +253,9 @@ def headings_of(trajectory: np.ndarray) -> np.ndarray:
 def to_map(poses: np.ndarray, rear: FloatArray) -> FloatArray:
     """Poses (..., 3) of the ego frame in the map frame; headings are not wrapped."""
     cos, sin = np.cos(rear[2]), np.sin(rear[2])
-    local = poses.astype(np.float64)
-    out = np.empty_like(local)
-    out[..., 0] = local[..., 0] * cos - local[..., 1] * sin + rear[0]
-    out[..., 1] = local[..., 0] * sin + local[..., 1] * cos + rear[1]
-    out[..., 2] = local[..., 2] + rear[2]
-    return out
+    x, y, heading = np.moveaxis(poses.astype(np.float64), -1, 0)
+    moved = (x * cos - y * sin + rear[0], x * sin + y * cos + rear[1], heading + rear[2])
+    return np.stack(moved, axis=-1)
 
 
 def best_proposals(output: Output, rear: FloatArray) -> tuple[FloatArray, FloatArray]:
