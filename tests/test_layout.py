@@ -23,8 +23,8 @@ BUDGETS = {
     "shiftsim/sim/traffic": 2_400,  # goal 2_200
     "metrics": 2_300,
     "shiftsim/runs": 4_410,  # goal 3_300
-    "planners": 4_390,  # goal 4_300
-    "planners/learned": 5_070,  # goal 4_600
+    "planners": 4_380,  # goal 4_300
+    "planners/learned": 5_030,  # goal 4_600
     "data/maps": 3_640,  # goal 3_000
     "data": 5_410,  # goal 3_900
     "data/nuplan": 2_780,  # goal 2_400
@@ -34,7 +34,7 @@ BUDGETS = {
     "shiftsim/view": 2_100,  # goal 1_800
     "shiftsim/env": 1_100,
     "shiftsim/train": 1_960,  # goal 1_600
-    "shiftsim/compat": 2_690,  # goal 2_300
+    "shiftsim/compat": 2_670,  # goal 2_300
     "shiftsim/verify": 1_300,  # goal 1_200
     "shiftsim/cli": 2_760,  # goal 2_300
     "benchmarks": 710,  # goal 700
