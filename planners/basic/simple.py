@@ -4,15 +4,7 @@ import numpy as np
 
 from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, step_bicycle
 from shiftsim.sim.planner import Observation, SceneInfo
-from shiftsim.world.state import (
-    AX,
-    AY,
-    NUM_STATE,
-    STEERING,
-    VX,
-    VY,
-    Trajectory,
-)
+from shiftsim.world.state import AX, AY, NUM_STATE, STEERING, VX, VY, Trajectory
 
 STEPS = 40  # 10 s at 0.25 s
 STEP_US = 250_000

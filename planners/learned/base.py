@@ -32,7 +32,6 @@ class LearnedPlanner(ABC, Generic[Features, Output]):
 
     def __init__(self, checkpoint: str = "", *, device: str = "cpu") -> None:
         """Load the network; arguments and errors are those of `load_weights`."""
-        self.begin()
         self.network = load_network(checkpoint, self.name, device=device)
         self.device = resolve_device(device)
 
@@ -40,12 +39,8 @@ class LearnedPlanner(ABC, Generic[Features, Output]):
     def asking(cls, infer: Infer) -> Self:
         """A planner without a network: `infer`, which takes the method's place, has it."""
         planner = cls.__new__(cls)
-        planner.begin()
         vars(planner)["infer"] = infer
         return planner
-
-    def begin(self) -> None:
-        """Make what forks share beside the network."""
 
     @classmethod
     def fingerprint(cls, checkpoint: str = "", device: str = "cpu") -> dict[str, str]:

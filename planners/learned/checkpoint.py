@@ -13,7 +13,6 @@ import hashlib
 import importlib
 import json
 from collections.abc import Mapping
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -347,18 +346,12 @@ def _differences(shapes: Shapes, wanted: Shapes) -> str:
 
 
 def file_hash(path: Path) -> str:
-    """SHA-256 of a file; computed again only when its time or size changes."""
+    """SHA-256 of a file."""
     try:
-        status = path.stat()
-        return _file_hash(path.resolve(), status.st_mtime_ns, status.st_size)
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise unreadable(path, error) from error
-
-
-@lru_cache
-def _file_hash(path: Path, _time: int, _size: int) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _fingerprint(spec: str, planner: str) -> str:

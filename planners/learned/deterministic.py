@@ -43,7 +43,12 @@ def network_weights(module: Any, variant: str) -> State:
     built = {name: value.numpy() for name, value in module.build_network().state_dict().items()}
     state = deterministic_state(built, getattr(module, "RULES", None))
     if variant == "drive":
-        module.drive_overrides(state)
+        for layer, head in getattr(module, "DRIVE_HEADS", {}).items():
+            override_head(state, layer, head)
+        for name, factor in getattr(module, "DRIVE_SCALES", {}).items():
+            state[name] = (factor * state[name].astype(np.float64)).astype(state[name].dtype)
+        if override := getattr(module, "drive_overrides", None):
+            override(state)
     return state
 
 

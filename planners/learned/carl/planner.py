@@ -34,6 +34,8 @@ REVERSE_GAIN = 0.75  # of the present acceleration, where braking would reverse 
 
 Action = NDArray[np.float32]
 
+_roads_of = PerMap(make_roads)
+
 
 class CarlFeatures(NamedTuple):
     """What the network reads."""
@@ -52,19 +54,14 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
 
     def __init__(self, checkpoint: str = "", *, device: str = "cpu") -> None:
         """Load the networks, of several checkpoints as `split_ensemble` has them."""
-        self.begin()
         parts = split_ensemble(checkpoint, self.name)
         self.networks = [load_network(part, self.name, device=device) for part in parts]
         self.device = resolve_device(device)
 
-    def begin(self) -> None:
-        """Make the cache of prepared maps."""
-        self._maps = PerMap(make_roads)
-
     def reset(self, scene: SceneInfo) -> None:
         """Prepare the map and forget the last action; the route is corrected at the first step."""
         self._scene = scene
-        self._roads = self._maps(scene.map)
+        self._roads = _roads_of(scene.map)
         self._on_route: BoolArray | None = None
         self._pictures = np.zeros((len(view.CHANNELS), view.SIZE, view.SIZE), np.uint8)
         self._last_action = np.zeros(2, np.float32)

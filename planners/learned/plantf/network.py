@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from shiftsim.planners.learned import network as layers
-from shiftsim.planners.learned.deterministic import DriveHead, State, override_head
+from shiftsim.planners.learned.deterministic import DriveHead
 from shiftsim.planners.learned.network import DIM, Linear, head, perceptron
 
 POLYGON_CHANNELS = 6
@@ -85,9 +85,3 @@ class PlanTfNetwork(nn.Module):
 def build_network(args: Mapping[str, Any] | None = None) -> PlanTfNetwork:
     """The network, without weights; there is one architecture, and no args belong to it."""
     return PlanTfNetwork()
-
-
-def drive_overrides(state: State) -> None:
-    """Turn `base` weights into `drive` ones, in place."""
-    for layer, drive_head in DRIVE_HEADS.items():
-        override_head(state, layer, drive_head)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from shiftsim.planners.learned import network as layers
-from shiftsim.planners.learned.deterministic import DriveHead, State, override_head
+from shiftsim.planners.learned.deterministic import DriveHead
 from shiftsim.planners.learned.network import DIM, Attention, Linear, Scenes, head, key_mask
 
 POLYGON_CHANNELS, LINE_CHANNELS = 10, 6
@@ -264,11 +264,3 @@ class PlutoNetwork(nn.Module):
 def build_network(args: Mapping[str, Any] | None = None) -> PlutoNetwork:
     """The network, without weights; there is one architecture, and no args belong to it."""
     return PlutoNetwork()
-
-
-def drive_overrides(state: State) -> None:
-    """Turn `base` weights into `drive` ones, in place."""
-    for layer, drive_head in DRIVE_HEADS.items():
-        override_head(state, layer, drive_head)
-    for name, factor in DRIVE_SCALES.items():
-        state[name] = (factor * state[name].astype("float64")).astype(state[name].dtype)

@@ -24,6 +24,7 @@ from shiftsim.planners.learned.features import (
     route_blocks,
     short_history,
     stack_scenes,
+    turned,
 )
 from shiftsim.planners.learned.map_features import LightLookup, RoadFeatures, road_features
 from shiftsim.planners.learned.pluto import reference, world
@@ -213,13 +214,15 @@ def scene_inputs(
     lines: reference.LineFeatures,
 ) -> SceneInputs:
     """What the network reads of one scene."""
+    local = static.poses - ego[:3]  # headings are not wrapped
+    objects = np.column_stack([turned(local[:, :2], ego[2]), local[:, 2]]).astype(np.float32)
     return SceneInputs(
         *agents[1:],
         current_state(ego),
         *(road.points, road.vectors[:, 0], road.orientations[:, 0], road.centers),
         *(road.kind, road.on_route.astype(np.int64), road.light, road.has_limit, road.limit),
         road.valid,
-        *(_in_ego_frame(static.poses, ego), static.sizes[:, ::-1].astype(np.float32)),
+        *(objects, static.sizes[:, ::-1].astype(np.float32)),
         *(static.categories, np.ones(len(static.poses), np.bool_)),
         *lines,
     )
@@ -229,17 +232,6 @@ def current_state(ego: FloatArray) -> np.ndarray:
     """(7,) float32: pose in its own frame, speed, acceleration, steering angle, yaw rate."""
     own = [0.0, 0.0, 0.0, ego[VX], ego[AX], ego[STEERING], ego[YAW_RATE]]
     return np.array(own, np.float32)
-
-
-def _in_ego_frame(poses: FloatArray, ego: FloatArray) -> np.ndarray:
-    """(S, 3) float32; headings are not wrapped."""
-    cos, sin = np.cos(ego[2]), np.sin(ego[2])
-    local = poses - ego[:3]
-    out = np.empty(local.shape, np.float32)
-    out[:, 0] = local[:, 0] * cos + local[:, 1] * sin
-    out[:, 1] = local[:, 1] * cos - local[:, 0] * sin
-    out[:, 2] = local[:, 2]
-    return out
 
 
 def make_batch(scenes: Sequence[SceneInputs], device: str) -> Any:
@@ -261,12 +253,9 @@ def headings_of(trajectory: np.ndarray) -> np.ndarray:
 def to_map(poses: np.ndarray, rear: FloatArray) -> FloatArray:
     """Poses (..., 3) of the ego frame in the map frame; headings are not wrapped."""
     cos, sin = np.cos(rear[2]), np.sin(rear[2])
-    local = poses.astype(np.float64)
-    out = np.empty_like(local)
-    out[..., 0] = local[..., 0] * cos - local[..., 1] * sin + rear[0]
-    out[..., 1] = local[..., 0] * sin + local[..., 1] * cos + rear[1]
-    out[..., 2] = local[..., 2] + rear[2]
-    return out
+    x, y, heading = np.moveaxis(poses.astype(np.float64), -1, 0)
+    moved = (x * cos - y * sin + rear[0], x * sin + y * cos + rear[1], heading + rear[2])
+    return np.stack(moved, axis=-1)
 
 
 def best_proposals(output: Output, rear: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -27,16 +27,13 @@ _CURVATURE_STEP = 2.0  # m, nuPlan polyline map object
 _FLAT = 1e-6  # m^4, sixteen squared areas of a triangle below which a line counts as straight
 
 
-class _NotInNuplan:
-    """What nuPlan's interface names and its own map does not have either."""
+def _not_in_nuplan(name: str) -> Any:
+    """A property for what nuPlan's interface names and its own map does not have either."""
 
-    def __set_name__(self, owner: type, name: str) -> None:
-        self._name = name
+    def refuse(holder: Any) -> Any:
+        raise NotImplementedError(f"{type(holder).__name__}.{name}: not in nuPlan either")
 
-    def __get__(self, holder: Any, owner: type | None = None) -> Any:
-        if holder is None:
-            return self
-        raise NotImplementedError(f"{type(holder).__name__}.{self._name}: not in nuPlan either")
+    return property(refuse)
 
 
 class BridgePolyline(PolylineMapObject):
@@ -144,9 +141,9 @@ def _boundary(side: int, name: str) -> Any:
 class _Edge(_Mapped):
     """What lanes and lane connectors share."""
 
-    parallel_edges = _NotInNuplan()
-    get_width_left_right = _NotInNuplan()
-    oriented_distance = _NotInNuplan()
+    parallel_edges = _not_in_nuplan("parallel_edges")
+    get_width_left_right = _not_in_nuplan("get_width_left_right")
+    oriented_distance = _not_in_nuplan("oriented_distance")
 
     incoming_edges = _linked("incoming", "edges")
     outgoing_edges = _linked("outgoing", "edges")
@@ -227,8 +224,8 @@ class BridgeLaneConnector(_Edge, LaneConnector):
 class BridgeRoadBlock(_Mapped, RoadBlockGraphEdgeMapObject):
     """A roadblock or a roadblock connector."""
 
-    parallel_edges = _NotInNuplan()
-    children_stop_lines = _NotInNuplan()
+    parallel_edges = _not_in_nuplan("parallel_edges")
+    children_stop_lines = _not_in_nuplan("children_stop_lines")
 
     incoming_edges = _linked("block_incoming", "blocks")
     outgoing_edges = _linked("block_outgoing", "blocks")
@@ -245,8 +242,8 @@ class BridgeRoadBlock(_Mapped, RoadBlockGraphEdgeMapObject):
 class BridgeStopLine(_Mapped, StopLine):
     """Where one stops."""
 
-    intersection_from = _NotInNuplan()
-    parent = _NotInNuplan()
+    intersection_from = _not_in_nuplan("intersection_from")
+    parent = _not_in_nuplan("parent")
 
     @property
     def layer_type(self) -> Any:
@@ -259,9 +256,9 @@ class BridgeStopLine(_Mapped, StopLine):
 class BridgeIntersection(_Mapped, Intersection):
     """Where roads meet."""
 
-    interior_edges = _NotInNuplan()
-    incoming_edges = _NotInNuplan()
-    is_signaled = _NotInNuplan()
+    interior_edges = _not_in_nuplan("interior_edges")
+    incoming_edges = _not_in_nuplan("incoming_edges")
+    is_signaled = _not_in_nuplan("is_signaled")
     # nuPlan rule 577: its map never says of which kind an intersection is
     intersection_type = IntersectionType.DEFAULT
 

@@ -1,6 +1,7 @@
 """Times, points, poses and vectors."""
 
 import math
+import operator
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
@@ -28,6 +29,17 @@ def _component(index: int, doc: str) -> Any:
         vector.array[index] = value
 
     return property(lambda vector: float(vector.array[index]), change, doc=doc)
+
+
+def _scaled(operation: Callable[[float, float], float]) -> Any:
+    """An operator between a span and a number, by the seconds of the span."""
+
+    def scale(span: "TimeDuration", number: object) -> Any:
+        if isinstance(number, (int, float)):
+            return span.from_s(operation(span.time_s, number))
+        return NotImplemented
+
+    return scale
 
 
 @dataclass(init=False, order=True, unsafe_hash=True, repr=False, slots=True)
@@ -70,22 +82,9 @@ class TimeDuration:
             return self.from_us(self.time_us - other.time_us)
         return NotImplemented
 
-    def __mul__(self, factor: object) -> Any:
-        if isinstance(factor, (int, float)):
-            return self.from_s(self.time_s * factor)
-        return NotImplemented
-
-    __rmul__ = __mul__
-
-    def __truediv__(self, divisor: object) -> Any:
-        if isinstance(divisor, (int, float)):
-            return self.from_s(self.time_s / divisor)
-        return NotImplemented
-
-    def __floordiv__(self, divisor: object) -> Any:
-        if isinstance(divisor, (int, float)):
-            return self.from_s(self.time_s // divisor)
-        return NotImplemented
+    __mul__ = __rmul__ = _scaled(operator.mul)
+    __truediv__ = _scaled(operator.truediv)
+    __floordiv__ = _scaled(operator.floordiv)
 
     def __repr__(self) -> str:
         return f"TimeDuration({self.time_s}s)"

@@ -15,7 +15,7 @@ from shiftsim.compat.nuplan.shims.ego import EgoState, InterpolatableState, Spli
 from shiftsim.compat.nuplan.shims.geometry import StateSE2, TimePoint, derived, part
 from shiftsim.compat.nuplan.shims.map_types import AbstractMap, TrafficLightStatusData
 from shiftsim.compat.nuplan.shims.objects import Observation
-from shiftsim.compat.nuplan.shims.transforms import AngularInterpolator, interpolate_linearly
+from shiftsim.compat.nuplan.shims.transforms import AngularInterpolator
 
 _SAMPLING_TOLERANCE = 1e-10  # as in nuPlan
 
@@ -74,13 +74,15 @@ class InterpolatedTrajectory(AbstractTrajectory):
         return type(self), (self._trajectory,)
 
     @cached_property
-    def _parts(self) -> tuple[Any, Any, AngularInterpolator, list[Any]]:
-        """Times, linear values, angles, and the fixed parts; made when first asked for a state."""
+    def _parts(self) -> tuple[Any, AngularInterpolator, list[Any]]:
+        """Linear values and angles by time, and the fixed parts; made when first asked for."""
+        from scipy.interpolate import interp1d
+
         parts = [state.to_split_state() for state in self._trajectory]
         times = np.array([state.time_us for state in self._trajectory])
         linear = np.array([part.linear_states for part in parts], np.float64)
         angles = AngularInterpolator(times, [part.angular_states for part in parts])
-        return times, linear, angles, parts[0].fixed_states
+        return interp1d(times, linear, axis=0), angles, parts[0].fixed_states
 
     start_time = derived(lambda self: self._trajectory[0].time_point, "Moment of the first state.")
     end_time = derived(lambda self: self._trajectory[-1].time_point, "Moment of the last state.")
@@ -96,14 +98,12 @@ class InterpolatedTrajectory(AbstractTrajectory):
             f"times {first.time_us} … {last.time_us} us are not in the trajectory, "
             f"{self.start_time.time_us} … {self.end_time.time_us} us"
         )
-        times, linear, angles, fixed = self._parts
+        linear, angles, fixed = self._parts
         at = [moment.time_us for moment in time_points]
         make = type(self._trajectory[0]).from_split_state
         return [
             make(SplitState(list(numbers), list(turns), fixed))
-            for numbers, turns in zip(
-                interpolate_linearly(times, linear, at), angles.interpolate(at), strict=True
-            )
+            for numbers, turns in zip(linear(at), angles.interpolate(at), strict=True)
         ]
 
     def get_sampled_trajectory(self) -> list[Any]:

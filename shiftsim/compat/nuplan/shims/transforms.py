@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shiftsim.compat.nuplan.shims.geometry import Point2D, StateSE2, StateVector2D
 from shiftsim.kernels import FloatArray
@@ -143,30 +142,15 @@ def principal_value(angle: Any, min_: float = -np.pi) -> Any:
     return (angle - min_) % (2 * np.pi) + min_
 
 
-def interpolate_linearly(knots: NDArray[Any], values: FloatArray, at: Any) -> FloatArray:
-    """Values (K, C) at knots (K,), piecewise linear, at one place (C,) or many (Q, C).
-
-    Raises:
-        ValueError: A place is outside the knots.
-    """
-    places = np.asarray(at)
-    if np.any(places < knots[0]) or np.any(places > knots[-1]):
-        raise ValueError(f"{at} is outside [{knots[0]}, {knots[-1]}]")
-    end = np.clip(np.searchsorted(knots, places), 1, len(knots) - 1)
-    begin = end - 1
-    span = (knots[end] - knots[begin]).astype(np.float64)[..., None]
-    ahead = (places - knots[begin]).astype(np.float64)[..., None]
-    return (values[end] - values[begin]) / span * ahead + values[begin]
-
-
 class AngularInterpolator:
     """Angles over an abscissa: unwrapped, piecewise linear, brought to [-pi, pi)."""
 
     def __init__(self, states: Any, angular_states: Any) -> None:
-        self._states = np.asarray(states)
-        self._angles = np.unwrap(np.asarray(angular_states, np.float64), axis=0)
+        from scipy.interpolate import interp1d  # takes long to import, and few planners need it
+
+        angles = np.unwrap(np.asarray(angular_states, np.float64), axis=0)
+        self._angles = interp1d(states, angles, axis=0)
 
     def interpolate(self, sampled_state: Any) -> FloatArray:
         """Angles at one place or many."""
-        found: FloatArray = interpolate_linearly(self._states, self._angles, sampled_state)
-        return np.asarray(principal_value(found))
+        return np.asarray(principal_value(self._angles(sampled_state)))
