@@ -193,17 +193,16 @@ def tracks(
     the picture beside the report shows tracks and map. Recordings shorter than a window become one
     scenario each, with 2 s of history.
     """
-    from shiftsim.data.readers.tracks.inspection import (
-        convert_tracks,
-        inspect_tracks,
-        tracks_config,
-    )
+    from shiftsim.data.readers.scenarios import EGO_CATEGORIES
+    from shiftsim.data.readers.tracks.inspection import convert_tracks, inspect_tracks
+    from shiftsim.data.readers.windows import make_config
     from shiftsim.data.store.tables import picture_file
     from shiftsim.errors import ConfigError, ConversionError
     from shiftsim.files import read_toml, store_path
 
     flags = {"window_s": window_s, "overlap_s": overlap_s, "history_s": history_s}
-    config = tracks_config(**{name: value for name, value in flags.items() if value is not None})
+    given = {name: value for name, value in flags.items() if value is not None}
+    config = make_config({"ego_categories": EGO_CATEGORIES, **given})
     overrides = read_toml(columns) if columns else {}
     egos = None if ego is None or "all" in ego else ego
     folder = store_path(store)
@@ -216,7 +215,7 @@ def tracks(
     picture = picture_file(folder, inspection.road.name, inspection.table.name)
     errors = inspection.diagnostics.errors
     try:
-        report = convert_tracks(inspection, folder, egos=egos, config=config)
+        report = convert_tracks(inspection, folder, egos=egos)
     except ConversionError:
         for wrong in errors:
             say(f" wrong: {wrong.what}")
