@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -30,7 +31,7 @@ from shiftsim.data.readers.motion import (
 from shiftsim.data.readers.samples import TrackSamples
 from shiftsim.errors import ConversionError
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
-from shiftsim.world.ranges import DSC3D
+from shiftsim.world.ranges import DSC3D, require
 
 POSITION = ("translation_x", "translation_y", "translation_z")
 ROTATION = ("rotation_x", "rotation_y", "rotation_z")
@@ -77,8 +78,17 @@ class Dsc3dFile(SourceFile):
     """A file of a DSC3D download."""
 
     remedy = "get the recording again from its source, or repair the file"
-    ranges = DSC3D
     casts = True
+
+    def require(self, field: str, values: Any, place: str) -> None:
+        """Numbers are in the range of their field."""
+        require(DSC3D, field, values, f"{self.path}: {place}", error=ConversionError)
+
+    def values(self, table: pa.Table, name: str) -> FloatArray:
+        """(A,) a column of numbers, all in the range of its field."""
+        values: FloatArray = table[name].to_numpy()
+        self.require(name, values, "column")
+        return values
 
 
 def read_recording(
@@ -105,7 +115,7 @@ def read_recording(
 
     def matrix(*names: str) -> FloatArray:
         """(A, number of names) columns of numbers in their range."""
-        return np.column_stack([file.numbers(table, name, name) for name in names])
+        return np.column_stack([file.values(table, name) for name in names])
 
     row_frames, ids = matrix("frame_id", "track_id").astype(np.int64).T
     order = np.lexsort((row_frames, ids))
@@ -188,7 +198,7 @@ def rotation_angles(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _read_frames(file: Dsc3dFile, apart: int) -> tuple[IntArray, IntArray]:
     """(F,) ids and (F,) time stamps [us] of the annotated frames."""
     table = file.columns(_FRAMES)
-    ids = file.numbers(table, "frame_id", "frame_id").astype(np.int64)
+    ids = file.values(table, "frame_id").astype(np.int64)
     file.require_that(len(ids) > 1, f"{len(ids)} frames, need at least 2")
     file.require_that((np.diff(ids) > 0).all(), "frame_id must increase strictly")
     file.require_that(

@@ -22,7 +22,7 @@ from shiftsim.data.readers.reader import Reader
 from shiftsim.data.readers.windows import ConversionConfig
 from shiftsim.errors import ConversionError, DataError, readable
 from shiftsim.kernels import FloatArray, IntArray
-from shiftsim.world.ranges import OPEN_DATA, Table, require
+from shiftsim.world.ranges import OPEN_DATA, require
 
 _MAX_BYTES = 2_000_000_000
 _MAX_ROWS = 8_000_000
@@ -44,7 +44,6 @@ class SourceFile:
 
     # hint of all faults that have none of their own
     remedy = "get the file again from its source, or leave the scene out"
-    ranges: Table = OPEN_DATA  # of its fields
     casts = False  # whether columns may have another type that can be cast to the one wanted
 
     def __init__(self, path: Path) -> None:
@@ -100,7 +99,7 @@ class SourceFile:
 
     def require(self, field: str, values: Any, place: str) -> None:
         """Numbers are in the range of their field."""
-        require(self.ranges, field, values, f"{self.path}: {place} as", error=ConversionError)
+        require(OPEN_DATA, field, values, f"{self.path}: {place} as", error=ConversionError)
 
     def line(self, points: Any, place: str, least: int = 2) -> FloatArray:
         """(K, 2) a line of points (K', 2 or 3), or maps of x and y, without repeated ones [m]."""
