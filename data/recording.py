@@ -153,7 +153,11 @@ def visible_columns(
     if (order == kinds.argsort(kind="stable")).all():
         return index[order]  # the oldest of a kind come first: as they are listed, whoever is there
     before = np.zeros((len(kinds), len(kinds)), np.bool_)
-    _link_columns(np.ascontiguousarray(valid), kinds, before)
+    for kind in np.unique(kinds).tolist():
+        same = np.flatnonzero(kinds == kind)
+        row, column = np.nonzero(valid[:, same])
+        follows = row[1:] == row[:-1]
+        before[same[column[:-1][follows]], same[column[1:][follows]]] = True
     return index[sort_tracks(before, kinds, first)]
 
 
@@ -177,21 +181,6 @@ def sort_tracks(before: BoolArray, kinds: IntArray, first: IntArray) -> IntArray
     order = np.lexsort((first, kinds))
     _move_behind(np.ascontiguousarray(before), kinds, order)
     return order
-
-
-@kernel
-def _link_columns(valid: BoolArray, kinds: IntArray, before: BoolArray) -> None:
-    """Mark which track directly precedes which one of its kind in a row."""
-    last = np.full(16, -1)
-    for frame in range(valid.shape[0]):
-        if frame > 0 and (valid[frame] == valid[frame - 1]).all():
-            continue
-        last[:] = -1
-        for track in np.flatnonzero(valid[frame]):
-            kind = kinds[track]
-            if last[kind] >= 0:
-                before[last[kind], track] = True
-            last[kind] = track
 
 
 @kernel

@@ -1,7 +1,6 @@
 """XML files of others: read as data, never as a program."""
 
-import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from lxml import etree
@@ -11,10 +10,8 @@ from shiftsim.errors import ConversionError
 
 def xml_elements(
     data: bytes, root: str, fault: Callable[[str, str], ConversionError], names: Sequence[str] = ()
-) -> Iterator[Any]:
+) -> list[Any]:
     """The children of the root that have one of some names, or the root itself. No comments.
-
-    Each is whole; a child is freed when the next is asked for.
 
     Args:
         data: The file.
@@ -26,30 +23,20 @@ def xml_elements(
         ConversionError: It is not XML, has another root, or a document type: entities and external
             references are refused.
     """
-    found = None
+    parser = etree.XMLParser(
+        remove_comments=True,
+        remove_pis=True,
+        resolve_entities=False,
+        load_dtd=False,
+        no_network=True,
+        huge_tree=False,
+    )
     try:
-        for event, element in etree.iterparse(
-            io.BytesIO(data),
-            events=("start", "end"),
-            tag=[f"{{*}}{name}" for name in (root, *names)],
-            remove_comments=True,
-            remove_pis=True,
-            resolve_entities=False,
-            load_dtd=False,
-            no_network=True,
-            huge_tree=False,
-        ):
-            if found is None:
-                if element.getroottree().docinfo.doctype:
-                    raise fault("has a DOCTYPE", "remove it and its entities")
-                if element.getparent() is not None or etree.QName(element).localname != root:
-                    break
-                found = element
-            if event == "end" and (element.getparent() if names else element) is found:
-                yield element
-                if names:
-                    element.clear()
+        found = etree.fromstring(data, parser)
     except etree.XMLSyntaxError as error:
         raise fault(f"not well-formed XML: {error.msg}", "") from error
-    if found is None:
+    if found.getroottree().docinfo.doctype:
+        raise fault("has a DOCTYPE", "remove it and its entities")
+    if etree.QName(found).localname != root:
         raise fault(f"its first element is not {root}", "")
+    return list(found.iterchildren(*[f"{{*}}{name}" for name in names])) if names else [found]

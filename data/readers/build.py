@@ -5,7 +5,7 @@ be is an error; what can be repaired is repaired and counted.
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -26,7 +26,6 @@ from shiftsim.data.readers.samples import (
     ROW_S,
     ROW_US,
     TrackSamples,
-    find_runs,
     rows_between,
     sample_run,
 )
@@ -34,7 +33,6 @@ from shiftsim.errors import ConversionError
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.state import AgentKind
 
-MAX_HOLE_S = 0.5  # s, longest hole of a track that is filled
 MAX_PAUSE_S = 3600.0  # s without a row of any object within one recording
 MAX_SPAN_S = 1e5  # s from the first row to the last one
 
@@ -50,7 +48,6 @@ def make_samples(
     headings: FloatArray | None = None,
     velocities: FloatArray | None = None,
     sizes: FloatArray | None = None,
-    derived: FloatArray | None = None,
     kind_of: Mapping[str, AgentKind] = CATEGORIES | KIND_NAMES,
 ) -> TrackSamples:
     """A recording from its columns. A rows, one per object and time, in any order.
@@ -67,7 +64,6 @@ def make_samples(
             where they are not given, and for tracks where they contradict the positions.
         sizes: (A, 2) length, width [m]; the usual size of a kind (`SIZES`) where it is not given,
             NaN or 0. A track gets the median.
-        derived: (A, 2) `fitted_velocities` of rows sorted by id and time, where they are known.
         kind_of: AgentKind by name of a category.
 
     Raises:
@@ -86,34 +82,25 @@ def make_samples(
             f"{name}: {len(time_us)} rows at one time", "give rows at two times or more"
         )
     track_ids, track = index_ids(ids)
-    order = order_of_rows(track, time_us)
-    if order is not None:
-        time_us, track, category, xy = time_us[order], track[order], category[order], xy[order]
-        headings, velocities, sizes = (
-            None if part is None else part[order] for part in (headings, velocities, sizes)
-        )
-        derived = None
+    order = np.lexsort((time_us, track))
+    time_us, track, category, xy = time_us[order], track[order], category[order], xy[order]
+    headings, velocities, sizes = (
+        None if part is None else part[order] for part in (headings, velocities, sizes)
+    )
     if fault := find_twice(track_ids, track, time_us) or find_pause(time_us):
         raise ConversionError(f"{name}: {fault[0]}", fault[1])
-    stamps, frame = index_ids(time_us)
+    stamps, frame = np.unique(time_us, return_inverse=True)
     time = (time_us - stamps[0]) / 1e6
     step = np.diff(time)[track[1:] == track[:-1]]
     period = float(np.median(step)) if len(step) else ROW_S
-    most = most_frequent(category, len(categories), track, warnings)
-    names = tuple(categories[code] for code in most)
-    if unknown := sorted(set(names) - set(kind_of)):
-        raise ConversionError(
-            f"{name}: category {unknown[0]!r} is unknown",
-            f"map it to one of {', '.join(sorted(kind_of))}",
-        )
+    names = track_categories(name, category, categories, track, kind_of, warnings)
     kinds = np.array([kind_of[category] for category in names], np.int64)
-    if derived is None:
-        derived = fitted_velocities(xy, time, track, period)
+    derived = fitted_velocities(xy, time, track, period)
     contradicts = None
     if velocities is not None:
         contradicts = contradiction(velocities, derived, time, track)[0]
-    speeds = believed_velocities(velocities, derived, contradicts, track, warnings)
-    raw = headings_of_motion(speeds, track, warnings) if headings is None else headings
+    velocities = believed_velocities(velocities, derived, contradicts, track, warnings)
+    raw = headings_of_motion(velocities, track, warnings) if headings is None else headings
     samples = TrackSamples(
         name=name,
         start_us=int(stamps[0]),
@@ -121,10 +108,10 @@ def make_samples(
         clock=(stamps - stamps[0]) / 1e6,
         frame=frame,
         track=track,
-        centers=np.pad(xy, ((0, 0), (0, 1))),
+        xy=xy,
         raw_headings=raw,
-        headings=held_headings(raw, speeds, time, track, warnings),
-        velocities=speeds,
+        headings=held_headings(raw, velocities, time, track, warnings),
+        velocities=velocities,
         track_ids=track_ids,
         categories=names,
         kinds=kinds,
@@ -139,7 +126,7 @@ def make_samples(
 Fault = tuple[str, str] | None  # what is wrong, and the remedy
 
 
-def find_pause(time_us: IntArray) -> Fault:
+def find_pause(time_us: NDArray[Any]) -> Fault:
     """Times (A,) [us] that span too long, or with too long a pause: every row takes memory."""
     stamps = np.unique(time_us)
     first = int(np.diff(stamps).argmax())
@@ -158,7 +145,7 @@ def find_pause(time_us: IntArray) -> Fault:
     return None
 
 
-def find_twice(ids: NDArray[Any], track: IntArray, time_us: IntArray) -> Fault:
+def find_twice(ids: NDArray[Any], track: IntArray, time_us: NDArray[Any]) -> Fault:
     """Two rows of one object at one time; rows (A,) are sorted by track and time."""
     twice = np.flatnonzero((np.diff(track) == 0) & (np.diff(time_us) == 0))
     if not len(twice):
@@ -173,7 +160,7 @@ def find_twice(ids: NDArray[Any], track: IntArray, time_us: IntArray) -> Fault:
 
 def on_common_clock(samples: TrackSamples) -> TrackSamples:
     """The same recording with a row every 0.05 s, where objects have times of their own."""
-    runs = find_runs(samples, MAX_HOLE_S)
+    runs = samples.runs
     first, last = rows_between(samples.time[runs.first], samples.time[runs.last])
     # what is seen at an end of the recording is seen at its first or last row, too
     first[samples.time[runs.first] < samples.period] = 0
@@ -181,10 +168,8 @@ def on_common_clock(samples: TrackSamples) -> TrackSamples:
     last[at_end] = int(samples.duration / ROW_S + 1e-9)
     long = np.flatnonzero(last >= first).tolist()
     rows = [np.arange(first[run], last[run] + 1) for run in long]
-    parts = [
-        sample_run(samples, runs, run, row * ROW_S) for run, row in zip(long, rows, strict=True)
-    ]
-    poses, velocities, heights = map(np.concatenate, zip(*parts, strict=True))
+    parts = [sample_run(samples, run, row * ROW_S) for run, row in zip(long, rows, strict=True)]
+    poses, velocities = map(np.concatenate, zip(*parts, strict=True))
     frame = np.concatenate(rows)
     track_of_row = np.repeat(runs.track[long], [len(row) for row in rows])
     present, track = np.unique(track_of_row, return_inverse=True)
@@ -197,7 +182,7 @@ def on_common_clock(samples: TrackSamples) -> TrackSamples:
         clock=np.arange(int(frame.max()) + 1) * ROW_US / 1e6,
         frame=frame,
         track=track,
-        centers=np.column_stack([poses[:, :2], heights]),
+        xy=np.ascontiguousarray(poses[:, :2]),
         raw_headings=poses[:, 2],
         headings=poses[:, 2],
         velocities=velocities,
@@ -212,43 +197,50 @@ def on_common_clock(samples: TrackSamples) -> TrackSamples:
 def index_ids(ids: Any) -> tuple[NDArray[Any], IntArray]:
     """Distinct ids, ascending, and (A,) the index of each row's among them.
 
-    `ids` (A,) are integers or texts, as an array of numpy or pyarrow.
+    `ids` (A,) are integers or texts, as an array of numpy or a column of pyarrow.
     """
-    array = ids if isinstance(ids, pa.ChunkedArray | pa.Array) else pa.array(ids)
-    encoded = pa.chunked_array(array.chunks if isinstance(array, pa.ChunkedArray) else [array])
-    if not pa.types.is_dictionary(encoded.type):
-        encoded = encoded.dictionary_encode()  # far faster than sorting texts
-    names, number = dictionary_codes(encoded)
+    column = ids if isinstance(ids, pa.ChunkedArray) else pa.chunked_array([pa.array(ids)])
+    names, number = dictionary_codes(column)  # far faster than sorting texts
     distinct, rank = np.unique(names.to_numpy(zero_copy_only=False), return_inverse=True)
     return distinct.astype(str) if distinct.dtype == object else distinct, rank[number]
 
 
 def dictionary_codes(column: pa.ChunkedArray) -> tuple[pa.Array, IntArray]:
-    """The values of a dictionary column, and (A,) the index of each row's; nulls get the last."""
+    """The distinct values of a column, and (A,) the index of each row's; nulls get the last."""
+    if not pa.types.is_dictionary(column.type):
+        column = column.dictionary_encode()
     encoded = column.unify_dictionaries().combine_chunks()
     encoded = encoded.chunk(0) if isinstance(encoded, pa.ChunkedArray) else encoded
     codes = encoded.indices.fill_null(len(encoded.dictionary))
     return encoded.dictionary, codes.to_numpy().astype(np.int64, copy=False)
 
 
-def order_of_rows(track: IntArray, time_us: IntArray) -> IntArray | None:
-    """(A,) rows in the order of tracks and times; nothing where they have it."""
-    later = time_us[1:] >= time_us[:-1]
-    if ((track[1:] > track[:-1]) | ((track[1:] == track[:-1]) & later)).all():
-        return None
-    return np.lexsort((time_us, track))
+def track_categories(
+    where: str,
+    category: IntArray,
+    names: Sequence[str],
+    track: IntArray,
+    known: Collection[str],
+    warnings: Counter[str],
+    *,
+    remedy: str = "map it to one of",
+) -> tuple[str, ...]:
+    """N most frequent category of every track; `category` (A,) are indices of `names`.
 
-
-def most_frequent(
-    category: IntArray, num_categories: int, track: IntArray, warnings: Counter[str]
-) -> list[int]:
-    """N most frequent category of every track; category and track: (A,)."""
-    votes = np.zeros((int(track[-1]) + 1, num_categories), np.int64)
-    np.add.at(votes, (track, category), 1)
-    changing = int(((votes > 0).sum(axis=1) > 1).sum())
-    warnings["tracks of changing category (most frequent taken)"] += changing
-    most: list[int] = votes.argmax(axis=1).tolist()
-    return most
+    Raises:
+        ConversionError: One is not among the `known`.
+    """
+    pairs, votes = np.unique(track * len(names) + category, return_counts=True)
+    voted_track, voted = np.divmod(pairs, len(names))
+    first, num_voted = np.unique(voted_track, return_index=True, return_counts=True)[1:]
+    warnings["tracks of changing category (most frequent taken)"] += int((num_voted > 1).sum())
+    most = voted[np.lexsort((voted, -votes, voted_track))[first]]
+    found = tuple(names[code] for code in most.tolist())
+    if unknown := sorted(set(found) - set(known)):
+        raise ConversionError(
+            f"{where}: category {unknown[0]!r} is unknown", f"{remedy} {', '.join(sorted(known))}"
+        )
+    return found
 
 
 def _sizes(
@@ -256,16 +248,12 @@ def _sizes(
 ) -> FloatArray:
     """(N, 2) median of the sizes of every track, the usual one of its kind where it has none."""
     usual = np.array([SIZES[AgentKind(kind)] for kind in kinds.tolist()])
-    if sizes is None:
-        warnings["tracks without size (that of their kind)"] += len(kinds)
-        return usual
-    known = (sizes > 0.0).all(axis=1)
-    if not known.all():  # rows without a size say nothing of it
-        sizes, track = sizes[known], track[known]
     medians = np.zeros_like(usual)
-    if len(track):
-        for axis in (0, 1):
-            medians[: int(track[-1]) + 1, axis] = track_medians(sizes[:, axis], track)
+    if sizes is not None:
+        known = (sizes > 0.0).all(axis=1)  # rows without a size say nothing of it
+        if known.any():
+            found = track_medians(sizes[known], track[known])
+            medians[: len(found)] = found
     lacking = ~np.all(medians > 0.0, axis=1)
     warnings["tracks without size (that of their kind)"] += int(lacking.sum())
     return np.where(np.expand_dims(lacking, 1), usual, medians)

@@ -108,7 +108,6 @@ def convert(
     """
     names = reader.recordings()
     show = progress or (lambda done, total, name: None)
-    show(0, len(names), "")
     with _locked(store):
         writer = StoreWriter(store)
         work = safe_join(store, f"{PARTIAL}/{file_name(reader.name)}")
@@ -146,26 +145,20 @@ def _convert_into(
     failures: dict[str, DataError] = {}
     for done, outcome in enumerate(executor(make, todo), 1):
         show(report.kept + done, len(names), Path(outcome.task).name)
-        failure = ConversionError(outcome.death) if outcome.death else outcome.result
-        if failure is not None:
-            failures[outcome.task] = failure
+        if outcome.death or outcome.result is not None:
+            failures[outcome.task] = outcome.result or ConversionError(outcome.death)
     if len(failures) == len(names):
         first = failures[names[0]]
         others = f"{reader.source}: none of the {len(names)} recordings can be converted; the first"
         where = f"{others} is {names[0]}: " if len(names) > 1 else ""
         raise ConversionError(f"{where}{first.message}", first.hint)
     report.converted = len(todo) - len(failures)
-    for name in names:
-        if name in failures:
-            failure = failures[name]
-            hint = f" ({failure.hint})" if failure.hint else ""
-            report.skipped[name] = f"{failure.message}{hint}"
+    for name in filter(failures.__contains__, names):
+        failure = failures[name]
+        report.skipped[name] = failure.message + f" ({failure.hint})" * bool(failure.hint)
     parts = {name: stage.part(name) or {} for name in waiting if name not in failures}
     entries |= {name: part["entry"] for name, part in parts.items()}
     report.details = reader.summarise(list(entries.values()))
-    if site is not None:
-        writer.add_map(site.road)
-        report.lanes = len(site.road.edges)
     map_warnings = Counter(site.warnings if site is not None else {})
     maps: set[str] = set()
     for name, part in parts.items():
@@ -181,6 +174,8 @@ def _convert_into(
         RecordingSummary(**entries[name]["summary"]) for name in names if name in entries
     ]
     if site is not None:
+        writer.add_map(site.road)
+        report.lanes = len(site.road.edges)
         content = {
             "city": reader.name,
             "lanes": report.lanes,

@@ -6,7 +6,7 @@
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,12 @@ import numpy as np
 import pyproj
 
 from shiftsim.data.maps.builder import BuiltMap
-from shiftsim.data.maps.opendrive.map import build_road_map
 from shiftsim.data.maps.opendrive.reading import read_opendrive
 from shiftsim.data.maps.opendrive.records import OpenDrive
 from shiftsim.data.readers.annotations import Dsc3dFile, Site, read_recording
 from shiftsim.data.readers.convert import ConversionReport, Executor, Progress, convert, serial_map
 from shiftsim.data.readers.placement import place_on_map
-from shiftsim.data.readers.reader import SourceRecording, site_map
+from shiftsim.data.readers.reader import Reader, SourceRecording, opendrive_site
 from shiftsim.data.readers.samples import TrackSamples
 from shiftsim.data.readers.windows import ConversionConfig, window_spans
 from shiftsim.data.store.tables import digest
@@ -40,7 +39,7 @@ _META = {
 }
 
 
-class Dsc3dReader:
+class Dsc3dReader(Reader):
     """A DSC3D download with its map; its recordings are named by their folders.
 
     Args:
@@ -66,8 +65,8 @@ class Dsc3dReader:
         self.name = site or src.resolve().name
         self.source = self.download.folder
         path = find_map(self.download, map_path)
-        self.site = self._map(path)
-        self.settings: Mapping[str, Any] = {
+        self.site: BuiltMap = self._map(path)
+        self.settings = {
             "site": [self.name, *self.download.offset.tolist()],
             "rate": [self.download.frame_rate, self.download.frame_distance],
             "config": asdict(self.config),
@@ -79,17 +78,13 @@ class Dsc3dReader:
         _check_georeference(drive, self.download)
         x, y, *_ = drive.offset or (0.0, 0.0)
         place = self.download.offset
-        offset = float(place[0]) - x, float(place[1]) - y  # the header's is applied
-        road, report = build_road_map(
+        return opendrive_site(
             drive,
             name=self.name,
-            offset=offset,
+            offset=(float(place[0]) - x, float(place[1]) - y),  # the header's is applied
             epsg=self.download.epsg,
             country=self.config.country,
         )
-        if road.num_lanes == 0:
-            raise ConversionError(f"{drive.source} has no drivable lane", "give a map with roads")
-        return site_map(road, report.warnings)
 
     def recordings(self) -> Sequence[str]:
         """Names as listed in `data_meta.json`."""
@@ -108,12 +103,11 @@ class Dsc3dReader:
             message = error.message.replace(f"{self.source}{os.sep}", "")
             raise ConversionError(message, error.hint) from error
         return SourceRecording(
-            samples,
+            replace(samples, offset=self.download.offset[:2]),
             self.site,
             config=self.config,
             scenario_type=SCENARIO_TYPE,
             spans=window_spans(samples.duration, self.config),
-            offset=self.download.offset[:2],
             details={"placement": self._placement(samples)},
         )
 
@@ -121,7 +115,7 @@ class Dsc3dReader:
         """How many moving vehicles are looked at, how many of them are on drivable area."""
         is_vehicle = (samples.kinds == AgentKind.VEHICLE)[samples.track]
         moves = np.hypot(samples.velocities[:, 0], samples.velocities[:, 1]) > _MOVING
-        points = samples.centers[is_vehicle & moves, :2]
+        points = samples.xy[is_vehicle & moves]
         points = points[:: max(1, len(points) // _MAX_POINTS)] + self.download.offset[:2]
         found = place_on_map(self.site.road, points, self.config.min_drivable_share)
         return found._asdict() | {"shift": found.shift.tolist()}

@@ -5,8 +5,8 @@ and msgpack the form (`SourceFile.expect`). What passes is used without further 
 ranges.
 """
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,9 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import shapely
 
-from shiftsim.data.maps.builder import BuiltMap
 from shiftsim.data.maps.segments import clean_line
 from shiftsim.data.polygons import largest_part
+from shiftsim.data.readers.reader import Reader
 from shiftsim.data.readers.windows import ConversionConfig
 from shiftsim.errors import ConversionError, DataError, readable
 from shiftsim.kernels import FloatArray, IntArray
@@ -44,6 +44,7 @@ class SourceFile:
 
     # hint of all faults that have none of their own
     remedy = "get the file again from its source, or leave the scene out"
+    casts = False  # whether columns may have another type that can be cast to the one wanted
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -51,6 +52,11 @@ class SourceFile:
     def fault(self, what: object, remedy: str = "") -> ConversionError:
         """The error that says what is wrong."""
         return ConversionError(f"{self.path}: {what}", remedy or self.remedy)
+
+    def require_that(self, is_good: object, what: str, remedy: str = "") -> None:
+        """Raise an error that says what is wrong, unless all is good."""
+        if not is_good:
+            raise self.fault(what, remedy)
 
     @contextmanager
     def naming(self) -> Iterator[None]:
@@ -167,11 +173,14 @@ class SourceFile:
             for key, inner in each.items():
                 self.expect(value.get(key), inner, f"{place}: {key!r}")
 
-    def columns(self, wanted: Mapping[str, pa.DataType]) -> pa.Table:
+    def columns(
+        self, wanted: Mapping[str, pa.DataType], *, optional: Collection[str] = ()
+    ) -> pa.Table:
         """Columns of a Parquet file, or of an Arrow IPC file (`.arrow`), and its metadata.
 
         Args:
             wanted: Type of each column; there are no nulls but in lists whose type allows them.
+            optional: Columns that may be missing.
 
         Raises:
             ConversionError: The file is missing, broken or without rows, a column is missing or of
@@ -179,22 +188,48 @@ class SourceFile:
         """
         self.require_size()
         try:
-            table = _read(self.path, wanted)
+            table = self._read(wanted)
             table.validate(full=True)
         except (OSError, ValueError, MemoryError, pa.ArrowException) as error:
             raise self.fault(f"cannot be read ({error})") from error
-        if not 0 < len(table) <= _MAX_ROWS:
-            what = f"{len(table)} rows, need 1 to {_MAX_ROWS}"
-            raise self.fault(what, "split the recording" if len(table) else "")
+        self._require_rows(len(table))
+        columns = {}
         for name, kind in wanted.items():
-            if (count := table.column_names.count(name)) != 1:
+            count = table.column_names.count(name)
+            if not count and name in optional:
+                continue
+            if count != 1:
                 what = f"there {count} times" if count else "missing"
                 raise self.fault(f"column {name!r} is {what}")
-            if _bare(table[name].type) != _bare(kind):
-                raise self.fault(f"column {name!r} is {table[name].type}, need {_bare(kind)}")
-            if count := sum(_nulls(chunk, kind) for chunk in table[name].chunks):
-                raise self.fault(f"column {name!r} holds {count} nulls, need a value everywhere")
-        return table.select(list(wanted)).replace_schema_metadata(table.schema.metadata)
+            column = table[name]
+            if self.casts:
+                with suppress(ValueError, pa.ArrowException):
+                    column = column.cast(kind)
+            if _bare(column.type) != _bare(kind):
+                raise self.fault(f"column {name!r} is {column.type}, need {_bare(kind)}")
+            if nulls := sum(_nulls(chunk, kind) for chunk in column.chunks):
+                raise self.fault(f"column {name!r} holds {nulls} nulls, need a value everywhere")
+            columns[name] = column
+        return pa.table(columns, metadata=table.schema.metadata)
+
+    def _read(self, wanted: Mapping[str, pa.DataType]) -> pa.Table:
+        """The columns that are there."""
+        if self.path.suffix != ".arrow":
+            file = pq.ParquetFile(self.path)
+            self._require_rows(file.metadata.num_rows)
+            known = [name for name in wanted if name in file.schema_arrow.names]
+            texts = [name for name in known if pa.types.is_dictionary(wanted[name])]
+            file = pq.ParquetFile(self.path, read_dictionary=texts)  # these are not repeated
+            return file.read(known, use_threads=False)
+        with pa.OSFile(str(self.path)) as source:
+            schema = pa.ipc.open_file(source).schema
+            known_at = [i for i, name in enumerate(schema.names) if name in wanted]
+            options = pa.ipc.IpcReadOptions(included_fields=known_at, use_threads=False)
+            return pa.ipc.open_file(source, options=options).read_all()
+
+    def _require_rows(self, count: int) -> None:
+        remedy = "split the recording" if count else ""
+        self.require_that(0 < count <= _MAX_ROWS, f"{count} rows, need 1 to {_MAX_ROWS}", remedy)
 
     def numbers(self, table: pa.Table, column: str, field: str) -> FloatArray:
         """(R,) a column as float64, all in the range of the field."""
@@ -240,7 +275,7 @@ def _nulls(found: pa.Array, kind: pa.DataType, *, allowed: bool = False) -> int:
     return count
 
 
-class SceneFolder:
+class SceneFolder(Reader):
     """What the readers of folders of scenes share; each scene has a map of its own.
 
     Args:
@@ -251,11 +286,11 @@ class SceneFolder:
     name = ""  # of the data set
     pattern = ""  # of the files that scenes are named by
     hint = ""  # where there is none
-    site: BuiltMap | None = None
+    site = None
 
     def __init__(self, source: Path, *, vehicles: bool = False) -> None:
         self.source, self.vehicles = source, vehicles
-        self.settings: Mapping[str, Any] = {"vehicles": vehicles}
+        self.settings = {"vehicles": vehicles}
 
     def recordings(self) -> list[str]:
         """Paths that name the scenes, sorted."""
@@ -268,19 +303,3 @@ class SceneFolder:
     def recorded_ego(self, name: str) -> dict[str, Any]:
         """Which objects of a scene become egos: `name`, whatever it does, or all vehicles."""
         return {} if self.vehicles else {"egos": (name,), "config": _RECORDED}
-
-    def summarise(self, entries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-        """Nothing: scenes have nothing in common."""
-        return {}
-
-
-def _read(path: Path, names: Collection[str]) -> pa.Table:
-    if path.suffix != ".arrow":
-        file = pq.ParquetFile(path)
-        known = [name for name in names if name in file.schema_arrow.names]
-        return file.read(known, use_threads=False)
-    with pa.OSFile(str(path)) as source:
-        schema = pa.ipc.open_file(source).schema
-        known_at = [i for i, name in enumerate(schema.names) if name in names]
-        options = pa.ipc.IpcReadOptions(included_fields=known_at, use_threads=False)
-        return pa.ipc.open_file(source, options=options).read_all()

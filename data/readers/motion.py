@@ -25,7 +25,9 @@ def track_ends(track: IntArray) -> IntArray:
 
 
 def track_medians(values: FloatArray, track: IntArray) -> FloatArray:
-    """(N,) median of the rows of each track; values and track: (A,), sorted by track."""
+    """(N,) or (N, D) median of the rows of each track; values (A,) or (A, D), track (A,) sorted."""
+    if values.ndim == 2:
+        return np.column_stack([track_medians(column, track) for column in values.T])
     return np.array(
         [median(values[low:high]) for low, high in pairwise(track_ends(track).tolist())]
     )

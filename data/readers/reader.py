@@ -3,13 +3,15 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from shiftsim.data.maps.builder import BuiltMap
 from shiftsim.data.maps.lights import LightStates
+from shiftsim.data.maps.opendrive.map import build_road_map
+from shiftsim.data.maps.opendrive.records import OpenDrive
 from shiftsim.data.readers.samples import TrackSamples
 from shiftsim.data.readers.windows import ConversionConfig, Span
-from shiftsim.kernels import FloatArray
+from shiftsim.errors import ConversionError
 from shiftsim.world.map import VectorMap
 
 
@@ -23,7 +25,6 @@ class SourceRecording:
     scenario_type: str = "unknown"
     egos: Sequence[str] | None = None  # ids of the egos; None for every vehicle that can be one
     spans: Sequence[Span] | None = None  # windows; None for all that fit
-    offset: FloatArray | None = None  # (2,) what brings places into the frame of the map [m]
     left_out_s: float = 0.0  # time at its end that no scenario reaches [s]
     needs_scenario: bool = False  # whether it is an error if none is left
     lights: LightStates | None = None
@@ -32,24 +33,20 @@ class SourceRecording:
     details: Mapping[str, Any] = field(default_factory=dict)  # for the report, JSON values only
 
 
-class Reader(Protocol):
-    """A source of recordings. It must pickle."""
+class Reader:
+    """A source of recordings. It must pickle.
 
-    @property
-    def name(self) -> str:
-        """Name of the site or of the data set."""
+    Attributes:
+        name: Name of the site or of the data set.
+        source: Where it is.
+        site: The map that all recordings share, whose report the store gets; None without one.
+        settings: What the result depends on beside the files, JSON values only.
+    """
 
-    @property
-    def source(self) -> Path:
-        """Where it is."""
-
-    @property
-    def site(self) -> BuiltMap | None:
-        """The map that all recordings share, whose report the store gets; None without one."""
-
-    @property
-    def settings(self) -> Mapping[str, Any]:
-        """What the result depends on beside the files, JSON values only."""
+    name: str
+    source: Path
+    site: BuiltMap | None
+    settings: Mapping[str, Any]
 
     def recordings(self) -> Sequence[str]:
         """Names of the recordings, in the order in which they are reported.
@@ -57,9 +54,11 @@ class Reader(Protocol):
         Raises:
             ConversionError: There is none.
         """
+        raise NotImplementedError
 
     def files(self, recording: str) -> Sequence[Path]:
         """The files that a recording is read from."""
+        raise NotImplementedError
 
     def read(self, recording: str) -> SourceRecording:
         """One recording.
@@ -67,6 +66,7 @@ class Reader(Protocol):
         Raises:
             DataError: A file is missing or broken, or contradicts itself.
         """
+        raise NotImplementedError
 
     def summarise(self, entries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         """What the report says of all recordings, from the entry of each, details included.
@@ -74,6 +74,19 @@ class Reader(Protocol):
         Raises:
             ConversionError: They and the map contradict each other; nothing is written then.
         """
+        return {}
+
+
+def opendrive_site(drive: OpenDrive, *, name: str, **how: Any) -> BuiltMap:
+    """The map of a site from OpenDRIVE; `how` as for `build_road_map`.
+
+    Raises:
+        ConversionError: It has no lane that cars may use.
+    """
+    road, report = build_road_map(drive, name=name, **how)
+    if road.num_lanes == 0:
+        raise ConversionError(f"{drive.source} has no drivable lane", "give a map with roads")
+    return site_map(road, report.warnings)
 
 
 def site_map(road: VectorMap, warnings: Mapping[str, int]) -> BuiltMap:

@@ -4,7 +4,7 @@ Rows of a converted recording are 0.05 s apart, counted from the first frame; po
 between frames, angles by the shorter way round. Nothing is stretched (nuPlan rule 454).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -35,7 +35,7 @@ class TrackSamples:
     clock: FloatArray  # (F,) time of the frames since the first one [s]
     frame: IntArray  # (A,) frame of the row
     track: IntArray  # (A,) track of the row
-    centers: FloatArray  # (A, 3) centre of the box [m]
+    xy: FloatArray  # (A, 2) centre of the box [m]
     raw_headings: FloatArray  # (A,) heading as recorded [rad]
     headings: FloatArray  # (A,) heading, held where it spins at standstill [rad]
     velocities: FloatArray  # (A, 2) in the frame of the centres [m/s]
@@ -44,6 +44,25 @@ class TrackSamples:
     kinds: IntArray  # (N,) AgentKind codes
     sizes: FloatArray  # (N, 2 or 3) length, width and, if known, height [m]
     warnings: dict[str, int]  # count by kind of what was repaired
+    # (2,) what brings places into the frame of the map [m]
+    offset: FloatArray = field(default_factory=lambda: np.zeros(2))
+    max_hole_s: float = 0.5  # longest time without a row that does not split a track [s]
+
+    @cached_property
+    def runs(self) -> "Runs":
+        """Stretches of the tracks without a longer hole (nuPlan rule 458)."""
+        gap = np.r_[np.inf, np.diff(self.time)]
+        new_track = np.r_[True, np.diff(self.track) != 0]
+        starts = new_track | (gap > self.max_hole_s + self.period + 1e-6)
+        first = np.flatnonzero(starts)
+        last = np.r_[first[1:] - 1, len(self.time) - 1]
+        track = self.track[first]
+        number = np.arange(len(first)) - np.searchsorted(track, track)
+        tokens = [
+            f"{name}_{before + 1}" if before else str(name)
+            for name, before in zip(self.track_ids[track].tolist(), number.tolist(), strict=True)
+        ]
+        return Runs(first, last, track, tokens)
 
     @cached_property
     def time(self) -> FloatArray:
@@ -67,35 +86,13 @@ class TrackSamples:
         return float(self.clock[-1])
 
 
-@dataclass(frozen=True)
-class Runs:
+class Runs(NamedTuple):
     """Stretches of rows in which a track is present without a hole that is too long. U runs."""
 
     first: IntArray  # (U,) first row
     last: IntArray  # (U,) last row
     track: IntArray  # (U,) track
-    number: IntArray  # (U,) how many runs of the same track came before
-
-
-class Boxes(NamedTuple):
-    """Boxes of a track at given times. G boxes, in the frame of the recording."""
-
-    poses: FloatArray  # (G, 3) box centre x [m], y [m], heading [rad]
-    velocities: FloatArray  # (G, 2) [m/s]
-    heights: FloatArray  # (G,) z of the box centre [m]
-
-
-def find_runs(recording: TrackSamples, max_hole_s: float) -> Runs:
-    """Split the tracks where they are absent for longer than `max_hole_s` (nuPlan rule 458)."""
-    time = recording.time
-    gap = np.r_[np.inf, np.diff(time)]
-    new_track = np.r_[True, np.diff(recording.track) != 0]
-    starts = new_track | (gap > max_hole_s + recording.period + 1e-6)
-    first = np.flatnonzero(starts)
-    last = np.r_[first[1:] - 1, len(time) - 1]
-    track = recording.track[first]
-    first_run = np.searchsorted(track, track)
-    return Runs(first, last, track, np.arange(len(first)) - first_run)
+    tokens: list[str]  # U ids; a presence after a long hole is a track of its own
 
 
 def rows_of(seconds: float) -> int:
@@ -109,13 +106,16 @@ def rows_between(first_s: FloatArray, last_s: FloatArray) -> tuple[IntArray, Int
     return first, np.floor(last_s / ROW_S + _EPS).astype(np.int64)
 
 
-def sample_run(recording: TrackSamples, runs: Runs, run: int, time: FloatArray) -> Boxes:
-    """Boxes of a run at times (G,) since the first frame [s], linear between the frames.
+def sample_run(
+    recording: TrackSamples, run: int, time: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """(G, 3) poses of box centres and (G, 2) velocities of a run at times (G,).
 
+    Times are those since the first frame [s]; values are linear between the frames.
     Beyond the ends of a run motion goes on: linearly for one frame, then with constant velocity and
     heading. Callers decide how far that is allowed.
     """
-    first, last = int(runs.first[run]), int(runs.last[run])
+    first, last = int(recording.runs.first[run]), int(recording.runs.last[run])
     row_time, velocities = recording.time, recording.velocities
     row = first - 1 + np.searchsorted(row_time[first : last + 1], time + _EPS, side="right")
     row = np.clip(row, first, max(last - 1, first))
@@ -127,39 +127,20 @@ def sample_run(recording: TrackSamples, runs: Runs, run: int, time: FloatArray) 
     inside = np.clip(share, 0.0, 1.0)[:, None]
     beyond = (share - linear) * span  # s
     end = np.where(share < 0.0, row, following)
-    way = recording.centers[following] - recording.centers[row]
-    centers = recording.centers[row] + linear[:, None] * way
-    places = centers[:, :2] + beyond[:, None] * velocities[end]
+    way = recording.xy[following] - recording.xy[row]
+    xy = recording.xy[row] + linear[:, None] * way + beyond[:, None] * velocities[end]
     turn = wrap_angles(recording.headings[following] - recording.headings[row])
     headings = wrap_angles(recording.headings[row] + linear * turn)
     change = velocities[following] - velocities[row]
-    return Boxes(
-        np.column_stack([places, headings]), velocities[row] + inside * change, centers[:, 2]
-    )
+    return np.column_stack([xy, headings]), velocities[row] + inside * change
 
 
-def run_token(recording: TrackSamples, runs: Runs, run: int) -> str:
-    """Track token of a run: the track id; a presence after a long hole is a track of its own."""
-    number = int(runs.number[run])
-    name = str(recording.track_ids[runs.track[run]])
-    return f"{name}_{number + 1}" if number else name
+def resample(recording: TrackSamples, log_name: str, city: str, padding: int = 0) -> Recording:
+    """A whole recording at 20 Hz in the frame of the map, every run a track.
 
-
-def resample(
-    recording: TrackSamples,
-    runs: Runs,
-    *,
-    log_name: str,
-    city: str,
-    offset: FloatArray,
-    padding_s: float = 0.0,
-) -> Recording:
-    """A whole recording at 20 Hz in UTM, every run a track.
-
-    `offset` (2,) is the UTM of the local origin [m]; the first `padding_s` lie before the
-    first frame, with constant velocity.
+    The first `padding` rows lie before the first frame, with constant velocity.
     """
-    padding = rows_of(padding_s)
+    runs = recording.runs
     num_rows = int(np.floor(recording.duration / ROW_S + _EPS)) + 1 + padding
     first, last = rows_between(recording.time[runs.first], recording.time[runs.last])
     first = np.where(recording.frame[runs.first] == 0, -padding, first)
@@ -171,14 +152,14 @@ def resample(
     poses, velocities, sizes = (np.full((*shape, parts), np.nan) for parts in (3, 2, 2))
     for column, run in enumerate(present.tolist()):
         row = np.arange(first[run], last[run] + 1)
-        boxes = sample_run(recording, runs, run, row * ROW_S)
-        valid[row + padding, column] = True
-        poses[row + padding, column] = boxes.poses
-        sizes[row + padding, column] = recording.sizes[runs.track[run], :2]
+        sampled, moving = sample_run(recording, run, row * ROW_S)
+        row += padding
+        valid[row, column], poses[row, column] = True, sampled
+        sizes[row, column] = recording.sizes[runs.track[run], :2]
         if kinds[column] <= LAST_AGENT_KIND:
-            velocities[row + padding, column] = boxes.velocities
-    poses[..., :2] += offset
-    tokens = tuple(run_token(recording, runs, run) for run in present.tolist())
+            velocities[row, column] = moving
+    poses[..., :2] += recording.offset
+    tokens = tuple(runs.tokens[run] for run in present.tolist())
     tracks = Tracks(valid, poses, velocities, sizes, kinds, tokens)
     times = recording.start_us + (np.arange(num_rows) - padding) * ROW_US
     return Recording(log_name, city, times, tracks, TrafficLights.empty(num_rows))
@@ -186,30 +167,28 @@ def resample(
 
 def ego_trace(
     recording: TrackSamples,
-    runs: Runs,
     run: int,
-    *,
     log_name: str,
-    offset: FloatArray,
+    *,
     first_row: int,
     last_row: int,
     padding: int = 0,
 ) -> EgoTrace:
     """States of a run as the ego: the Pacifica's box centre on the recorded one.
 
-    `offset` (2,) is the UTM of the local origin [m]. The rows first_row … last_row - 1 are wanted;
-    they count from the first of the `padding` rows before the first frame.
+    The rows first_row … last_row - 1 are wanted; they count from the first of the `padding` rows
+    before the first frame.
     """
+    runs = recording.runs
     ends = recording.time[[runs.first[run], runs.last[run]]]
     begin, end = rows_between(ends[:1], ends[1:])
     low = min(int(begin[0]) + padding, first_row)
     high = max(int(end[0]) + 1 + padding, last_row)
     times = np.arange(low - padding, high - padding).astype(np.float64) * ROW_S
-    boxes = sample_run(recording, runs, run, times)
-    states = ego_states(boxes.poses, boxes.velocities)
-    states[:, :2] += offset
+    states = ego_states(*sample_run(recording, run, times))
+    states[:, :2] += recording.offset
     wanted = np.ascontiguousarray(states[first_row - low : last_row - low])
-    return EgoTrace(log_name, run_token(recording, runs, run), first_row, wanted)
+    return EgoTrace(log_name, runs.tokens[run], first_row, wanted)
 
 
 def ego_states(centers: FloatArray, velocities: FloatArray) -> FloatArray:

@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +24,6 @@ from shiftsim.data.readers.samples import (
     ROW_US,
     TrackSamples,
     ego_trace,
-    find_runs,
     resample,
     rows_between,
     rows_of,
@@ -47,7 +47,6 @@ from shiftsim.data.readers.windows import (
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import ConfigError, ConversionError, nearest
-from shiftsim.kernels import FloatArray
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import FULL_DURATION, duration_class
 from shiftsim.world.state import rear_poses
@@ -83,93 +82,54 @@ class Converted:
     summary: RecordingSummary
 
 
-def make_scenarios(
-    samples: TrackSamples,
-    road: VectorMap,
-    *,
-    egos: Sequence[str] | None = None,
-    config: ConversionConfig | None = None,
-    scenario_type: str = "unknown",
-    left_out_s: float = 0.0,
-) -> Converted:
-    """All scenarios of a recording; both it and the map are in the frame of the map.
-
-    Args:
-        samples: The recording.
-        road: The map.
-        egos: Ids of the egos, of any category; by default every car, van, pickup or vehicle that
-            is there throughout the window.
-        config: Thresholds of DeepPlan's conversion.
-        scenario_type: Tag of the scenarios.
-        left_out_s: Time at the end of the recording that no window reaches [s].
+def make_scenarios(samples: TrackSamples, road: VectorMap, **how: Any) -> Converted:
+    """All scenarios of a recording and a map in one frame; `how` as in `SourceRecording`.
 
     Raises:
         ConfigError: No object has the id of an ego.
     """
-    return convert_recording(
-        SourceRecording(
-            samples,
-            site_map(road, {}),
-            config=config,
-            scenario_type=scenario_type,
-            egos=egos,
-            left_out_s=left_out_s,
-        )
-    )
+    return convert_recording(SourceRecording(samples, site_map(road, {}), **how))
 
 
 def convert_recording(source: SourceRecording) -> Converted:
     """All scenarios of one recording of a source; see `make_scenarios`."""
-    samples, road, spans = source.samples, source.map.road, source.spans
     config = source.config or ConversionConfig(ego_categories=EGO_CATEGORIES)
-    offset = np.zeros(2) if source.offset is None else source.offset
-    if spans is None and source.egos is None:
-        rows = int(np.floor((samples.duration - source.left_out_s) / ROW_S + 1e-9)) + 1
-        spans = list(_spans(0, rows, -1, config))
-    elif spans is None:
-        spans = list(_named_spans(samples, source.egos or (), config, source.left_out_s))
-    runs = find_runs(samples, config.max_hole_s)
-    windows = evaluate_windows(samples, runs, config, spans)
-    log_name = f"{road.name}_{samples.name}"
+    samples, road = replace(source.samples, max_hole_s=config.max_hole_s), source.map.road
+    spans = source.spans
+    if spans is None:
+        spans = list(_usable_spans(samples, source.egos, config, source.left_out_s))
+    windows = evaluate_windows(samples, config, spans)
     padding = rows_of(config.padding_s)
-    recording = resample(
-        samples, runs, log_name=log_name, city=road.name, offset=offset, padding_s=config.padding_s
-    )
+    recording = resample(samples, f"{road.name}_{samples.name}", road.name, padding)
     rejected: Counter[str] = Counter()
     accepted = _accepted_runs(windows, config, rejected)
     traces: list[EgoTrace] = []
     scenarios: list[Window] = []
     for run, numbers in sorted(accepted.items()):
-        own = [windows[number].span for number in numbers]
+        starts = [rows_of(windows[number].span.start_s) for number in numbers]
+        lengths = [rows_of(windows[number].span.length_s) for number in numbers]
         trace = ego_trace(
             samples,
-            runs,
             run,
-            log_name=log_name,
-            offset=offset,
-            first_row=min(rows_of(span.start_s) for span in own),
-            last_row=max(rows_of(s.start_s) + rows_of(s.length_s) for s in own) + padding,
+            recording.log_name,
+            first_row=min(starts),
+            last_row=max(map(sum, zip(starts, lengths, strict=True))) + padding,
             padding=padding,
         )
-        starts = np.array([span.start_s + span.history_s for span in own])
-        poses = sample_run(samples, runs, run, starts).poses
-        poses[:, :2] += offset
-        track, before = int(runs.track[run]), len(scenarios)
-        for number, span, pose in zip(numbers, own, poses, strict=True):
-            window: Window | str = LANE
-            if starts_on_lane(road, pose, config):
-                window = _scenario(source, offset, config, track, number, span, trace)
-            if isinstance(window, str):
-                rejected[window] += 1
-            else:
-                scenarios.append(window)
-        if len(scenarios) > before:
+        made = [
+            _scenario(source, samples, config, run, number, windows[number].span, trace)
+            for number in numbers
+        ]
+        rejected.update(window for window in made if isinstance(window, str))
+        usable = [window for window in made if isinstance(window, Window)]
+        if usable:
+            scenarios += usable
             traces.append(trace)
     if source.lights is not None:
         lights = light_rows(source.lights, source.map.lights, recording.time_us)
         recording = replace(recording, lights=lights)
     warnings = Counter(samples.warnings) + Counter(source.warnings)
-    warnings["rows far outside the map"] += _rows_outside_map(samples, road, offset)
+    warnings["rows far outside the map"] += _rows_outside_map(samples, road)
     summary = RecordingSummary(
         name=samples.name,
         duration_s=samples.duration,
@@ -233,24 +193,15 @@ def write_converted(writer: StoreWriter, converted: Converted) -> None:
         writer.add_window(window)
 
 
-def _spans(first: int, rows: int, only: int, config: ConversionConfig) -> Iterator[Span]:
-    """Windows within some rows of 0.05 s; one shorter window where none fits."""
-    full = window_spans(rows * ROW_S, config)
-    for span in full:
-        start = round((first + rows_of(span.start_s)) * ROW_S, 2)
-        yield Span(start, span.length_s, span.history_s, only)
-    if not full and rows * ROW_S >= SHORT_HISTORY_S + _LEAST_S:
-        history = min(SHORT_HISTORY_S, config.history_s)
-        yield Span(round(first * ROW_S, 2), round(rows * ROW_S, 2), history, only)
-
-
-def _named_spans(
-    samples: TrackSamples, egos: Sequence[str], config: ConversionConfig, left_out_s: float
+def _usable_spans(
+    samples: TrackSamples, egos: Sequence[str] | None, config: ConversionConfig, left_out_s: float
 ) -> Iterator[Span]:
-    """Windows of named egos, which begin where each is first seen."""
+    """Windows of a recording; those of named egos begin where each is first seen."""
+    runs, end = samples.runs, samples.duration - left_out_s
+    if egos is None:
+        yield from _spans(0, int(np.floor(end / ROW_S + 1e-9)) + 1, -1, config)
+        return
     numbers = {str(name): number for number, name in enumerate(samples.track_ids.tolist())}
-    runs = find_runs(samples, config.max_hole_s)
-    end = samples.duration - left_out_s
     last_s = np.minimum(samples.time[runs.last], end)
     first, last = rows_between(samples.time[runs.first], last_s)
     # beyond its last row an ego is known to exist only where the recording ends, too
@@ -265,6 +216,17 @@ def _named_spans(
             )
         for run in np.flatnonzero(runs.track == numbers[ego]).tolist():
             yield from _spans(int(first[run]), int(rows[run]), numbers[ego], config)
+
+
+def _spans(first: int, rows: int, only: int, config: ConversionConfig) -> Iterator[Span]:
+    """Windows within some rows of 0.05 s; one shorter window where none fits."""
+    full = window_spans(rows * ROW_S, config)
+    for span in full:
+        start = round((first + rows_of(span.start_s)) * ROW_S, 2)
+        yield Span(start, span.length_s, span.history_s, only)
+    if not full and rows * ROW_S >= SHORT_HISTORY_S + _LEAST_S:
+        history = min(SHORT_HISTORY_S, config.history_s)
+        yield Span(round(first * ROW_S, 2), round(rows * ROW_S, 2), history, only)
 
 
 def _accepted_runs(
@@ -285,16 +247,19 @@ def _accepted_runs(
 
 def _scenario(
     source: SourceRecording,
-    offset: FloatArray,
+    samples: TrackSamples,
     config: ConversionConfig,
-    track: int,
+    run: int,
     number: int,
     span: Span,
     trace: EgoTrace,
 ) -> Window | str:
-    """The scenario of an ego in a window, or the rule that its route fails."""
-    samples, road = source.samples, source.map.road
-    padding = rows_of(config.padding_s)
+    """The scenario of an ego in a window, or the rule that its start or its route fails."""
+    road, track, padding = source.map.road, int(samples.runs.track[run]), rows_of(config.padding_s)
+    (pose,), _ = sample_run(samples, run, np.array([span.start_s + span.history_s]))
+    pose[:2] += samples.offset
+    if not starts_on_lane(road, pose, config):
+        return LANE
     first = rows_of(span.start_s)  # with the padding, one padding earlier than the window
     start = first + padding + rows_of(span.history_s)
     end = first + padding + rows_of(span.length_s)
@@ -305,7 +270,7 @@ def _scenario(
     goal = states[-1, :3].copy()
     last = int(np.searchsorted(samples.track, track, side="right")) - 1
     if samples.time[last] > span.start_s + span.length_s:
-        center = np.array([*samples.centers[last, :2] + offset, samples.headings[last]])
+        center = np.array([*samples.xy[last] + samples.offset, samples.headings[last]])
         goal = rear_poses(center)  # nuPlan rule 457
     name = samples.track_ids[track]
     key = f"{road.name}|{samples.name}|{span.start_s}|{name}|{span.length_s}"
@@ -339,11 +304,8 @@ def _scenario(
     )
 
 
-def _rows_outside_map(samples: TrackSamples, road: VectorMap, offset: FloatArray) -> int:
+def _rows_outside_map(samples: TrackSamples, road: VectorMap) -> int:
     bounds = road.edges.polygons.bounds
     low, high = bounds[:, :2].min(axis=0) - _MAP_MARGIN, bounds[:, 2:].max(axis=0) + _MAP_MARGIN
-    outside = np.zeros(len(samples.centers), np.bool_)
-    for axis in (0, 1):
-        place = samples.centers[:, axis] + offset[axis]
-        outside |= (place < low[axis]) | (place > high[axis])
-    return int(outside.sum())
+    places = samples.xy + samples.offset
+    return int(((places < low) | (places > high)).any(axis=1).sum())

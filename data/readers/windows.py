@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.data.readers.samples import ROW_S, Runs, TrackSamples, rows_of
+from shiftsim.data.readers.samples import ROW_S, TrackSamples, rows_of
 from shiftsim.errors import ConfigError, one_of
 from shiftsim.geometry.boxes import box_corners
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
@@ -127,7 +127,6 @@ class WindowVerdicts:
     tracks: IntArray  # (n,) tracks, ascending
     runs: IntArray  # (n,) run that covers the whole window, -1 where none does
     verdicts: tuple[str, ...]  # n names of a rule, or `ego`
-    partners: IntArray  # (n,) track whose box it overlapped, -1 where the verdict is another one
 
 
 def window_spans(duration: float, config: ConversionConfig) -> list[Span]:
@@ -141,18 +140,46 @@ def window_spans(duration: float, config: ConversionConfig) -> list[Span]:
 
 
 def evaluate_windows(
-    recording: TrackSamples, runs: Runs, config: ConversionConfig, spans: Sequence[Span]
+    recording: TrackSamples, config: ConversionConfig, spans: Sequence[Span]
 ) -> list[WindowVerdicts]:
     """The verdict on every track in every window, rules of category to overlap."""
-    only = np.array([span.only for span in spans if span.only >= 0], np.int64)
-    allowed = np.array([name in config.ego_categories for name in recording.categories], np.bool_)
+    clock, runs, num_tracks = recording.clock, recording.runs, len(recording.track_ids)
+    is_ego_kind = np.array([name in config.ego_categories for name in recording.categories])
     speed = _median_of_three(  # nuPlan rule 452
         np.hypot(recording.velocities[:, 0], recording.velocities[:, 1]), recording.track
     )
-    asked = allowed & any(span.only < 0 for span in spans)
-    asked[only] = True
-    partner = overlap_partners(recording, asked, config.max_overlap)
-    return [_evaluate(span, recording, runs, config, allowed, speed, partner) for span in spans]
+    asked = is_ego_kind & any(span.only < 0 for span in spans)
+    asked[[span.only for span in spans if span.only >= 0]] = True
+    is_overlapping = overlap_partners(recording, asked, config.max_overlap) >= 0
+    # where frames are missing at an end of the window, nobody is known to be there
+    longest = config.max_hole_s + recording.period + _EPS
+    out = []
+    for span in spans:
+        stop_s = span.start_s + span.length_s
+        first, stop = np.searchsorted(clock, [span.start_s - _EPS, stop_s - _EPS]).tolist()
+        rows = recording.by_frame[recording.frame_ptr[first] : recording.frame_ptr[stop]]
+        allowed = is_ego_kind
+        if span.only >= 0:
+            allowed = np.arange(num_tracks) == span.only
+            rows = rows[recording.track[rows] == span.only]
+        track = recording.track[rows]
+        tracks = np.unique(track)
+        peak, is_hit = np.zeros(num_tracks), np.zeros(num_tracks, np.bool_)
+        np.maximum.at(peak, track, speed[rows])
+        is_hit[track[is_overlapping[rows]]] = True
+        begin, end = clock[[min(first, len(clock) - 1), max(stop - 1, 0)]].tolist()
+        is_known = begin - span.start_s <= longest and stop_s - end <= longest
+        covering = (recording.frame[runs.first] <= first) & is_known
+        covering &= recording.frame[runs.last] >= stop - 1
+        run = np.full(num_tracks, -1, np.int64)
+        run[runs.track[covering]] = np.flatnonzero(covering)
+        verdict = np.select(
+            [~allowed, run < 0, peak <= config.min_peak_speed, is_hit],
+            [CATEGORY, PRESENCE, SPEED, OVERLAP],
+            EGO,
+        )
+        out.append(WindowVerdicts(span, tracks, run[tracks], tuple(verdict[tracks].tolist())))
+    return out
 
 
 def overlap_partners(
@@ -164,7 +191,7 @@ def overlap_partners(
     `candidates` (N,) are looked at.
     """
     return _first_overlaps(
-        recording.centers,
+        recording.xy,
         recording.raw_headings,
         np.ascontiguousarray(recording.sizes[:, :2]),
         recording.track,
@@ -173,46 +200,6 @@ def overlap_partners(
         candidates,
         max_overlap,
     )
-
-
-def _evaluate(
-    span: Span,
-    recording: TrackSamples,
-    runs: Runs,
-    config: ConversionConfig,
-    allowed: BoolArray,
-    speed: FloatArray,
-    partner: IntArray,
-) -> WindowVerdicts:
-    num_tracks = len(recording.track_ids)
-    first = int(np.searchsorted(recording.clock, span.start_s - _EPS))
-    last = int(np.searchsorted(recording.clock, span.start_s + span.length_s - _EPS)) - 1
-    rows = recording.by_frame[recording.frame_ptr[first] : recording.frame_ptr[last + 1]]
-    if span.only >= 0:
-        allowed = np.arange(num_tracks) == span.only
-        rows = rows[recording.track[rows] == span.only]
-    tracks = np.flatnonzero(np.bincount(recording.track[rows], minlength=num_tracks))
-    peak = np.zeros(num_tracks)
-    np.maximum.at(peak, recording.track[rows], speed[rows])
-    covering = (recording.frame[runs.first] <= first) & (recording.frame[runs.last] >= last)
-    # where frames are missing at an end of the window, nobody is known to be there
-    longest = config.max_hole_s + recording.period + _EPS
-    begin, end = recording.clock[[min(first, len(recording.clock) - 1), max(last, 0)]].tolist()
-    covering &= begin - span.start_s <= longest
-    covering &= span.start_s + span.length_s - end <= longest
-    run = np.full(num_tracks, -1, np.int64)
-    run[runs.track[covering]] = np.flatnonzero(covering)
-    hit = np.full(num_tracks, -1, np.int64)
-    touching = rows[partner[rows] >= 0][::-1]  # the earliest row of a track is written last
-    hit[recording.track[touching]] = partner[touching]
-    verdict = np.select(
-        [~allowed, run < 0, peak <= config.min_peak_speed, hit >= 0],
-        [CATEGORY, PRESENCE, SPEED, OVERLAP],
-        EGO,
-    )
-    found = verdict[tracks]
-    partners = np.where(found == OVERLAP, hit[tracks], -1)
-    return WindowVerdicts(span, tracks, run[tracks], tuple(found.tolist()), partners)
 
 
 def _median_of_three(values: FloatArray, track: IntArray) -> FloatArray:

@@ -158,15 +158,13 @@ def tracks(
     the picture beside the report shows tracks and map. Recordings shorter than a window become one
     scenario each, with 2 s of history.
     """
-    from shiftsim.data.readers.tracks.inspection import (
-        convert_tracks,
-        inspect_tracks,
-        tracks_config,
-    )
+    from shiftsim.data.readers.scenarios import EGO_CATEGORIES
+    from shiftsim.data.readers.tracks.inspection import convert_tracks, inspect_tracks
+    from shiftsim.data.readers.windows import make_config
     from shiftsim.data.store.tables import picture_file
 
     flags = cli.given(window_s=window_s, overlap_s=overlap_s, history_s=history_s)
-    config = tracks_config(**flags)
+    config = make_config({"ego_categories": EGO_CATEGORIES, **flags})
     overrides = read_toml(columns) if columns else {}
     egos = None if ego is None or "all" in ego else ego
     folder = store_path(store)
@@ -179,7 +177,7 @@ def tracks(
     picture = picture_file(folder, inspection.road.name, inspection.table.name)
     errors = inspection.diagnostics.errors
     try:
-        report = convert_tracks(inspection, folder, egos=egos, config=config)
+        report = convert_tracks(inspection, folder, egos=egos)
     except ConversionError:
         for wrong in errors:
             echo(f" wrong: {wrong.what}\n   remedy: {wrong.remedy}")

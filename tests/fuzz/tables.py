@@ -75,11 +75,9 @@ def read_track_table(folder: Path) -> Any:
     """As `shiftsim convert tracks` does it."""
     from fuzz.targets import read_store
 
-    from shiftsim.data.readers.tracks.inspection import (
-        convert_tracks,
-        inspect_tracks,
-        tracks_config,
-    )
+    from shiftsim.data.readers.scenarios import EGO_CATEGORIES
+    from shiftsim.data.readers.tracks.inspection import convert_tracks, inspect_tracks
+    from shiftsim.data.readers.windows import ConversionConfig
     from shiftsim.errors import ConfigError, ConversionError
     from shiftsim.files import read_toml
 
@@ -89,11 +87,13 @@ def read_track_table(folder: Path) -> Any:
         for name in ("tracks.csv", "01_tracks.csv", "tracks.parquet")
         if (path := folder / name).exists()
     )
-    short = tracks_config(window_s=4.0, overlap_s=1.0, history_s=1.0)
+    short = ConversionConfig(
+        ego_categories=EGO_CATEGORIES, window_s=4.0, overlap_s=1.0, history_s=1.0
+    )
     words = read_toml(said) if said.exists() else {}
     try:
         inspection = inspect_tracks(tracks, folder / "road.xodr", overrides=words, config=short)
-        convert_tracks(inspection, folder / "store", config=short)
+        convert_tracks(inspection, folder / "store")
     except ConfigError as error:  # the command names the file
         raise ConfigError(f"{tracks}: {error.message}", error.hint) from error
     except ConversionError as error:  # as it does with what it doubts

@@ -71,15 +71,14 @@ EXPECTED: dict[str, Range | tuple[Range, ...]] = {
     "Site.offset": DSC3D["reference_utm.offset"],
     "Site.frame_rate": DSC3D["frame_rate"],
     "Site.frame_distance": DSC3D["frame_distance"],
-    "Annotations.start_us": DSC3D["time"],
-    "Annotations.frame": DSC3D["frame_id"],
-    "Annotations.track_ids": DSC3D["track_id"],
-    "Annotations.bottom": DSC3D["translation_x"],
+    "TrackSamples.start_us": DSC3D["time"],
+    "TrackSamples.frame": DSC3D["frame_id"],
+    "TrackSamples.track_ids": DSC3D["track_id"],
     # a box rests on its bottom, which may be tilted
-    "Annotations.centers": Range(*(1.01 * end for end in DSC3D["translation_x"][:2])),
-    "Annotations.angles": DSC3D["rotation_x"],
-    "Annotations.sizes": DSC3D["dimension_x"]._replace(low=1e-300),
-    "Annotations.velocities": Range(-200, 200, "m/s"),  # faster ones are not believed
+    "TrackSamples.xy": Range(*(1.01 * end for end in DSC3D["translation_x"][:2])),
+    "TrackSamples.raw_headings": DSC3D["rotation_x"],
+    "TrackSamples.sizes": DSC3D["dimension_x"]._replace(low=1e-300),
+    "TrackSamples.velocities": Range(-200, 200, "m/s"),  # faster ones are not believed
     **{name: RUN[field] for name, field in RUN_COLUMNS.items()},
     "ego of a rollout": RUN["state"],
     "weight": CHECKPOINT["weight"],

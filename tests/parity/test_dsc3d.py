@@ -25,12 +25,32 @@ from shiftsim.data.maps.opendrive.graph import LaneSegment
 from shiftsim.data.maps.opendrive.lanes import LaneKey
 from shiftsim.data.maps.opendrive.map import build_road_map
 from shiftsim.data.maps.opendrive.reading import read_opendrive
-from shiftsim.data.readers.annotations import Annotations, Site, read_recording
+from shiftsim.data.readers.annotations import (
+    POSITION as PLACE,
+)
+from shiftsim.data.readers.annotations import (
+    ROTATION,
+    Site,
+    read_recording,
+    rotation_angles,
+)
 from shiftsim.data.readers.dsc3d import find_map, open_site
 from shiftsim.data.readers.reader import SourceRecording, site_map
-from shiftsim.data.readers.samples import ROW_S, find_runs, rows_between, sample_run
+from shiftsim.data.readers.samples import (
+    ROW_S,
+    TrackSamples,
+    rows_between,
+    sample_run,
+)
 from shiftsim.data.readers.scenarios import Converted, convert_recording
-from shiftsim.data.readers.windows import EGO, ConversionConfig, evaluate_windows, window_spans
+from shiftsim.data.readers.windows import (
+    EGO,
+    OVERLAP,
+    ConversionConfig,
+    evaluate_windows,
+    overlap_partners,
+    window_spans,
+)
 from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.metrics.route import driven_route
 from shiftsim.world.state import center_poses
@@ -89,27 +109,36 @@ def test_sample(folder: Path, cases: Cases) -> None:
     if len(site.recordings) != 1:
         cases.skip("recordings beyond the first", len(site.recordings) - 1)
     recording, lanes = read_recording(site, site.recordings[0]), Lanes(find_map(site), site)
-    keys = [lanes.keys_at(x, y) for x, y in (recording.bottom[:, :2] + lanes.offset).tolist()]
-    compare_rows(read_file(folder / "expected_rows.parquet", cases), site, recording, keys)
-    compare_samples(read_file(folder / "expected_20hz.parquet", cases), recording)
-    compare_summary(read_file(folder / "expected.json", cases), site, recording, keys)
+    raw = read_file(site.folder / "annotations" / recording.name / "annotations.parquet", cases)
+    raw = raw.at(np.lexsort((raw["frame_id"], raw["track_id"])))
+    bottom = np.column_stack([raw[name] for name in PLACE]).astype(np.float64)
+    keys = [lanes.keys_at(x, y) for x, y in (bottom[:, :2] + lanes.offset).tolist()]
+    rows = read_file(folder / "expected_rows.parquet", cases)
+    compare_rows(rows, site, recording, keys, bottom, raw)
+    compare_samples(read_file(folder / "expected_20hz.parquet", cases), recording, bottom)
+    expected = read_file(folder / "expected.json", cases)
+    compare_summary(expected, site, recording, keys, bottom, raw)
     cases.note(DERIVED)
     name_unknown(folder, cases, "data", "expected_rows.parquet", "expected_20hz.parquet", "*.json")
 
 
-def compare_rows(file: File, site: Site, recording: Annotations, keys: Any) -> None:
+def compare_rows(
+    file: File, site: Site, recording: TrackSamples, keys: Any, bottom: np.ndarray, raw: File
+) -> None:
     """All boxes as recorded, by track and frame."""
     rows = file.at(np.lexsort((file["frame_id"], file["track_id"])))
-    utm = recording.bottom[:, :2] + site.offset[:2]
+    utm = bottom[:, :2] + site.offset[:2]
     lanes = [key[0] if len(key) == 1 else LaneKey("", 0, 0) for key in keys]
     lon, lat = pyproj.Transformer.from_crs(site.epsg, 4326, always_xy=True).transform(*utm.T)
-    yaw, pitch, roll = recording.angles.T
-    x, y, z = recording.centers.T
+    angles, up = rotation_angles(np.column_stack([raw[name] for name in ROTATION]))
+    _, pitch, roll = angles.T
+    x, y = recording.xy.T
+    height = recording.sizes[recording.track, 2]
     ours = {
         "frame_id": recording.frame * site.frame_distance,
         "track_id": recording.track_ids[recording.track],
-        **{"yaw": yaw, "pitch": pitch, "roll": roll},
-        **{"centre_x": x, "centre_y": y, "centre_z": z},
+        **{"yaw": recording.raw_headings, "pitch": pitch, "roll": roll},
+        **{"centre_x": x, "centre_y": y, "centre_z": bottom[:, 2] + 0.5 * height * up[:, 2]},
         **{"utm_x": utm[:, 0], "utm_y": utm[:, 1], "lon": lon, "lat": lat},
         "road": [lane.road for lane in lanes],
         "lane": [lane.lane for lane in lanes],
@@ -119,16 +148,16 @@ def compare_rows(file: File, site: Site, recording: Annotations, keys: Any) -> N
     file.finish()
 
 
-def compare_samples(file: File, recording: Annotations) -> None:
+def compare_samples(file: File, recording: TrackSamples, bottom: np.ndarray) -> None:
     """The bottoms of all boxes at 20 Hz, by track and time."""
-    recording = replace(recording, centers=recording.bottom)
-    runs = find_runs(recording, CONFIG.max_hole_s)
+    recording = replace(recording, xy=np.ascontiguousarray(bottom[:, :2]))
+    runs = recording.runs
     first, last = rows_between(recording.time[runs.first], recording.time[runs.last])
     run = np.repeat(np.arange(len(first)), last - first + 1)
     step = np.concatenate([*map(np.arange, first, last + 1)])
     time = step * ROW_S
-    parts = [sample_run(recording, runs, i, time[run == i]) for i in range(len(first))]
-    poses, velocities, _ = map(np.concatenate, zip(*parts, strict=True))
+    parts = [sample_run(recording, i, time[run == i]) for i in range(len(first))]
+    poses, velocities = map(np.concatenate, zip(*parts, strict=True))
     ours = {"track_id": recording.track_ids[runs.track[run]], "step": step, "t": time}
     ours |= dict(zip(("x", "y", "yaw"), poses.T, strict=True))
     ours |= dict(zip(("vx", "vy"), velocities.T, strict=True))
@@ -136,14 +165,14 @@ def compare_samples(file: File, recording: Annotations) -> None:
     file.finish()
 
 
-def compare_summary(expected: File, site: Site, recording: Annotations, keys: Any) -> None:
+def compare_summary(
+    expected: File, site: Site, recording: TrackSamples, keys: Any, bottom: np.ndarray, raw: File
+) -> None:
     report, folder = expected.report, site.folder / "annotations" / recording.name
-    raw = read_file(folder / "annotations.parquet", report)
-    order = np.lexsort((raw["frame_id"], raw["track_id"]))
-    velocity = np.column_stack([raw[f"velocity_{axis}"] for axis in "xyz"])[order]
+    velocity = np.column_stack([raw[f"velocity_{axis}"] for axis in "xyz"])
     stamps = read_file(folder / "frames.parquet", report)["time"].astype("datetime64[us]")
     lag = (stamps - stamps[0]).astype(np.int64) * 1e-6 - recording.clock
-    yaw, moving = recording.angles[:, 0], np.arctan2(velocity[:, 1], velocity[:, 0])
+    yaw, moving = recording.raw_headings, np.arctan2(velocity[:, 1], velocity[:, 0])
     first, last = (f"{t:%Y-%m-%d %H:%M:%S.%f}+00:00" for t in stamps[[0, -1]].tolist())
     ours = {
         "rows": len(recording.track),
@@ -154,7 +183,7 @@ def compare_summary(expected: File, site: Site, recording: Annotations, keys: An
         **{"first_time": first, "last_time": last},
         "max_abs_time_minus_frameid_over_rate_s": np.abs(lag).max(),
         "max_yaw_minus_velocity_heading_rad": np.abs(wrap_angles(yaw - moving)).max(),
-        "max_yaw_minus_rotation_z_rad": np.abs(yaw - raw["rotation_z"][order]).max(),
+        "max_yaw_minus_rotation_z_rad": np.abs(yaw - raw["rotation_z"]).max(),
         "boxes_in_exactly_one_driving_lane": sum(len(key) == 1 for key in keys),
         "steps_20hz": int(recording.duration / ROW_S + 1e-9) + 1,
     }
@@ -165,7 +194,7 @@ def compare_summary(expected: File, site: Site, recording: Annotations, keys: An
         rows = np.flatnonzero(recording.track == number)
         lanes = {(key.road, key.lane) for row in rows for key in keys[row]}
         track.values["road_lane"].sort()
-        steps = np.hypot(*np.diff(recording.bottom[rows, :2], axis=0).T)
+        steps = np.hypot(*np.diff(bottom[rows, :2], axis=0).T)
         speed = np.linalg.norm(velocity[rows], axis=1)
         length, width, height = recording.sizes[number]
         mine = {
@@ -180,7 +209,7 @@ def compare_summary(expected: File, site: Site, recording: Annotations, keys: An
     expected.finish()
 
 
-def tracks_of(expected: File, recording: Annotations) -> Iterator[tuple[int, str, File]]:
+def tracks_of(expected: File, recording: TrackSamples) -> Iterator[tuple[int, str, File]]:
     """Number, name and answers of every track; compares which there are."""
     tracks, track_ids = expected.each("tracks")[0], recording.track_ids.tolist()
     expected.report.compare("track ids", recording.name, track_ids, sorted(map(int, tracks)))
@@ -213,9 +242,8 @@ def compare_scripted(folder: Path, maps: Path, cases: Cases) -> None:
     if found := next(filter(Path.is_file, here), None):
         lanes = Lanes(found, site)
         spans = window_spans(recording.duration, CONFIG)
-        source = SourceRecording(
-            recording, site_map(lanes.road, {}), config=CONFIG, spans=spans, offset=lanes.offset
-        )
+        placed = replace(recording, offset=lanes.offset)
+        source = SourceRecording(placed, site_map(lanes.road, {}), config=CONFIG, spans=spans)
         converted = convert_recording(source)
         compare_converted(folder, converted, lanes, lanes_from, cases)
     else:
@@ -225,18 +253,22 @@ def compare_scripted(folder: Path, maps: Path, cases: Cases) -> None:
     name_unknown(folder, cases, "data", "expected_ego_20hz.parquet", "expected.json")
 
 
-def compare_windows(expected: File, recording: Annotations, name: str) -> dict[Any, Any]:
+def compare_windows(expected: File, recording: TrackSamples, name: str) -> dict[Any, Any]:
     """Windows and verdicts; what the file says of lanes, by window and ego."""
     cases, track_ids, lanes_from = expected.report, recording.track_ids.tolist(), {}
-    runs, spans = find_runs(recording, CONFIG.max_hole_s), window_spans(recording.duration, CONFIG)
-    windows = evaluate_windows(recording, runs, CONFIG, spans)
+    windows = evaluate_windows(recording, CONFIG, window_spans(recording.duration, CONFIG))
+    everybody = np.ones(len(track_ids), np.bool_)
+    partners = overlap_partners(recording, everybody, CONFIG.max_overlap)
     wanted = expected.each("windows")
     cases.compare("windows", name, len(windows), len(wanted))
     for window, theirs in zip(windows, wanted, strict=False):
         where, given = f"{name} window {window.span.start_s:g} s", theirs["verdict"]
-        verdicts, judged = {}, zip(window.tracks, window.verdicts, window.partners, strict=True)
-        for number, verdict, partner in judged:
-            other = f" with {track_ids[partner]}" if partner >= 0 else ""
+        verdicts, judged = {}, zip(window.tracks, window.verdicts, strict=True)
+        begin_s, end_s = window.span.start_s - ATOL, window.span.start_s + window.span.length_s
+        inside = (recording.time >= begin_s) & (recording.time < end_s - ATOL)
+        for number, verdict in judged:
+            rows = np.flatnonzero(inside & (recording.track == number) & (partners >= 0))
+            other = f" with {track_ids[partners[rows[0]]]}" if verdict == OVERLAP else ""
             verdicts[str(track_ids[number])] = f"{verdict}{other}"
         egos = [int(name) for name, verdict in verdicts.items() if verdict == EGO]
         ours = {"start_s": window.span.start_s, "egos": egos}

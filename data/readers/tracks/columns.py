@@ -74,10 +74,10 @@ class Columns:
     shift: tuple[float, float] = (0.0, 0.0)  # added to x and y [m]
     reference: str = ""  # `front`, `rear` or `center`, where the user gives it
 
-    @property
-    def names(self) -> list[str]:
-        """Columns of the file that are read."""
-        return list(dict.fromkeys(c.name for c in self.found.values() if c.name))
+    def unit_factors(self, role: str) -> dict[str, float]:
+        """By unit, what the values of a column are multiplied by if they are in that one."""
+        units, unit_now = UNITS[_ROLES[role][0]], self.found[role].unit
+        return {unit: factor / units[unit_now] for unit, factor in units.items()}
 
 
 def recognise(names: Sequence[str], overrides: Mapping[str, Any], where: str) -> Columns:

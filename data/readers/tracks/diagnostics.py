@@ -9,17 +9,15 @@ import numpy as np
 from shiftsim.data.readers.build import find_pause, find_twice
 from shiftsim.data.readers.codes import KINDS
 from shiftsim.data.readers.motion import contradiction
-from shiftsim.data.readers.tracks.axes import check_headings, check_reference, check_velocities
-from shiftsim.data.readers.tracks.columns import UNITS, Columns
-from shiftsim.data.readers.tracks.map_fit import MIN_ALONG, Fit, fit_map
-from shiftsim.data.readers.tracks.statistics import (
-    FAST,
+from shiftsim.data.readers.tracks.axes import (
     LEAST_CONTRADICTING,
-    Diagnostics,
-    TrackStatistics,
+    check_headings,
+    check_reference,
+    check_velocities,
 )
+from shiftsim.data.readers.tracks.findings import FAST, Diagnostics
+from shiftsim.data.readers.tracks.map_fit import MIN_ALONG, Fit, fit_map
 from shiftsim.data.readers.tracks.table import TrackTable
-from shiftsim.kernels import BoolArray
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AgentKind
 
@@ -43,89 +41,131 @@ _MAX_OVERSPEED = 1.6  # of the speed limit, of nine tenths of the rows
 def diagnose(table: TrackTable, road: VectorMap, min_share: float) -> Diagnostics:
     """Everything that cannot be right; `min_share` of the moving vehicles must be on the map."""
     out = Diagnostics()
-    used = np.unique(table.category).tolist()
-    if unknown := [
-        name for i, name in enumerate(table.categories) if i in used and name not in KINDS
-    ]:
-        names = ", ".join(repr(name[:40]) for name in unknown[:8])
+    for check in (_check_kinds, _check_times, _check_jumps, _check_speeds):
+        if not check(table, out):  # what follows would mean nothing
+            return out
+    _check_gaps(table, out)
+    _check_starts(table, out)
+    fit = _check_map(table, road, min_share, out)
+    _check_accelerations(table, out)
+    _check_walkers(table, out)
+    _check_sizes(table, out)
+    check_headings(table, fit, out)
+    check_velocities(table, fit, out)
+    if not out.errors:
+        check_reference(table, out)
+    return out
+
+
+def _check_kinds(table: TrackTable, out: Diagnostics) -> bool:
+    """Whether all kinds are known, and one is a vehicle."""
+    used = [table.categories[code] for code in np.unique(table.category).tolist()]
+    if unknown := [name[:40] for name in used if name not in KINDS]:
         out.error(
-            f"kinds {names} are unknown",
-            f"say what they are in a TOML file for --columns: [kinds] {unknown[0][:40]!r} = 'car';"
+            f"kinds {', '.join(map(repr, unknown[:8]))} are unknown",
+            f"say what they are in a TOML file for --columns: [kinds] {unknown[0]!r} = 'car';"
             f" known are {', '.join(sorted(KINDS))}",
         )
-        return out
-    time = (table.time_us - table.time_us.min()) / 1e6
-    same = np.diff(table.track) == 0
-    step = np.diff(table.time_us)[same] / 1e6
-    stats = TrackStatistics(table, time, float(np.median(step)) if len(step) else 0.0)
-    if not stats.is_vehicle.any():
+    elif not table.is_vehicle.any():
         out.error(
             f"none of the {len(table.track_ids)} objects is a vehicle, so none can be the ego:"
             f" kinds {', '.join(map(repr, table.categories))}",
             "check the column of kinds, or map them: [kinds]",
         )
-        return out
-    if not _check_times(stats, out):
-        return out
-    if not (_check_jumps(stats, same, out) and _check_speeds(stats, out)):
-        return out
-    moving = stats.rows(_MOVING)
-    _check_gaps(table, out)
-    _check_starts(stats, out)
-    # another unit of length would show elsewhere, too
-    is_metric = _has_usual_sizes(stats) and _velocities_fit(stats)
-    fit = fit_map(road, table.xy[moving], stats.derived[moving], min_share, only_metres=is_metric)
-    out.figures.update({"drivable_share": fit.share, "along_share": fit.along})
-    _check_fit(fit, table.columns, min_share, out)
-    if fit.is_good and fit.overspeed > _MAX_OVERSPEED:
-        out.figures["overspeed"] = fit.overspeed
-        out.warn(
-            f"a tenth of the moving vehicles is {fit.overspeed:.2g} times as fast as the speed"
-            f" limit of their lane or faster, usual is less than {_MAX_OVERSPEED:g}",
-            "check --hz or the unit of time, unless the limits of the map are wrong",
-        )
-    _check_accelerations(stats, out)
-    _check_walkers(stats, out)
-    _check_sizes(stats, out)
-    check_headings(stats, fit, out)
-    check_velocities(stats, fit, out)
-    if not out.errors:
-        check_reference(stats, out)
-        out.derived = stats.derived
-    return out
+    return not out.errors
 
 
-def _check_times(stats: TrackStatistics, out: Diagnostics) -> bool:
+def _check_times(table: TrackTable, out: Diagnostics) -> bool:
     """Whether the motion of objects can be determined at all."""
-    table, period = stats.table, stats.period
-    if len(stats.ends) == len(table.track) + 1:
+    slow, fast = _RATES
+    period, column = table.period, table.columns.found.get("time")
+
+    def is_usual(period: float) -> bool:
+        return 0.99 / fast <= period <= 1.01 / slow
+
+    if len(table.ends) == len(table.track) + 1:
         out.error(
             f"each of the {len(table.track_ids)} objects has one row only",
             "check the column of ids: an object needs the same id in all its rows",
         )
-        return False
-    if fault := find_twice(table.track_ids, table.track, table.time_us):
+    elif fault := find_twice(table.track_ids, table.track, table.time_us):
         out.error(*fault)
-        return False
-    slow, fast = _RATES
-    if 0.99 / fast <= period <= 1.01 / slow:
+    elif is_usual(period):
         if fault := find_pause(table.time_us):
             out.error(*fault)
-        return fault is None
-    column = table.columns.found.get("time")
-    remedy = "check the unit of time: [units] time = 's', 'ms', 'us' or 'ns'"
-    if column is not None and table.hz is None:
-        units = UNITS["time"]
-        for unit, factor in units.items():
-            if 1.0 / fast <= period * factor / units[column.unit] <= 1.0 / slow:
-                remedy = f"{column.name!r} looks like {unit}: [units] time = {unit!r}"
-        if abs(period / (units[column.unit] / 1e6) - 1.0) < 1e-9:
-            remedy += f"; if it counts frames: [columns] frame = {column.name!r}, and --hz"
     else:
         remedy = "check --hz, the number of frames per second"
+        if column is not None and table.hz is None:
+            remedy = "check the unit of time: [units] time = 's', 'ms', 'us' or 'ns'"
+            for unit, factor in table.columns.unit_factors("time").items():
+                if is_usual(period * factor):
+                    remedy = f"{column.name!r} looks like {unit}: [units] time = {unit!r}"
+            if abs(period * 1e6 / column.factor("time") - 1.0) < 1e-9:
+                remedy += f"; if it counts frames: [columns] frame = {column.name!r}, and --hz"
+        out.error(
+            f"rows of an object are {period:g} s apart ({1.0 / period:g} Hz), need"
+            f" {slow:g} … {fast:g} Hz",
+            remedy,
+        )
+    return not out.errors
+
+
+def _check_jumps(table: TrackTable, out: Diagnostics) -> bool:
+    """Single rows that are far from their neighbours; whether speeds mean anything beside them."""
+    same = np.diff(table.track) == 0
+    step, way = np.diff(table.time), np.hypot(*np.diff(table.xy, axis=0).T)
+    far = np.flatnonzero(same & (way > _JUMP) & (way > _JUMP_SPEED * step))
+    out.figures["jumps"] = float(len(far))
+    if not len(far):
+        return True
+    speed = way[same] / step[same]
+    if np.median(speed[speed > _MOVING]) > _MAX_SPEED:
+        return True  # all do: a matter of units
+    remedy = "one id names two objects, or a row is wrong: give objects ids of their own"
+    for axis, places in zip("xy", table.xy[far + 1].T, strict=True):
+        values, counts = np.unique(places, return_counts=True)
+        if counts.max() > 0.2 * len(far) and len(far) > 10:
+            remedy = (
+                f"many of them lead to {axis} = {values[counts.argmax()]:g} m, which looks like a"
+                " place that is not known: leave these rows out"
+            )
+    row = far[0]
     out.error(
-        f"rows of an object are {period:g} s apart ({1.0 / period:g} Hz), need"
-        f" {slow:g} … {fast:g} Hz",
+        f"object {table.track_ids[table.track[row]].item()!r} jumps {way[row]:.1f} m within"
+        f" {table.time[row + 1] - table.time[row]:g} s at {table.time[row]:g} s ({len(far)}"
+        f" such jumps; more than {_JUMP_SPEED:g} m/s is no motion)",
+        remedy,
+    )
+    return len(far) < 0.01 * int(same.sum())
+
+
+def _check_speeds(table: TrackTable, out: Diagnostics) -> bool:
+    speed = table.speed[table.is_vehicle]
+    high, fastest = float(np.percentile(speed, 95)), float(speed.max())
+    out.figures["fastest_vehicle_mps"] = fastest
+    if high > _MAX_SPEED:
+        factors = table.columns.unit_factors("x")
+        fitting = [unit for unit, factor in factors.items() if 1 < high * factor < 40]
+        guess = "".join(f": they look like {u}: [units] position = {u!r}" for u in fitting[:1])
+        out.error(
+            f"vehicles move at {high:.4g} m/s (95 % of the rows are slower), at most {_MAX_SPEED:g}"
+            " m/s is possible",
+            f"check the units of positions and time{guess}",
+        )
+        return False
+    if fastest >= _LEAST_SPEED:
+        return True
+    remedy = "check the units of positions and time; an ego must move"
+    if _LEAST_SPEED < fastest * 1000.0 < _MAX_SPEED:
+        remedy = "positions look like kilometres: [units] position = 'km'"
+    elif _LEAST_SPEED < fastest * _DEGREE < _MAX_SPEED and np.abs(table.xy).max() <= 360.0:
+        remedy = (
+            "positions look like degrees of longitude and latitude: project them to the metric"
+            " frame of the map (pyproj)"
+        )
+    out.error(
+        f"no vehicle is faster than {fastest:.3g} m/s, and all positions are within"
+        f" {np.ptp(table.xy, axis=0).max():.3g} m; an ego must reach {_LEAST_SPEED:g} m/s",
         remedy,
     )
     return False
@@ -143,9 +183,9 @@ def _check_gaps(table: TrackTable, out: Diagnostics) -> None:
         )
 
 
-def _check_starts(stats: TrackStatistics, out: Diagnostics) -> None:
+def _check_starts(table: TrackTable, out: Diagnostics) -> None:
     """Objects that all begin at once and end one after another."""
-    first, last = stats.time[stats.ends[:-1]], stats.time[stats.ends[1:] - 1]
+    first, last = table.time[table.ends[:-1]], table.time[table.ends[1:] - 1]
     vanish = (last < last.max() - 1.0).mean()
     if len(first) >= _LEAST_OBJECTS and first.max() == 0.0 and vanish > 0.5:
         out.warn(
@@ -155,87 +195,54 @@ def _check_starts(stats: TrackStatistics, out: Diagnostics) -> None:
         )
 
 
-def _check_jumps(stats: TrackStatistics, same: BoolArray, out: Diagnostics) -> bool:
-    """Single rows that are far from their neighbours; whether speeds mean anything beside them."""
-    table = stats.table
-    way = np.hypot(*np.diff(table.xy, axis=0).T)
-    far = same & (way > _JUMP) & (way > _JUMP_SPEED * np.diff(stats.time))
-    count = int(far.sum())
-    out.figures["jumps"] = float(count)
-    if not count:
-        return True
-    speed = way[same] / np.diff(stats.time)[same]
-    if np.median(speed[speed > _MOVING]) > _MAX_SPEED:
-        return True  # all do: a matter of units
-    row = int(np.flatnonzero(far)[0])
-    name = table.track_ids[table.track[row]].item()
-    remedy = "one id names two objects, or a row is wrong: give objects ids of their own"
-    ends = table.xy[np.flatnonzero(far) + 1]
-    for axis, column in enumerate("xy"):
-        values, counts = np.unique(ends[:, axis], return_counts=True)
-        if counts.max() > 0.2 * count and count > 10:
-            common = values[counts.argmax()]
-            remedy = (
-                f"many of them lead to {column} = {common:g} m, which looks like a place that is"
-                " not known: leave these rows out"
+def _check_map(table: TrackTable, road: VectorMap, min_share: float, out: Diagnostics) -> Fit:
+    """Whether vehicles are on the map, and as fast as its limits allow."""
+    stored, moving, fast = table.velocities, table.moving_rows(_MOVING), table.moving_rows(FAST)
+    # another unit of length would show elsewhere, too
+    is_metric = table.vehicle_size is not None and _is_usual(*table.vehicle_size)
+    if is_metric and stored is not None and len(fast):
+        wrong, _ = contradiction(stored, table.derived, table.time, table.track)
+        is_metric = bool(wrong[table.track[fast]].mean() <= LEAST_CONTRADICTING)
+    else:
+        is_metric = False
+    fit = fit_map(road, table.xy[moving], table.derived[moving], min_share, only_metres=is_metric)
+    out.figures |= {"drivable_share": fit.share, "along_share": fit.along}
+    if fit.is_good:
+        if fit.overspeed > _MAX_OVERSPEED:
+            out.figures["overspeed"] = fit.overspeed
+            out.warn(
+                f"a tenth of the moving vehicles is {fit.overspeed:.2g} times as fast as the speed"
+                f" limit of their lane or faster, usual is less than {_MAX_OVERSPEED:g}",
+                "check --hz or the unit of time, unless the limits of the map are wrong",
             )
-    out.error(
-        f"object {name!r} jumps {way[row]:.1f} m within"
-        f" {stats.time[row + 1] - stats.time[row]:g} s at {stats.time[row]:g} s ({count}"
-        f" such jumps; more than {_JUMP_SPEED:g} m/s is no motion)",
-        remedy,
+        return fit
+    what = f"only {fit.along:.0%} of the moving vehicles drive along the lane they are on, need"
+    what += f" {MIN_ALONG:.0%}"
+    if fit.share < min_share:
+        what = f"only {fit.share:.0%} of the moving vehicles are on drivable area, need"
+        what += f" {min_share:.0%}"
+    remedy = (
+        "no other unit, axis or origin fits better: give the map of this place, and check that it"
+        " is of this recording"
     )
-    return count < 0.01 * same.sum()
+    if fit.best is not None:
+        what += f"; {fit.best.share:.0%} {fit.best.words}"
+        names = (table.columns.found[axis].name for axis in "xy")
+        remedy = f"in a TOML file: {', and '.join(fit.best.remedies(*names))}"
+    out.error(what, remedy)
+    return fit
 
 
-def _check_speeds(stats: TrackStatistics, out: Diagnostics) -> bool:
-    speed = stats.speed[stats.is_vehicle]
-    high, fastest = float(np.percentile(speed, 95)), float(speed.max())
-    out.figures.update({"fastest_vehicle_mps": fastest})
-    table = stats.table
-    column = table.columns.found["x"]
-    if high > _MAX_SPEED:
-        units = UNITS["position"]
-        fitting = [u for u, f in units.items() if 1 < high * f / units[column.unit] < 40]
-        guess = (
-            f": they look like {fitting[0]}: [units] position = {fitting[0]!r}" if fitting else ""
-        )
-        out.error(
-            f"vehicles move at {high:.4g} m/s (95 % of the rows are slower), at most {_MAX_SPEED:g}"
-            " m/s is possible",
-            f"check the units of positions and time{guess}",
-        )
-        return False
-    if fastest < _LEAST_SPEED:
-        spread = float((table.xy.max(axis=0) - table.xy.min(axis=0)).max())
-        remedy = "check the units of positions and time; an ego must move"
-        if _LEAST_SPEED < fastest * UNITS["position"]["km"] < _MAX_SPEED:
-            remedy = "positions look like kilometres: [units] position = 'km'"
-        elif _LEAST_SPEED < fastest * _DEGREE < _MAX_SPEED and np.abs(table.xy).max() <= 360.0:
-            remedy = (
-                "positions look like degrees of longitude and latitude: project them to the metric"
-                " frame of the map (pyproj)"
-            )
-        out.error(
-            f"no vehicle is faster than {fastest:.3g} m/s, and all positions are within"
-            f" {spread:.3g} m; an ego must reach {_LEAST_SPEED:g} m/s",
-            remedy,
-        )
-        return False
-    return True
-
-
-def _check_accelerations(stats: TrackStatistics, out: Diagnostics) -> None:
+def _check_accelerations(table: TrackTable, out: Diagnostics) -> None:
     """Along and across, over half a second: three times too fast they are nine times as large."""
-    track, time = stats.table.track, stats.time
-    rows = stats.rows(FAST)
-    after = np.minimum(rows + max(1, round(_ACCELERATION_S / stats.period)), len(time) - 1)
-    used = (track[after] == track[rows]) & (time[after] > time[rows])
-    used &= time[after] < time[rows] + 2.0 * max(_ACCELERATION_S, stats.period)
+    time, rows = table.time, table.moving_rows(FAST)
+    after = np.minimum(rows + max(1, round(_ACCELERATION_S / table.period)), len(time) - 1)
+    used = (table.track[after] == table.track[rows]) & (time[after] > time[rows])
+    used &= time[after] < time[rows] + 2.0 * max(_ACCELERATION_S, table.period)
     rows, after = rows[used], after[used]
     if not len(rows):
         return
-    change = stats.derived[after] - stats.derived[rows]
+    change = table.derived[after] - table.derived[rows]
     usual = float(np.median(np.hypot(*change.T) / (time[after] - time[rows])))
     out.figures["acceleration_mps2"] = usual
     if usual > _MAX_ACCELERATION:
@@ -246,14 +253,13 @@ def _check_accelerations(stats: TrackStatistics, out: Diagnostics) -> None:
         )
 
 
-def _check_walkers(stats: TrackStatistics, out: Diagnostics) -> None:
+def _check_walkers(table: TrackTable, out: Diagnostics) -> None:
     """How fast pedestrians walk while they do, the same whatever a clock counts."""
-    is_walker = stats.is_of(AgentKind.PEDESTRIAN)[stats.ends[:-1]]
+    is_walker = table.is_of(AgentKind.PEDESTRIAN)[table.ends[:-1]]
     speeds = []
-    for first, stop in zip(stats.ends[:-1][is_walker], stats.ends[1:][is_walker], strict=True):
-        way = stats.table.xy[stop - 1] - stats.table.xy[first]
-        if np.hypot(*way) > _LEAST_WALK:
-            speed = stats.speed[first:stop]
+    for first, stop in zip(table.ends[:-1][is_walker], table.ends[1:][is_walker], strict=True):
+        if np.hypot(*(table.xy[stop - 1] - table.xy[first])) > _LEAST_WALK:
+            speed = table.speed[first:stop]
             speeds.append(np.median(speed[speed > 0.5 * np.percentile(speed, 90)]))
     if len(speeds) < _LEAST_WALKERS:
         return
@@ -266,55 +272,18 @@ def _check_walkers(stats: TrackStatistics, out: Diagnostics) -> None:
         )
 
 
-def _check_fit(fit: Fit, columns: Columns, min_share: float, out: Diagnostics) -> None:
-    if fit.is_good:
-        return
-    if fit.share < min_share:
-        what = (
-            f"only {fit.share:.0%} of the moving vehicles are on drivable area, need"
-            f" {min_share:.0%}"
-        )
-    else:
-        what = (
-            f"only {fit.along:.0%} of the moving vehicles drive along the lane they are on, need"
-            f" {MIN_ALONG:.0%}"
-        )
-    if fit.best is None:
-        out.error(
-            what,
-            "no other unit, axis or origin fits better: give the map of this place, and check that"
-            " it is of this recording",
-        )
-        return
-    x, y = columns.found["x"].name, columns.found["y"].name
-    remedy = ", and ".join(fit.best.remedies(x, y))
-    out.error(f"{what}; {fit.best.share:.0%} {fit.best.words}", f"in a TOML file: {remedy}")
-
-
-def _usual(length: float, width: float) -> bool:
+def _is_usual(length: float, width: float) -> bool:
     return _LENGTHS[0] <= length <= _LENGTHS[1] and _WIDTHS[0] <= width <= _WIDTHS[1]
 
 
-def _has_usual_sizes(stats: TrackStatistics) -> bool:
-    return stats.vehicle_size is not None and _usual(*stats.vehicle_size)
-
-
-def _velocities_fit(stats: TrackStatistics) -> bool:
-    stored, rows = stats.table.velocities, stats.rows(FAST)
-    if stored is None or not len(rows):
-        return False
-    wrong, _ = contradiction(stored, stats.derived, stats.time, stats.table.track)
-    return bool(wrong[stats.table.track[rows]].mean() <= LEAST_CONTRADICTING)
-
-
-def _check_sizes(stats: TrackStatistics, out: Diagnostics) -> None:
-    sizes = stats.table.sizes
+def _check_sizes(table: TrackTable, out: Diagnostics) -> None:
+    sizes = table.sizes
     if sizes is None:
         return
     large = np.flatnonzero((sizes[:, 0] > _LONGEST) | (sizes[:, 1] > _WIDEST))
     if 0 < len(large) < 0.5 * len(sizes):
         row = large[0]
-        name = stats.table.track_ids[stats.table.track[row]].item()
+        name = table.track_ids[table.track[row]].item()
         out.error(
             f"object {name!r} is {sizes[row, 0]:.4g} m long and {sizes[row, 1]:.4g} m wide"
             f" ({len(large)} rows), at most {_LONGEST:g} m and {_WIDEST:g} m",
@@ -325,7 +294,7 @@ def _check_sizes(stats: TrackStatistics, out: Diagnostics) -> None:
             "all lengths and widths are negative",
             "turn the signs: [columns] length = '-NAME', width = '-NAME'; or leave the columns out",
         )
-    lengths = sizes[stats.is_of(AgentKind.PEDESTRIAN), 0]
+    lengths = sizes[table.is_of(AgentKind.PEDESTRIAN), 0]
     lengths = lengths[lengths > 0.0]
     if len(lengths) and np.median(lengths) > _LONGEST_WALKER:
         out.error(
@@ -333,27 +302,21 @@ def _check_sizes(stats: TrackStatistics, out: Diagnostics) -> None:
             f" {_LONGEST_WALKER:g} m",
             "check the column of kinds; or leave sizes that are not known empty",
         )
-    if stats.vehicle_size is None:
+    if table.vehicle_size is None:
         return
-    length, width = stats.vehicle_size
-    out.figures.update({"median_length_m": length, "median_width_m": width})
-    columns = stats.table.columns.found
-    names = columns["length"].name, columns["width"].name
-
-    if _usual(length, width):
+    length, width = table.vehicle_size
+    out.figures |= {"median_length_m": length, "median_width_m": width}
+    if _is_usual(length, width):
         return
     remedy = "check the unit and the columns of length and width"
-    units = UNITS["size"]
-    for unit, factor in units.items():
-        scale = factor / units[columns["length"].unit]
-        if _usual(length * scale, width * scale):
+    for unit, scale in table.columns.unit_factors("length").items():
+        if _is_usual(length * scale, width * scale):
             remedy = f"they look like {unit}: [units] size = {unit!r}"
-        elif _usual(width * scale, length * scale):
-            remedy = (
-                f"length and width look swapped: [columns] length = {names[1]!r}, width ="
-                f" {names[0]!r}" + ("" if scale == 1 else f", [units] size = {unit!r}")
-            )
-    if _usual(2.0 * length, 2.0 * width):
+        elif _is_usual(width * scale, length * scale):
+            names = [table.columns.found[role].name for role in ("width", "length")]
+            remedy = "length and width look swapped: [columns] length = {!r}, width = {!r}"
+            remedy = remedy.format(*names) + f", [units] size = {unit!r}" * (scale != 1.0)
+    if _is_usual(2.0 * length, 2.0 * width):
         remedy = "these look like halves (extents from the middle): write whole lengths and widths"
     out.error(
         f"the median vehicle is {length:.3g} m long and {width:.3g} m wide, need"

@@ -10,6 +10,7 @@ from shiftsim.data.readers.placement import (
     direction_at,
     place_on_map,
 )
+from shiftsim.data.readers.tracks.columns import UNITS
 from shiftsim.kernels import FloatArray
 from shiftsim.world.map import VectorMap
 
@@ -31,7 +32,6 @@ _AXES = {
     "turned by a quarter turn to the right": np.array([[0.0, 1.0], [-1.0, 0.0]]),
     "with x and y swapped and mirrored": np.array([[0.0, -1.0], [-1.0, 0.0]]),
 }
-_SCALES = {"m": 1.0, "cm": 0.01, "ft": 0.3048, "mm": 0.001, "km": 1000.0}
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Fit:
         """Vectors (n, 2) in the axes and units of the map, as far as these are known."""
         if self.best is None:
             return vectors
-        scale = _SCALES[self.best.unit]
+        scale = UNITS["position"][self.best.unit]
         return scale * vectors @ _AXES[self.best.axes].T
 
 
@@ -117,7 +117,7 @@ def fit_map(
         return Fit(share, along, True, overspeed=over)
     best, value = None, share * along
     speed = float(np.median(np.hypot(*ways.T)))
-    for unit, scale in _SCALES.items():
+    for unit, scale in UNITS["position"].items():
         if not _SPEEDS[0] <= scale * speed <= _SPEEDS[1] or (only_metres and unit != "m"):
             continue
         for shifted in (False, True):

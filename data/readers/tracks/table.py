@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +12,22 @@ import pyarrow.csv as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from shiftsim.data.readers.build import dictionary_codes, index_ids, order_of_rows
-from shiftsim.data.readers.codes import normalise_category
+from shiftsim.data.readers.build import dictionary_codes, index_ids
+from shiftsim.data.readers.codes import KINDS, normalise_category
 from shiftsim.data.readers.files import SourceFile
-from shiftsim.data.readers.motion import unit_vectors
+from shiftsim.data.readers.motion import (
+    fitted_velocities,
+    track_ends,
+    track_medians,
+    unit_vectors,
+)
 from shiftsim.data.readers.tracks.columns import Columns, recognise
 from shiftsim.errors import ConfigError, ConversionError
-from shiftsim.kernels import FloatArray, IntArray
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
+from shiftsim.world.state import AgentKind
 
 _DELIMITERS = ",;\t|"
-_BLOCK_BYTES = 1 << 22  # that are parsed at once
+_MAX_ROWS = 40_000  # that statistics look at
 _FIELDS = {"x": "position", "y": "position", "heading": "heading"}  # that nothing replaces
 
 
@@ -41,6 +48,59 @@ class TrackTable:
     velocities: FloatArray | None  # (A, 2) [m/s]
     sizes: FloatArray | None  # (A, 2) length, width [m]
 
+    @cached_property
+    def time(self) -> FloatArray:
+        """(A,) since the first row [s]."""
+        return (self.time_us - self.time_us.min()) / 1e6
+
+    @cached_property
+    def period(self) -> float:
+        """Median time between rows of an object [s]; 0 where none has two rows."""
+        step = np.diff(self.time_us)[np.diff(self.track) == 0] / 1e6
+        return float(np.median(step)) if len(step) else 0.0
+
+    @cached_property
+    def ends(self) -> IntArray:
+        """(N + 1,) first row of every object, and the number of rows."""
+        return track_ends(self.track)
+
+    def is_of(self, kind: AgentKind) -> BoolArray:
+        """(A,) whether a row is of an object of a kind."""
+        known = [KINDS.get(name) == kind for name in self.categories]
+        return np.array(known, np.bool_)[self.category]
+
+    @cached_property
+    def is_vehicle(self) -> BoolArray:
+        """(A,) whether a row is of a vehicle."""
+        return self.is_of(AgentKind.VEHICLE)
+
+    @cached_property
+    def derived(self) -> FloatArray:
+        """(A, 2) velocities by the positions [m/s]."""
+        return fitted_velocities(self.xy, self.time, self.track, self.period)
+
+    @cached_property
+    def speed(self) -> FloatArray:
+        """(A,) by the positions [m/s]."""
+        return np.hypot(self.derived[:, 0], self.derived[:, 1])
+
+    @cached_property
+    def vehicle_size(self) -> tuple[float, float] | None:
+        """Length and width of the median vehicle [m], where vehicles have sizes."""
+        if self.sizes is None:
+            return None
+        known = track_medians(self.sizes, self.track)[np.unique(self.track[self.is_vehicle])]
+        known = known[(known > 0).all(axis=1)]
+        if not len(known):
+            return None
+        length, width = np.median(known, axis=0).tolist()
+        return length, width
+
+    def moving_rows(self, faster: float) -> IntArray:
+        """Some rows of vehicles that move faster [m/s]."""
+        found = np.flatnonzero(self.is_vehicle & (self.speed > faster))
+        return found[:: max(1, len(found) // _MAX_ROWS)]
+
 
 def read_tracks(
     path: Path, *, overrides: Mapping[str, Any] | None = None, hz: float | None = None
@@ -56,24 +116,18 @@ def read_tracks(
         ConversionError: The file cannot be read, a column is missing or holds something else.
         ConfigError: An override does not fit the file.
     """
-    file = _TableFile(path, dict(overrides or {}))
-    columns, table = file.columns_of, file.table
-    time_us, rate = file.times(hz)
+    file = _TableFile(path, {**(overrides or {}), **({"hz": hz} if hz is not None else {})})
+    columns = file.columns_of
+    time_us, rate = file.times()
     track_ids, track = index_ids(file.ids())
     category, categories = file.categories(track_ids, track)
-    order = order_of_rows(track, time_us)
-    if order is not None:
-        time_us, track, category = time_us[order], track[order], category[order]
+    order = np.lexsort((time_us, track))
 
     def stacked(*roles: str) -> FloatArray | None:
         """(A, number of roles) their values, or nothing where one is missing."""
         if not all(role in columns.found for role in roles):
             return None
-        out = np.empty((len(table), len(roles)))
-        for place, role in enumerate(roles):
-            values = file.values(role)
-            out[:, place] = values if order is None else values[order]
-        return out
+        return np.column_stack([file.values(role)[order] for role in roles])
 
     xy, heading = stacked("x", "y"), stacked("heading")
     headings = None if heading is None else heading[:, 0]
@@ -95,10 +149,10 @@ def read_tracks(
         path.name.partition(".")[0],
         columns,
         rate,
-        time_us,
-        track,
+        time_us[order],
+        track[order],
         track_ids,
-        category,
+        category[order],
         categories,
         xy,
         headings,
@@ -117,65 +171,36 @@ class _TableFile(SourceFile):
         if not path.is_file():
             what = "is no file" if path.exists() else "does not exist"
             raise ConversionError(f"{path} {what}", "give a CSV or Parquet file")
-        is_csv = path.suffix.lower() not in (".parquet", ".pq")
-        self.csv = self._csv_options() if is_csv else None
         self.kinds: dict[int, str] | None = None  # by id, from levelXdata's files
-        names = self._names()
+        self.table = self._load()
+        names = self.table.column_names
         if path.stem.endswith("_tracks"):  # levelXdata: kinds and rate are in files beside it
             self._read_beside(overrides, names)
         self.columns_of = recognise(names, overrides, str(path))
-        self.table = self._read()
         if not len(self.table):
             raise ConversionError(f"{path} has no rows", "export the tracks again")
 
-    def _csv_options(self) -> tuple[dict[str, Any], str]:
-        """Options of the parser, and the decimal point, from the first two lines."""
+    def _load(self) -> pa.Table:
+        """All columns; of CSV, the first two lines tell the delimiter and the decimal point."""
         try:
+            if self.path.suffix.lower() in (".parquet", ".pq"):
+                return pq.read_table(self.path, use_threads=False)
             with pa.input_stream(str(self.path), compression="detect") as stream:
-                lines = stream.read(1 << 16).decode("utf-8-sig").splitlines()[:2]
-        except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
-            what = f"not readable as CSV ({error})"
-            raise self.fault(what, "give CSV in UTF-8, or Parquet (.parquet)") from error
-        if not lines:
-            raise ConversionError(f"{self.path} is empty", "export the tracks again")
-        delimiter = max(_DELIMITERS, key=lines[0].count)
-        point = "," if delimiter != "," and "," in lines[-1] and "." not in lines[-1] else "."
-        read = pc.ReadOptions(use_threads=False, block_size=_BLOCK_BYTES)
-        return {"read_options": read, "parse_options": pc.ParseOptions(delimiter=delimiter)}, point
-
-    def _names(self) -> list[str]:
-        try:
-            if self.csv is None:
-                return list(pq.read_schema(self.path).names)
-            with pc.open_csv(self.path, **self.csv[0]) as stream:
-                return list(stream.schema.names)
-        except (OSError, pa.ArrowException) as error:
-            raise self.fault(f"not readable ({error})") from error
-
-    def _read(self) -> pa.Table:
-        found, names = self.columns_of.found, self.columns_of.names
-        try:
-            if self.csv is None:
-                return pq.read_table(self.path, columns=names, use_threads=False)
-            options, point = self.csv
-            types = {
-                column.name: pa.float64()
-                for role, column in found.items()
-                if role not in ("id", "kind", "time")
-            }
-            types[found["kind"].name] = pa.dictionary(pa.int32(), pa.string())
-            convert = pc.ConvertOptions(
-                include_columns=names,
-                column_types={name: kind for name, kind in types.items() if name},
-                decimal_point=point,
+                lines = stream.read(1 << 16).decode("utf-8-sig", "replace").splitlines()[:2]
+            if not lines:
+                raise ConversionError(f"{self.path} is empty", "export the tracks again")
+            delimiter = max(_DELIMITERS, key=lines[0].count)
+            has_comma = delimiter != "," and "," in lines[-1] and "." not in lines[-1]
+            return pc.read_csv(
+                self.path,
+                read_options=pc.ReadOptions(use_threads=False),
+                parse_options=pc.ParseOptions(delimiter=delimiter),
+                convert_options=pc.ConvertOptions(decimal_point="," if has_comma else "."),
             )
-            try:  # block by block takes half the memory; types are those of the first block
-                with pc.open_csv(self.path, convert_options=convert, **options) as stream:
-                    return stream.read_all()
-            except pa.ArrowInvalid:
-                return pc.read_csv(self.path, convert_options=convert, **options)
         except (OSError, pa.ArrowException, ValueError) as error:
-            raise self.fault(f"not readable ({error})") from error
+            raise self.fault(
+                f"not readable ({error})", "give CSV in UTF-8, or Parquet (.parquet)"
+            ) from error
 
     def _read_beside(self, overrides: dict[str, Any], names: list[str]) -> None:
         """Rate and kinds from levelXdata's files; what the user gives goes first."""
@@ -224,9 +249,9 @@ class _TableFile(SourceFile):
             self.require(_FIELDS[role], values, f"column {column.name!r}")
         return np.pi / 2 - values if column.unit == "compass" else values
 
-    def times(self, hz: float | None) -> tuple[IntArray, float | None]:
+    def times(self) -> tuple[IntArray, float | None]:
         """(A,) time stamps [us], and the frames per second, where they are given in frames."""
-        found, rate = self.columns_of.found, hz or self.columns_of.hz
+        found, rate = self.columns_of.found, self.columns_of.hz
         is_frame = "frame" in found and (rate is not None or "time" not in found)
         role = "frame" if is_frame else "time"
         column = found[role]
@@ -235,8 +260,6 @@ class _TableFile(SourceFile):
                 f"time is given in frames ({column.name!r}) only",
                 "say how many there are per second: --hz 25",
             )
-        if is_frame and not 0.0 < float(rate or 0.0) < np.inf:
-            raise ConfigError(f"hz is {rate!r}", "--hz 25")
         if not column.name:
             raise ConfigError(f"{role} is the same for all rows", f"name a column: {role} = 'NAME'")
         values = self.table[column.name]
@@ -284,7 +307,7 @@ class _TableFile(SourceFile):
         else:
             values = self.table[column.name]
             if not pa.types.is_dictionary(values.type):
-                values = values.cast(pa.string()).dictionary_encode()
+                values = values.cast(pa.string())
             found, codes = dictionary_codes(values)
             names = [*map(str, found.to_pylist()), ""]
         plain = [normalise_category(name) for name in names]

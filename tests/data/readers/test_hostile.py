@@ -59,7 +59,7 @@ def test_frames_years_apart_are_refused_before_anything_is_made_of_them(tmp_path
     ids = pa.array([0, 2, 4_000_000_000], pa.uint32())
     stamps = pa.array([0, 1, 2], pa.timestamp("us", "UTC"))
     pq.write_table(pa.table({"frame_id": ids, "time": stamps}), path)
-    with pytest.raises(ConversionError, match="span 160000000 s"):
+    with pytest.raises(ConversionError, match=r"row between 0.08 s and 1.6e\+08 s"):
         _read(folder)
 
 
@@ -72,7 +72,7 @@ def test_a_small_file_of_very_many_rows_is_refused_unread(tmp_path):
         for _ in range(9):
             file.write_table(many)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(ConversionError, match="9000000 rows, at most 8000000"):
+    with pytest.raises(ConversionError, match="9000000 rows, need 1 to 8000000"):
         _read(folder)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from shiftsim.data.readers.annotations import read_recording
 from shiftsim.data.readers.dsc3d import convert_dsc3d, open_site
-from shiftsim.data.readers.samples import ego_states, find_runs, resample, slope
+from shiftsim.data.readers.samples import ego_states, resample, slope
 from shiftsim.data.readers.windows import (
     ConversionConfig,
     evaluate_windows,
@@ -31,10 +31,9 @@ def _recording(tmp_path, tracks, duration=18.08, **kwargs):
 
 def _verdicts(tmp_path, tracks, duration=18.08, config=CONFIG):
     recording = _recording(tmp_path, tracks, duration)
-    runs = find_runs(recording, config.max_hole_s)
     return [
         dict(zip(recording.track_ids[w.tracks].tolist(), w.verdicts, strict=True))
-        for w in evaluate_windows(recording, runs, config, window_spans(duration, config))
+        for w in evaluate_windows(recording, config, window_spans(duration, config))
     ]
 
 
@@ -100,15 +99,13 @@ def test_the_heading_is_interpolated_the_short_way_round(tmp_path):
     times = writer.frame_times(2.0)
     yaw = np.where(np.arange(len(times)) % 2 == 0, 3.1, -3.1)
     recording = _recording(tmp_path, [writer.car(1, times, yaw=yaw)], duration=2.0)
-    runs = find_runs(recording, 0.5)
-    out = resample(recording, runs, log_name="r", city="c", offset=np.zeros(2))
+    out = resample(recording, "r", "c")
     assert (np.abs(out.tracks.poses[:, 0, 2]) > 3.09).all()
 
 
 def test_rows_are_linear_in_time_and_never_stretched(tmp_path):
     recording = _recording(tmp_path, [writer.car(1, writer.frame_times(18.08))])
-    runs = find_runs(recording, 0.5)
-    out = resample(recording, runs, log_name="r", city="c", offset=np.array([1e5, 5e6]))
+    out = resample(dataclasses.replace(recording, offset=np.array([1e5, 5e6])), "r", "c")
     rows = np.arange(len(out.time_us))
     np.testing.assert_array_equal(out.time_us, writer.START_US + 50_000 * rows)
     np.testing.assert_allclose(
@@ -119,16 +116,14 @@ def test_rows_are_linear_in_time_and_never_stretched(tmp_path):
 def test_a_long_hole_splits_a_track_in_two(tmp_path):
     times = writer.frame_times(10.0)
     recording = _recording(tmp_path, [writer.car(1, times[(times < 4) | (times > 6)])], 10.0)
-    runs = find_runs(recording, 0.5)
-    out = resample(recording, runs, log_name="r", city="c", offset=np.zeros(2))
+    out = resample(recording, "r", "c")
     assert out.tracks.tokens == ("1", "1_2")
     assert not out.tracks.valid[100].any()
 
 
 def test_padding_continues_the_motion_backwards(tmp_path):
     recording = _recording(tmp_path, [writer.car(1, writer.frame_times(5.0))], 5.0)
-    runs = find_runs(recording, 0.5)
-    out = resample(recording, runs, log_name="r", city="c", offset=np.zeros(2), padding_s=2.0)
+    out = resample(recording, "r", "c", padding=40)
     assert out.time_us[0] == writer.START_US - 2_000_000
     np.testing.assert_allclose(out.tracks.poses[0, 0, 0], 20.0 - 16.0, rtol=0, atol=1e-9)
 
