@@ -15,7 +15,7 @@ from time import perf_counter
 from shiftsim.benchmarks.bench import Plan
 from shiftsim.runs.prepare import RunPlan
 from shiftsim.runs.rollouts.columns import decode_rows
-from shiftsim.runs.rollouts.files import PartWriter
+from shiftsim.runs.rollouts.files import write_rollouts
 from shiftsim.runs.task import Batch, TaskRunner
 
 _SECONDS = 2.0  # spent on each planner of each run, as long as it has done a task in that time
@@ -73,7 +73,7 @@ def _measure(do: TaskRunner, batches: list[Batch]) -> tuple[float, float]:
     step = max(1, len(batches) // _MOST)
     spent, done = 0.0, 0
     with TemporaryDirectory() as folder:
-        writer = PartWriter(Path(folder))
+        rollouts = []
         for number, batch in enumerate(batches[::step][:_MOST]):
             if number >= _FEWEST and spent > _SECONDS:
                 break
@@ -81,11 +81,9 @@ def _measure(do: TaskRunner, batches: list[Batch]) -> tuple[float, float]:
             results = do(batch)
             spent += perf_counter() - began
             done += len(results)
-            for result in results:
-                if result.rollout:
-                    writer.add(result.task, decode_rows(result.rollout))
-        writer.close()
-        stored = sum(file.stat().st_size for file in writer.folder.iterdir())
+            rollouts += [(one.task, decode_rows(one.rollout)) for one in results if one.rollout]
+        write_rollouts(Path(folder), rollouts)
+        stored = sum(file.stat().st_size for file in Path(folder).iterdir())
     return spent / done, _ROW_BYTES + stored / done
 
 
