@@ -54,9 +54,9 @@ def total(costs: list[Cost]) -> Cost:
 
 def _costs(name: str, run: RunPlan, shards: int) -> Iterator[Cost]:
     with closing(run.runner()()) as do:
-        for planner in run.planners:
-            own = [batch for batch in run.batches if batch.planner == planner]
-            tasks = sum(len(batch.tasks) for batch in own)
+        for planner in run.config.planners:
+            own = [batch for batch in run.batches if batch[0].planner == planner]
+            tasks = sum(map(len, own))
             each, stored = _measure(do, own)
             workers = max(1, min(run.workers * shards, len(own)))
             memory = _peak() * min(run.workers, workers)
@@ -68,7 +68,7 @@ def _measure(do: TaskRunner, batches: list[Batch]) -> tuple[float, float]:
     """Seconds and bytes of one task: the mean of some from all over the run."""
     if not batches:
         return 0.0, 0.0
-    for batch in {batch.tasks[0].noise: batch for batch in batches}.values():
+    for batch in {batch[0].noise: batch for batch in batches}.values():
         do(batch)  # loads, and compiles
     step = max(1, len(batches) // _MOST)
     spent, done = 0.0, 0

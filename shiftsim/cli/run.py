@@ -229,7 +229,7 @@ def _say_plan(plan: "RunPlan") -> None:
     )
     if config.metrics:
         say(f"metrics     {' '.join(config.metrics)}")
-    is_learned = any(entry.in_batches for entry in plan.planners.values())
+    is_learned = any(plan.planners[name].in_batches for name in config.planners)
     if is_learned or plan.fingerprint["batch_size"] > 1:
         strict = "   strict" if config.strict else ""
         say(f"networks    batch size {config.batch_size}{strict}")

@@ -6,7 +6,6 @@ from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
-from operator import attrgetter
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from shiftsim.errors import DataError
@@ -124,8 +123,7 @@ def _bundle(plan: RunPlan) -> dict[str, Any]:
 
     store, tokens = open_named_store(plan.store), {task.token for task in plan.tasks}
     if plan.selection.edits is not None:
-        edited = plan.selection.edits.over(store)
-        tokens = {edited.base(token) for token in tokens}
+        tokens = {plan.selection.edited[token]["base"] for token in tokens}
     return write_bundle(store, plan.folder, tokens)
 
 
@@ -133,7 +131,7 @@ def _do_tasks(plan: RunPlan, writer: RunWriter, on_progress: OnProgress) -> None
     """Do what is not finished."""
     statuses = {task: record.status for task, record in writer.ended.items()}
     batches = remaining(plan.batches, statuses, retry=plan.config.retry_failed)
-    todo = {task for batch in batches for task in batch.tasks}
+    todo = {task for batch in batches for task in batch}
     earlier = (writer.result(task) for task in statuses if task not in todo)
     progress = Progress(len(plan.tasks) - len(todo), len(plan.tasks), 0)
 
@@ -170,11 +168,11 @@ def remaining(batches: Iterable[Batch], ended: Mapping[Task, str], *, retry: boo
     """
     out: list[Batch] = []
     for batch in batches:
-        failed = tuple(task for task in batch.tasks if ended.get(task) in (FAILED, TIMEOUT))
-        if not all(task in ended for task in batch.tasks):
+        failed = tuple(task for task in batch if ended.get(task) in (FAILED, TIMEOUT))
+        if not all(task in ended for task in batch):
             out.append(batch)
         elif retry and failed:
-            out.append(Batch(failed))
+            out.append(failed)
     return out
 
 
@@ -186,9 +184,9 @@ def _results(plan: RunPlan, batches: Sequence[Batch]) -> Generator[list[TaskResu
                 yield from map(run_batch, batches)
             return
         options: dict[str, Any] = {
-            "alone": min(len(plan.planners), len(batches)),
+            "alone": min(len(plan.config.planners), len(batches)),
             "limit": plan.config.timeout,
-            "pieces": Batch.split,
+            "in_batches": True,
         }
         from shiftsim.runs.workers import map_on_cluster, map_unordered
 
@@ -196,7 +194,7 @@ def _results(plan: RunPlan, batches: Sequence[Batch]) -> Generator[list[TaskResu
             scheduler = plan.config.scheduler
             outcomes = map_on_cluster(plan.runner(), batches, scheduler=scheduler, **options)
         else:
-            options |= {"workers": plan.workers, "group": attrgetter("token")}
+            options |= {"workers": plan.workers, "group": lambda batch: batch[0].token}
             outcomes = map_unordered(plan.runner(), batches, **options)
         with closing(outcomes):
             yield from map(results_of, outcomes)
@@ -208,17 +206,14 @@ def _networks_in_background(plan: RunPlan) -> Iterator[RunPlan]:
     from shiftsim.planners.learned.owner import InferenceClient, InferenceServer, new_address
     from shiftsim.processes import in_background
 
-    traffic = {plan.config.traffic: plan.traffic} if plan.traffic else {}
-    known, address = {**plan.planners, **traffic}, new_address()
-    makers = {name: known[name].make for name in plan.shared}
-    for name in plan.shared:
-        known[name] = replace(known[name], ask=InferenceClient(address, name))
+    address = new_address()
+    makers = {name: plan.planners[name].make for name in plan.shared}
+    asking = {
+        name: replace(plan.planners[name], ask=InferenceClient(address, name))
+        for name in plan.shared
+    }
     with in_background(partial(InferenceServer, makers, address)):
-        yield replace(
-            plan,
-            planners={name: known[name] for name in plan.planners},
-            traffic=known.get(plan.config.traffic, plan.traffic),
-        )
+        yield replace(plan, planners={**plan.planners, **asking})
 
 
 def results_of(outcome: "Outcome[Batch, list[TaskResult]]") -> list[TaskResult]:
@@ -227,4 +222,4 @@ def results_of(outcome: "Outcome[Batch, list[TaskResult]]") -> list[TaskResult]:
         return outcome.result
     status = TIMEOUT if outcome.is_late else FAILED
     hint = "run this scenario alone with --workers 1 to see why"
-    return [TaskResult(task, status, error=outcome.death, hint=hint) for task in outcome.task.tasks]
+    return [TaskResult(task, status, error=outcome.death, hint=hint) for task in outcome.task]

@@ -9,7 +9,7 @@ import json
 import shutil
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -97,9 +97,15 @@ def open_edits(name: str, store: ScenarioStore) -> "EditSet":
     """
     from shiftsim.runs.edited import read_edits
 
-    path, known = Path(store.path), store.tokens
+    path = Path(store.path)
     edits = read_edits(name, path)
-    return edits.with_splits(lambda split: find_split(split, path, known).tokens)
+    resolved = (
+        replace(edit, split="", tokens=find_split(edit.split, path, store.tokens).tokens)
+        if edit.split
+        else edit
+        for edit in edits.edits
+    )
+    return replace(edits, edits=tuple(resolved))
 
 
 class Selection(NamedTuple):
@@ -130,9 +136,8 @@ def select_scenarios(
     known = tuple(store.tokens)
     usable, fingerprint = known, {"store": store.hash}
     if config.split in ("", store.path.name) and not config.all_scenarios:
-        usable, filter_hash = _usable(config, store)
-        if filter_hash:
-            fingerprint["filter"] = filter_hash
+        usable, filter_hash = _usable(config.store, store)
+        fingerprint |= {"filter": filter_hash} if filter_hash else {}
     split = find_split(config.split, Path(store.path), usable)
     name, tokens, store_tokens, edited = split.name, split.tokens, set(known), dict[str, Any]()
     edits = given or (open_edits(config.edits, store) if config.edits else None)
@@ -162,23 +167,22 @@ def select_scenarios(
     return Selection(name, present, missing, dropped, fingerprint, edits, edited)
 
 
-def _usable(config: RunConfig, store: ScenarioStore) -> tuple[tuple[str, ...], str]:
+def _usable(name: str, store: ScenarioStore) -> tuple[tuple[str, ...], str]:
     """The scenarios of a whole store that filter and review accept, and the filter's hash."""
     from shiftsim.runs.filter import read_filter_results
 
-    known, filter_hash = tuple(store.tokens), ""
-    usable, results = known, read_filter_results(store.path, store.hash)
+    usable, results = tuple(store.tokens), read_filter_results(store.path, store.hash)
     if results is not None:
         if not results.accepted:
             raise DataError(
-                f"store {config.store!r}: the filter dropped all {len(results.rows)} scenarios",
+                f"store {name!r}: the filter dropped all {len(results.rows)} scenarios",
                 hint="`shiftsim filter` says why; --all to use them nevertheless",
             )
-        accepted, filter_hash = set(results.accepted), results.hash
-        usable = tuple(token for token in known if token in accepted)
+        accepted = set(results.accepted)
+        usable = tuple(token for token in usable if token in accepted)
     if store.is_reviewed:
-        usable = store.reviews.usable(known, usable)
-    return usable, filter_hash
+        usable = store.reviews.usable(tuple(store.tokens), usable)
+    return usable, results.hash if results else ""
 
 
 def write_bundle(store: ScenarioStore, folder: Path, tokens: Iterable[str]) -> dict[str, Any]:
