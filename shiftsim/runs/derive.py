@@ -50,11 +50,11 @@ def merge_runs(runs: Sequence[Run], *, out: str | None = None, allow_partial: bo
         for run in runs:
             for result in stored_results(run.path):
                 writer.add(result)
-        errors = {task: error for run in runs for task, error in _without_result(run)}
         return writer.finish(
             manifest | {"state": "finished"},
             _expected(first),
-            lambda task: errors.get(task, f"shard missing; there are {', '.join(shards)}"),
+            {task: error for run in runs for task, error in _without_result(run)},
+            f"shard missing; there are {', '.join(shards)}",
         )
 
 
@@ -195,4 +195,4 @@ def rescore(
         with closing(outcomes):
             record(map(results_of, outcomes), add, Progress(0, len(done), 0), on_progress)
         manifest |= {"state": "finished", "ended": now(), "rescored_from": run.path.name}
-        return writer.finish(manifest, statuses, dict(_without_result(run)).__getitem__)
+        return writer.finish(manifest, statuses, dict(_without_result(run)))

@@ -20,7 +20,7 @@ from shiftsim.runs.rollouts.columns import stored_plans, stored_tracks
 from shiftsim.world.scenario import FULL_DURATION
 
 # columns of a stored rollout in the order of cause and effect within one step
-_NOT_COMPARED = ("time_us", "planning_seconds")
+_NOT_COMPARED = {*Task._fields, "iteration", "time_us", "planning_seconds"}
 _LATER = ("degraded", "plan", "command_", "noise_")
 _UNITS = {"mps": "m/s", "mps2": "m/s²", "radps": "rad/s", "radps2": "rad/s²"}
 _UNITS |= {"m": "m", "rad": "rad"}

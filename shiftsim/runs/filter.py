@@ -220,7 +220,9 @@ def filter_store(
     unfinished.parent.mkdir(exist_ok=True)
     journal = Journal(unfinished, keep=True)
     try:
-        rows = [row for _, key, row, _ in journal.items() if key.startswith(conditions["hash"])]
+        rows: list[Mapping[str, Any]] = [
+            row for _, key, row, _ in journal.items() if key.startswith(conditions["hash"])
+        ]
         with suppress(DataError):  # it is written anew
             earlier = _read(path)
             if earlier.conditions.get("hash") == conditions["hash"]:

@@ -7,11 +7,12 @@ of the tables, both one by one, so that memory does not grow with the run.
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import pyarrow as pa
@@ -138,11 +139,13 @@ class RunWriter:
         self,
         manifest: dict[str, Any],
         expected: Iterable[Task],
-        absent: Callable[[Task], str] = lambda task: "the run was interrupted",
+        reasons: Mapping[Task, str] = MappingProxyType({}),
+        default: str = "the run was interrupted",
     ) -> Run:
         """Write tables and manifest, whose `counts` are filled in.
 
-        `expected` are all tasks of a complete run; `absent` says why one has no result.
+        `expected` are all tasks of a complete run; `reasons`, or the `default`, say why one has no
+        result.
         """
         counts = {"expected": 0, **dict.fromkeys(STATUSES, 0)}
         locations = self._write_rollouts()
@@ -155,7 +158,7 @@ class RunWriter:
                     if task in self.ended:
                         result = replace(self.result(task), location=locations.get(task))
                     else:
-                        result = TaskResult(task, MISSING, error=absent(task))
+                        result = TaskResult(task, MISSING, error=reasons.get(task, default))
                     counts["expected"] += 1
                     counts[result.status] += 1
                     for name, found in result.rows().items():

@@ -80,7 +80,7 @@ class Run:
         return complete_rollout(self.rollout_rows(task), scenario, task)
 
     def rollout_rows(self, task: Task) -> pa.RecordBatch:
-        """One stored rollout, a row per sample.
+        """One stored rollout as it lies on disk, a row per sample.
 
         Raises:
             DataError: It was not stored, or cannot be read.

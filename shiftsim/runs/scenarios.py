@@ -187,22 +187,16 @@ def _usable(name: str, store: ScenarioStore) -> tuple[tuple[str, ...], str]:
 
 def write_bundle(store: ScenarioStore, folder: Path, tokens: Iterable[str]) -> dict[str, Any]:
     """Copy scenarios with their recordings and maps into a run folder; for its manifest."""
-    target = safe_join(folder, BUNDLE)
-    if not target.exists():
-        partial = safe_join(folder, f".{BUNDLE}.tmp")
-        shutil.rmtree(partial, ignore_errors=True)
-        _copy(store, partial, set(tokens))
-        partial.rename(target)
-    return {"hash": open_store(target).hash}
-
-
-def _copy(store: ScenarioStore, target: Path, tokens: set[str]) -> None:
     from shiftsim.data.store.writing import StoreWriter, window_row
 
+    target, partial = (safe_join(folder, name) for name in (BUNDLE, f".{BUNDLE}.tmp"))
+    if target.exists():
+        return {"hash": open_store(target).hash}
+    shutil.rmtree(partial, ignore_errors=True)
     columns = (store.summary()[name].to_pylist() for name in ("token", "recording", "city"))
-    used = [row for row in zip(*columns, strict=True) if row[0] in tokens]
-
-    with StoreWriter(target, store.generator or None) as writer:
+    wanted = set(tokens)
+    used = [row for row in zip(*columns, strict=True) if row[0] in wanted]
+    with StoreWriter(partial, store.generator or None) as writer:
         for city in sorted({city for _, _, city in used}):
             writer.add_map(store.map(city))
         for recording in sorted({recording for _, recording, _ in used}):
@@ -211,12 +205,14 @@ def _copy(store: ScenarioStore, target: Path, tokens: set[str]) -> None:
                 for token, name, city in used
                 if name == recording
             ]
-            copied = target / ".recording"
+            copied = partial / ".recording"
             shutil.copytree(store.recording_folder(recording), copied)
             writer.take_recording(copied, recording, rows)
     if (store.path / REVIEW).is_file():
-        (target / REVIEW).parent.mkdir()
-        shutil.copyfile(store.path / REVIEW, target / REVIEW)
+        (partial / REVIEW).parent.mkdir()
+        shutil.copyfile(store.path / REVIEW, partial / REVIEW)
+    partial.rename(target)
+    return {"hash": open_store(target).hash}
 
 
 @dataclass(frozen=True, slots=True)

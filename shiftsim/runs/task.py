@@ -263,17 +263,15 @@ _METRIC_COLUMNS = pa.schema(
 
 
 def _metric_row(row: MetricRow, start_us: int, profile: Mapping[str, str]) -> dict[str, Any]:
-    first = row.violation
-    return {
-        "metric": row.metric,
-        "value": row.value,
-        "unit": row.unit,
-        "threshold": row.threshold,
-        "score": row.score,
-        "first_violation_iteration": None if first is None else first.iteration,
-        "first_violation_time_us": None if first is None else first.time_us,
-        "first_violation_s": None if first is None else (first.time_us - start_us) * 1e-6,
-        "first_violation_value": None if first is None else first.value,
-        "partner_token": None if first is None else first.partner,
-        **profile,
+    values = {
+        name: getattr(row, name) for name in ("metric", "value", "unit", "threshold", "score")
     }
+    if (first := row.violation) is not None:
+        values |= {
+            "first_violation_iteration": first.iteration,
+            "first_violation_time_us": first.time_us,
+            "first_violation_s": (first.time_us - start_us) * 1e-6,
+            "first_violation_value": first.value,
+            "partner_token": first.partner,
+        }
+    return {**values, **profile}

@@ -48,12 +48,11 @@ class RolloutReader:
     def __init__(self) -> None:
         self._file: pq.ParquetFile | None = None
         self._path = Path()
-        self._columns: list[str] = []
         self._rows = pa.table({})  # of a row group
         self._first = 0  # its first row
 
     def read(self, location: RolloutLocation) -> pa.RecordBatch:
-        """The rows of a rollout, without the columns that name its task.
+        """The rows of a rollout, all columns.
 
         Raises:
             DataError: The file cannot be read, or does not hold them.
@@ -77,12 +76,10 @@ class RolloutReader:
         self._file, self._rows = pq.ParquetFile(path), pa.table({})
         self._path = path
         found = self._file.schema_arrow
-        columns = [*STATES, *(TRACKS if TRACKS.names[0] in found.names else ())]
-        for column in columns:
+        for column in [*STATES, *(TRACKS if TRACKS.names[0] in found.names else ())]:
             at = found.get_field_index(column.name)
             if at < 0 or not found.field(at).type.equals(column.type):
                 raise TypeError(f"column {column.name!r} is missing or not {column.type}")
-        self._columns = [column.name for column in columns]
 
     def _read_group(self, row: int) -> None:
         """Read the row group that holds a row."""
@@ -91,7 +88,7 @@ class RolloutReader:
         for group in range(self._file.num_row_groups):
             end = first + self._file.metadata.row_group(group).num_rows
             if first <= row < end:
-                self._rows = self._file.read_row_group(group, self._columns, use_threads=False)
+                self._rows = self._file.read_row_group(group, use_threads=False)
                 self._first = first
                 return
             first = end
@@ -103,7 +100,8 @@ def write_rollouts(
 ) -> dict[Task, RolloutLocation]:
     """Write rollouts into new files of a folder, and say where they are.
 
-    They have columns of `STATES`, and of `TRACKS` in all rollouts or in none.
+    They have columns of `STATES`, and of `TRACKS` in all rollouts or in none. Columns that name a
+    task already are written anew.
     """
     rollouts, locations = iter(rollouts), dict[Task, RolloutLocation]()
     for first in rollouts:
@@ -124,7 +122,9 @@ def _row_groups(
         for task, rows in group:
             locations[task] = RolloutLocation(path, row, len(rows))
             row += len(rows)
-        table = pa.Table.from_batches([rows for _, rows in group]).combine_chunks()
+        columns = [name for name in group[0][1].schema.names if name not in _KEY.names]
+        batches = [rows.select(columns) for _, rows in group]
+        table = pa.Table.from_batches(batches).combine_chunks()
         schema = pa.schema([*_KEY, *table.schema])
         yield pa.Table.from_arrays([*_keys(group), *table.columns], schema=schema)
 
