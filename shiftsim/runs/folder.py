@@ -28,8 +28,7 @@ from shiftsim.runs.rollouts.files import (
     FOLDER,
     RolloutLocation,
     RolloutReader,
-    next_number,
-    part_name,
+    new_file,
     write_rollouts,
 )
 from shiftsim.runs.tables import MISSING, STATUSES, TABLES, TaskResult, stored_results
@@ -90,7 +89,6 @@ class RunWriter:
         if before is None or not before.is_complete:
             self._write_manifest(manifest | {"state": "running", "counts": {}})
         self.rollouts.mkdir(exist_ok=True)
-        self._number = next_number(self.rollouts)  # of the next file that is linked to
         self._linked: dict[Path, Path] = {}
 
     def _read_journal(self) -> None:
@@ -126,13 +124,13 @@ class RunWriter:
     def _link(self, file: Path) -> Path:
         """Have a file of another run in this one too, without its bytes where the disk can."""
         if file not in self._linked:
-            target = self.rollouts / part_name(self._number)
+            target = new_file(self.rollouts)
             try:
                 os.link(file, target)
             except OSError:
                 with atomic_write(target) as partial:
                     shutil.copyfile(file, partial)
-            self._linked[file], self._number = target, self._number + 1
+            self._linked[file] = target
         return self._linked[file]
 
     def finish(

@@ -57,31 +57,30 @@ def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
     Raises:
         DataError: It is not there, or is another one.
     """
-    bundle = run.path / BUNDLE
+    bundle, place = run.path / BUNDLE, store or run.manifest["store"]
+    recorded = wanted = run.manifest["determining"]["store"]
     if store is None and bundle.is_dir():
-        found = open_store(bundle)
-        wanted = run.manifest.get("bundle", {}).get("hash")
-    else:
-        place = store or run.manifest["store"]
-        if "://" in place and store is None:  # which may be anybody's
+        found, wanted = open_store(bundle), run.manifest.get("bundle", {}).get("hash")
+    elif "://" in place:
+        if store is None:  # which may be anybody's
             raise DataError(
                 f"the store of run {run.path.name!r} is behind the URL {place!r}",
                 hint=f"if you trust it: --store {place}",
             )
-        path = store_path(place)
-        if "://" not in place and not path.exists():
-            raise DataError(
-                f"the store of run {run.path.name!r} is not at {str(path)!r}",
-                hint="say where it is with --store",
-            )
-        found = open_store(place if "://" in place else path)
-        wanted = run.manifest["determining"]["store"]
+        found = open_store(place)
+    elif not (path := store_path(place)).exists():
+        raise DataError(
+            f"the store of run {run.path.name!r} is not at {str(path)!r}",
+            hint="say where it is with --store",
+        )
+    else:
+        found = open_store(path)
     if found.hash != wanted:
         raise DataError(
             f"store {str(found.path)!r} is not the one run {run.path.name!r} was made with",
             hint="name the right one with --store, or run again",
         )
-    found.hash = run.manifest["determining"]["store"]
+    found.hash = recorded
     if edits := run.manifest.get("edits"):
         from shiftsim.runs.edited import EditedStore, make_edits
 

@@ -263,9 +263,8 @@ _METRIC_COLUMNS = pa.schema(
 
 
 def _metric_row(row: MetricRow, start_us: int, profile: Mapping[str, str]) -> dict[str, Any]:
-    values = {
-        name: getattr(row, name) for name in ("metric", "value", "unit", "threshold", "score")
-    }
+    plain = ("metric", "value", "unit", "threshold", "score")
+    values = dict.fromkeys(_METRIC_COLUMNS.names) | {name: getattr(row, name) for name in plain}
     if (first := row.violation) is not None:
         values |= {
             "first_violation_iteration": first.iteration,

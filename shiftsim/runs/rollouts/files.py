@@ -105,8 +105,7 @@ def write_rollouts(
     """
     rollouts, locations = iter(rollouts), dict[Task, RolloutLocation]()
     for first in rollouts:
-        path = folder / part_name(next_number(folder))
-        of_file = chain([first], islice(rollouts, _FILE - 1))
+        path, of_file = new_file(folder), chain([first], islice(rollouts, _FILE - 1))
         write_blocks(path, _row_groups(path, of_file, locations))
     return locations
 
@@ -140,11 +139,6 @@ def _keys(rollouts: list[tuple[Task, pa.RecordBatch]]) -> list[pa.Array]:
     return [*columns, pa.array(np.concatenate([np.arange(length) for length in lengths]))]
 
 
-def part_name(number: int) -> str:
-    """Name of a file of rollouts."""
-    return f"part-{number:05d}.parquet"
-
-
 def part_file(folder: Path, name: str) -> Path:
     """The file of rollouts in a folder that a table or a journal names.
 
@@ -158,7 +152,7 @@ def part_file(folder: Path, name: str) -> Path:
     return folder / name
 
 
-def next_number(folder: Path) -> int:
-    """The first number for which, and for all after it, a folder has no file yet."""
+def new_file(folder: Path) -> Path:
+    """A file of rollouts that a folder does not have, numbered after all that it has."""
     taken = [int(found[1]) for path in folder.iterdir() if (found := _PART.fullmatch(path.name))]
-    return 1 + max(taken, default=-1)
+    return folder / f"part-{1 + max(taken, default=-1):05d}.parquet"
