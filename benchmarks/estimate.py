@@ -15,7 +15,7 @@ from time import perf_counter
 from shiftsim.benchmarks.bench import Plan
 from shiftsim.runs.prepare import RunPlan
 from shiftsim.runs.rollouts.columns import decode_rows
-from shiftsim.runs.rollouts.files import PartWriter
+from shiftsim.runs.rollouts.files import write_rollouts
 from shiftsim.runs.task import Batch, TaskRunner
 
 _SECONDS = 2.0  # spent on each planner of each run, as long as it has done a task in that time
@@ -54,9 +54,9 @@ def total(costs: list[Cost]) -> Cost:
 
 def _costs(name: str, run: RunPlan, shards: int) -> Iterator[Cost]:
     with closing(run.runner()()) as do:
-        for planner in run.planners:
-            own = [batch for batch in run.batches if batch.planner == planner]
-            tasks = sum(len(batch.tasks) for batch in own)
+        for planner in run.config.planners:
+            own = [batch for batch in run.batches if batch[0].planner == planner]
+            tasks = sum(map(len, own))
             each, stored = _measure(do, own)
             workers = max(1, min(run.workers * shards, len(own)))
             memory = _peak() * min(run.workers, workers)
@@ -68,12 +68,12 @@ def _measure(do: TaskRunner, batches: list[Batch]) -> tuple[float, float]:
     """Seconds and bytes of one task: the mean of some from all over the run."""
     if not batches:
         return 0.0, 0.0
-    for batch in {batch.tasks[0].noise: batch for batch in batches}.values():
+    for batch in {batch[0].noise: batch for batch in batches}.values():
         do(batch)  # loads, and compiles
     step = max(1, len(batches) // _MOST)
     spent, done = 0.0, 0
     with TemporaryDirectory() as folder:
-        writer = PartWriter(Path(folder))
+        rollouts = []
         for number, batch in enumerate(batches[::step][:_MOST]):
             if number >= _FEWEST and spent > _SECONDS:
                 break
@@ -81,11 +81,9 @@ def _measure(do: TaskRunner, batches: list[Batch]) -> tuple[float, float]:
             results = do(batch)
             spent += perf_counter() - began
             done += len(results)
-            for result in results:
-                if result.rollout:
-                    writer.add(result.task, decode_rows(result.rollout))
-        writer.close()
-        stored = sum(file.stat().st_size for file in writer.folder.iterdir())
+            rollouts += [(one.task, decode_rows(one.rollout)) for one in results if one.rollout]
+        write_rollouts(Path(folder), rollouts)
+        stored = sum(file.stat().st_size for file in Path(folder).iterdir())
     return spent / done, _ROW_BYTES + stored / done
 
 

@@ -51,15 +51,12 @@ class Isolated:
         return Isolated, self._given
 
     def identify(self) -> dict[str, Any]:
-        """The fingerprint of the planner; it is made once to see that it works.
+        """The fingerprint of the planner, which is made to see that it works.
 
         Raises:
             PlannerError: It cannot be made.
         """
-        self.close()
-        found, declares = self._started()
-        self.close()
-        return {**found, "sees_recording": True} if declares else dict(found)
+        return dict(self._started()[0])
 
     @property
     def sees_recording(self) -> bool:

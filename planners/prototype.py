@@ -5,6 +5,7 @@ same planner has driven before nor on how scenarios are shared out among workers
 """
 
 import io
+import logging
 import pickle
 import sys
 from collections.abc import Callable
@@ -13,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.planners.registry import close_planner
+from shiftsim.errors import readable
 from shiftsim.sim.planner import BatchPlanner, Planner
 
 
@@ -47,10 +48,6 @@ class PlannerPrototype:
         if copied is not self.planner and not isinstance(copied, BatchPlanner):
             close_planner(copied)
 
-    def close(self) -> None:
-        """Let the planner itself release what it holds."""
-        close_planner(self.planner)
-
 
 class _Writer(pickle.Pickler):
     """Leaves out what copies share: networks, and arrays that nobody can write."""
@@ -78,3 +75,14 @@ class _Reader(pickle.Unpickler):
 
     def persistent_load(self, place: int) -> Any:
         return self._shared[place]
+
+
+def close_planner(planner: object) -> None:
+    """Let a planner release what it holds; where it cannot, its results are there nevertheless."""
+    close = getattr(planner, "close", None)
+    if callable(close):
+        try:
+            close()
+        except (Exception, SystemExit) as error:
+            name = type(planner).__name__
+            logging.getLogger(__name__).warning("%s.close(): %s", name, readable(error))

@@ -8,18 +8,19 @@ import copy
 import hashlib
 import importlib
 import inspect
-import logging
 import pickle
 import sys
 import types
 import typing
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 
 from shiftsim.errors import ConfigError, MissingExtraError, ShiftsimError, one_of, readable
 from shiftsim.files import import_named, place_of
+from shiftsim.planners.prototype import PlannerPrototype, close_planner
 from shiftsim.planners.table import PLANNERS as PLANNERS
 from shiftsim.planners.table import readiness as readiness
 from shiftsim.sim.planner import BatchPlanner, Planner, sees_recording
@@ -157,9 +158,9 @@ def planner_fingerprint(spec: str, arguments: Mapping[str, Any] | None = None) -
     return out
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass
 class RunPlanner:
-    """A planner of a run: how to make it, and what identifies it."""
+    """A planner of a run: what identifies it, and how each process makes it."""
 
     name: str  # as in tables
     source: Any  # A name, `package.module:Class`, a class, or an instance
@@ -167,29 +168,31 @@ class RunPlanner:
     fingerprint: Mapping[str, Any]  # all that tells it from another planner, as JSON values
     in_batches: bool = False  # whether it answers for several scenarios at once
     ask: Any = None  # of `LearnedPlanner.asking`, where another process has the network
-    # the instance that was made to check the planner, until it is used; stays in this process
-    first: list[Planner] = field(default_factory=list, compare=False)
 
-    def __reduce__(self) -> Any:
-        given = (self.name, self.source, self.arguments, self.fingerprint)
-        return RunPlanner, (*given, self.in_batches, self.ask)
+    @cached_property
+    def prototype(self) -> PlannerPrototype:
+        """The planner of this process, whose copies drive."""
+        return PlannerPrototype(self.make)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "prototype"}
 
     def close(self) -> None:
-        """Let the instance of the check release what it holds, where nobody has used it."""
-        while self.first:
-            close_planner(self.first.pop())
+        """Let the planner of this process release what it holds."""
+        if (prototype := vars(self).pop("prototype", None)) is not None:
+            close_planner(prototype.planner)
 
     def make(self) -> Planner:
-        """An instance of its own for one process."""
+        """An instance of its own."""
         if self.ask is not None:
             return cast(Planner, planner_factory(self.source).asking(self.ask))
-        if self.first:
-            return self.first.pop()
         if isinstance(self.source, str):
             return load_planner(self.source, self.arguments)
         if inspect.isclass(self.source):
             return cast(Planner, self.source(**self.arguments))
-        return cast(Planner, copy.deepcopy(self.source))
+        # a planner that is isolated has its copies elsewhere
+        is_isolated = hasattr(self.source, "identify")
+        return cast(Planner, self.source if is_isolated else copy.deepcopy(self.source))
 
     @property
     def on_gpu(self) -> bool:
@@ -217,7 +220,7 @@ class RunPlanner:
 
 
 def run_planner(source: Any, arguments: Mapping[str, Any]) -> RunPlanner:
-    """A planner given by name, class or instance; the first instance is made, to see that it works.
+    """A planner given by name, class or instance; it is made here, to see that it works.
 
     Raises:
         ShiftsimError: It does not exist, or cannot be made.
@@ -230,13 +233,12 @@ def run_planner(source: Any, arguments: Mapping[str, Any]) -> RunPlanner:
     else:
         fingerprint = _object_fingerprint(source, arguments)
     found = RunPlanner(name, source, arguments, fingerprint)
-    planner = _made(name, found.make)
+    planner = _made(name, lambda: found.prototype.planner)
     _require_methods(name, planner)
-    found.first.append(planner)
-    if not hasattr(source, "identify") and sees_recording(planner):
-        fingerprint = {**fingerprint, "sees_recording": True}
-    in_batches = isinstance(planner, BatchPlanner)
-    return replace(found, fingerprint=fingerprint, in_batches=in_batches)
+    if sees_recording(planner):
+        found.fingerprint = {**fingerprint, "sees_recording": True}
+    found.in_batches = isinstance(planner, BatchPlanner)
+    return found
 
 
 def planner_name(source: Any) -> str:
@@ -257,17 +259,6 @@ def takes_argument(source: Any, name: str) -> bool:
         return name in inspect.signature(source).parameters
     except (TypeError, ValueError):
         return False
-
-
-def close_planner(planner: object) -> None:
-    """Let a planner release what it holds; where it cannot, its results are there nevertheless."""
-    close = getattr(planner, "close", None)
-    if callable(close):
-        try:
-            close()
-        except (Exception, SystemExit) as error:
-            name = type(planner).__name__
-            logging.getLogger(__name__).warning("%s.close(): %s", name, readable(error))
 
 
 def _class_of(source: Any) -> Any:

@@ -22,7 +22,7 @@ BUDGETS = {
     "shiftsim/sim": 1_710,  # goal 1_600
     "shiftsim/sim/traffic": 2_410,  # goal 2_200
     "metrics": 2_300,
-    "shiftsim/runs": 4_410,  # goal 3_300
+    "shiftsim/runs": 4_230,  # goal 3_300
     "planners": 4_370,  # goal 4_300
     "planners/learned": 5_030,  # goal 4_600
     "data/maps": 3_510,  # goal 3_000

@@ -9,6 +9,7 @@ import argparse
 import hashlib
 import json
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -29,7 +30,7 @@ from shiftsim.runs.filter import RESULTS, SCHEMA
 from shiftsim.runs.results import FORMAT_VERSION, Run
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.rollouts.columns import COMMAND_COLUMNS, NOISE_COLUMNS, rollout_rows
-from shiftsim.runs.rollouts.files import FOLDER, PartWriter
+from shiftsim.runs.rollouts.files import FOLDER, write_rollouts
 from shiftsim.runs.scenarios import open_run_store
 from shiftsim.sim.log import NUM_KEPT, SimulationLog
 from shiftsim.world.layers import Layer, Lists, Polylines, index_polygons
@@ -224,27 +225,37 @@ def _rewrite_rollouts(run: Run, store: str | None) -> int:
     rows = tasks.to_pylist()
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir()
-    writer, scenarios = PartWriter(partial), None
     stored = sorted(
         (row["rollout"], row["rollout_row"], at) for at, row in enumerate(rows) if row["rollout"]
     )
-    opened: dict[str, pa.Table] = {}
-    for name, first, at in stored:
-        if name not in opened:
-            opened = {name: pq.read_table(run.path / FOLDER / name)}
-        table = opened[name].slice(first, rows[at]["rollout_rows"]).combine_chunks()
-        task = Task(*(rows[at][key] for key in Task._fields))
-        tracks = Tracks.empty(len(table))
-        if "track_valid" in table.column_names:
-            scenarios = scenarios or open_run_store(run, store)
-            tracks = read_tracks(table, scenarios.read(task.token).tracks.tokens)
-        place = writer.add(task, read_rollout(table, tracks))
-        rows[at] |= {"rollout": place.file.name, "rollout_row": place.row}
-    writer.close()
+
+    def rollouts() -> Iterator[tuple[Task, pa.RecordBatch]]:
+        opened: dict[str, pa.Table] = {}
+        scenarios = None
+        for name, first, at in stored:
+            if name not in opened:
+                opened = {name: pq.read_table(run.path / FOLDER / name)}
+            table = opened[name].slice(first, rows[at]["rollout_rows"]).combine_chunks()
+            task = task_of(rows[at])
+            tracks = Tracks.empty(len(table))
+            if "track_valid" in table.column_names:
+                scenarios = scenarios or open_run_store(run, store)
+                tracks = read_tracks(table, scenarios.read(task.token).tracks.tokens)
+            yield task, read_rollout(table, tracks)
+
+    locations = write_rollouts(partial, rollouts())
+    for row in rows:
+        if location := locations.get(task_of(row)):
+            row |= {"rollout": location.file.name, "rollout_row": location.row}
     shutil.rmtree(run.path / FOLDER)
     partial.rename(run.path / FOLDER)
     pq.write_table(pa.Table.from_pylist(rows, tasks.schema), path, compression="zstd")
     return len(stored)
+
+
+def task_of(row: dict[str, Any]) -> Task:
+    """The task of a row of `tasks.parquet`."""
+    return Task(*(row[name] for name in Task._fields))
 
 
 def read_rollout(table: pa.Table, tracks: Tracks) -> pa.RecordBatch:

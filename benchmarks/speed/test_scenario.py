@@ -19,7 +19,7 @@ from shiftsim.metrics import compute_metrics
 from shiftsim.planners.registry import run_planner
 from shiftsim.runs.config import make_config
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.task import Batch, TaskRunner
+from shiftsim.runs.task import TaskRunner
 from shiftsim.sim import loop
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.noise import parse_noise
@@ -84,7 +84,7 @@ def test_whole_scenario(measure, runner, name):
 
     def whole():
         runner._scenarios._last = None  # read the scenario again each time
-        (result,) = runner(Batch((task,)))
+        (result,) = runner((task,))
         assert result.status == "ok", result.traceback
 
     measure(whole, calls=1, target=WHOLE_TARGET)

@@ -33,6 +33,7 @@ _FOOTER = "shiftsim"
 _REPEATING = (
     *("log", "recording", "ego", "type", "city", "duration_s", "offset_s", "subsample_ratio"),
     *("connector", "status", "token", "kind", "length_m", "width_m"),
+    *("planner", "noise", "track_tokens", "track_length_m", "track_width_m"),  # of rollouts
 )
 _NAMED = ("token", "connector")  # columns that name what a row is about
 
@@ -124,7 +125,7 @@ def write_blocks(
             first.schema,
             compression="zstd",
             compression_level=3,
-            **encodings(first.schema, _REPEATING),
+            **_encodings(first.schema),
             write_statistics=["row"] if "row" in first.schema.names else False,
             store_schema=False,
         ) as writer,
@@ -135,7 +136,7 @@ def write_blocks(
             writer.add_key_value_metadata({_FOOTER: json.dumps(footer, sort_keys=True)})
 
 
-def encodings(described: pa.Schema, repeating: Iterable[str]) -> dict[str, Any]:
+def _encodings(described: pa.Schema) -> dict[str, Any]:
     """How columns are written: floats as bytes in planes, integers as differences.
 
     Both are encodings of Parquet that compress much better than numbers as they are.
@@ -145,7 +146,7 @@ def encodings(described: pa.Schema, repeating: Iterable[str]) -> dict[str, Any]:
         is_list = pa.types.is_list(field.type)
         kind = field.type.value_type if is_list else field.type
         name = f"{field.name}.list.element" if is_list else field.name
-        if field.name in repeating:
+        if field.name in _REPEATING:
             dictionaries.append(name)
         elif pa.types.is_floating(kind):
             encoded[name] = "BYTE_STREAM_SPLIT"

@@ -224,7 +224,7 @@ def _plan_lines(plan: "RunPlan") -> Iterator[str]:
     )
     if config.metrics:
         yield f"metrics     {' '.join(config.metrics)}"
-    is_learned = any(entry.in_batches for entry in plan.planners.values())
+    is_learned = any(plan.planners[name].in_batches for name in config.planners)
     if is_learned or plan.fingerprint["batch_size"] > 1:
         strict = "   strict" if config.strict else ""
         yield f"networks    batch size {config.batch_size}{strict}"

@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
 from functools import partial
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -51,11 +50,11 @@ def merge_runs(runs: Sequence[Run], *, out: str | None = None, allow_partial: bo
         for run in runs:
             for result in stored_results(run.path):
                 writer.add(result)
-        errors = {task: error for run in runs for task, error in _without_result(run)}
         return writer.finish(
             manifest | {"state": "finished"},
             _expected(first),
-            lambda task: errors.get(task, f"shard missing; there are {', '.join(shards)}"),
+            {task: error for run in runs for task, error in _without_result(run)},
+            f"shard missing; there are {', '.join(shards)}",
         )
 
 
@@ -116,7 +115,7 @@ class Rescorer:
 
     def __call__(self, batch: Batch) -> list[TaskResult]:
         """The results of tasks."""
-        return [attempt(task, partial(self._score, task)) for task in batch.tasks]
+        return [attempt(task, partial(self._score, task)) for task in batch]
 
     def _score(self, task: Task) -> TaskResult:
         scenario = self._scenarios.read(task.token)
@@ -180,13 +179,14 @@ def rescore(
         for result in stored_results(run.path):
             if result.status != OK:  # it stays so
                 writer.add(replace(result, seconds={}))
+        # as rollouts lie in their files
+        batches: list[Batch] = [(task,) for task in sorted(done, key=lambda task: task.token)]
         outcomes = map_unordered(
             partial(Rescorer, run.path.resolve(), found.source, config),
-            # as rollouts lie in their files
-            [Batch((task,)) for task in sorted(done, key=lambda task: task.token)],
+            batches,
             workers=min(workers or default_workers(), len(done)),
             alone=1,
-            group=attrgetter("token"),
+            group=lambda batch: batch[0].token,
         )
 
         def add(result: TaskResult) -> None:
@@ -195,4 +195,4 @@ def rescore(
         with closing(outcomes):
             record(map(results_of, outcomes), add, Progress(0, len(done), 0), on_progress)
         manifest |= {"state": "finished", "ended": now(), "rescored_from": run.path.name}
-        return writer.finish(manifest, statuses, dict(_without_result(run)).__getitem__)
+        return writer.finish(manifest, statuses, dict(_without_result(run)))

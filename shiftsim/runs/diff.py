@@ -20,7 +20,7 @@ from shiftsim.runs.rollouts.columns import stored_plans, stored_tracks
 from shiftsim.world.scenario import FULL_DURATION
 
 # columns of a stored rollout in the order of cause and effect within one step
-_KEYS = {*Task._fields, "iteration", "time_us", "planning_seconds"}
+_NOT_COMPARED = {*Task._fields, "iteration", "time_us", "planning_seconds"}
 _LATER = ("degraded", "plan", "command_", "noise_")
 _UNITS = {"mps": "m/s", "mps2": "m/s²", "radps": "rad/s", "radps2": "rad/s²"}
 _UNITS |= {"m": "m", "rad": "rad"}
@@ -94,29 +94,22 @@ def diff_runs(first: Run, second: Run, *, limit: int = 10) -> Difference:
     planners = [run.manifest["config"]["planners"] for run in (first, second)]
     single = len(planners[0]) == len(planners[1]) == 1
     names = dict(zip(*planners, strict=True)) if single else {n: n for n in planners[0]}
-    names = {name: other for name, other in names.items() if other in planners[1]}
-    ours = {_key(row): row for row in first.scores.to_pylist()}
-    theirs = {_key(row): row for row in second.scores.to_pylist()}
-    back = {other: name for name, other in names.items()}
-    paired = {
-        task._replace(planner=back.get(task.planner, "")): row for task, row in theirs.items()
-    }
-    common = sorted(task for task in ours if task in paired)
-    if not common:
+    ours, theirs = (
+        {Task(*(row[name] for name in Task._fields)): row for row in run.scores.to_pylist()}
+        for run in (first, second)
+    )
+    pairs = {task: task._replace(planner=names[task.planner]) for task in sorted(ours)}
+    pairs = {task: other for task, other in pairs.items() if other in theirs}
+    if not pairs:
         raise ConfigError(
             f"runs {first.path.name!r} and {second.path.name!r} have no rollout in common",
             hint="compare runs of the same planners, noises, seeds and scenarios",
         )
-    before = np.array([ours[task]["cls"] for task in common])
-    after = np.array([paired[task]["cls"] for task in common])
-    changed = [
-        i for i in np.argsort(-np.abs(after - before), kind="stable") if before[i] != after[i]
-    ]
-    changes = [
-        _change(first, second, common[i], names[common[i].planner], ours, paired)
-        for i in changed[:limit]
-    ]
-    durations = {ours[task]["duration_class"] or FULL_DURATION for task in common}
+    before = np.array([ours[task]["cls"] for task in pairs])
+    after = np.array([theirs[other]["cls"] for other in pairs.values()])
+    common, largest_first = list(pairs), np.argsort(-np.abs(after - before), kind="stable")
+    changed = [common[i] for i in largest_first if before[i] != after[i]]
+    durations = {ours[task]["duration_class"] or FULL_DURATION for task in pairs}
     before_by, after_by = (run.manifest["determining"] for run in (first, second))
     settings = sorted({*before_by, *after_by})
     return Difference(
@@ -124,10 +117,13 @@ def diff_runs(first: Run, second: Run, *, limit: int = 10) -> Difference:
         same=int(np.sum(before == after)),
         better=int(np.sum(after > before)),
         worse=int(np.sum(after < before)),
-        only_first=len(ours) - len(common),
-        only_second=len(theirs) - len(common),
+        only_first=len(ours) - len(pairs),
+        only_second=len(theirs) - len(pairs),
         means=(float(before.mean()), float(after.mean())) if len(durations) == 1 else None,
-        changes=tuple(changes),
+        changes=tuple(
+            _change(first, second, task, pairs[task], ours[task], theirs[pairs[task]])
+            for task in changed[:limit]
+        ),
     )
 
 
@@ -169,30 +165,25 @@ def _score(value: float | None) -> str:
     return "–" if value is None else f"{value:.2f}"
 
 
-def _key(row: dict[str, Any]) -> Task:
-    return Task(*(row[name] for name in Task._fields))
-
-
 def _change(
     first: Run,
     second: Run,
     task: Task,
-    planner: str,
-    ours: dict[Task, dict[str, Any]],
-    theirs: dict[Task, dict[str, Any]],
+    other: Task,
+    before: dict[str, Any],
+    after: dict[str, Any],
 ) -> Change:
-    rows = ours[task], theirs[task]
+    """A change of the score between two rows, and where it comes from."""
     metrics = {
-        short: (rows[0][name], rows[1][name])
+        short: (before[name], after[name])
         for name, short in SHORT_NAMES.items()
-        if name != "score" and rows[0][name] != rows[1][name]
+        if name != "score" and before[name] != after[name]
     }
     departure, note = None, ""
-    theirs_of = task._replace(planner=planner)
-    if first.rollout_places.get(task) is None or second.rollout_places.get(theirs_of) is None:
+    if first.rollout_places.get(task) is None or second.rollout_places.get(other) is None:
         note = "rollouts are not stored"
     else:
-        tables = first.rollout_rows(task), second.rollout_rows(theirs_of)
+        tables = first.rollout_rows(task), second.rollout_rows(other)
         try:
             departure = find_departure(*tables)
         except ValueError as error:
@@ -203,7 +194,7 @@ def _change(
             note = "the rollouts are the same: they were scored differently"
             if traffic[0] != traffic[1]:
                 note = f"the ego drove the same, but in other traffic ({', '.join(traffic)})"
-    return Change(task, planner, rows[0]["cls"], rows[1]["cls"], metrics, departure, note)
+    return Change(task, other.planner, before["cls"], after["cls"], metrics, departure, note)
 
 
 def find_departure(first: pa.RecordBatch, second: pa.RecordBatch) -> Departure | None:
@@ -250,7 +241,7 @@ def _quantities(table: pa.RecordBatch, rows: int, tokens: list[str]) -> dict[str
     found = {
         name: column.to_numpy(zero_copy_only=False)
         for name, column in zip(table.schema.names, table.columns, strict=True)
-        if name not in _KEYS and not pa.types.is_list(column.type) and not column.null_count
+        if name not in _NOT_COMPARED and not pa.types.is_list(column.type) and not column.null_count
     }
     found["plan"] = stored_plans(table)
     if "track_tokens" in table.schema.names:

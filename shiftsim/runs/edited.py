@@ -5,8 +5,8 @@ manifest, so that its folder alone says how to make its scenarios again.
 """
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from shiftsim.world.scenario import Scenario
 FOLDER = "edits"  # below that of a store
 _FORMAT = 1
 _TOP = ("format", "name", "profile", "edit")
-_KEPT = (*_TOP, "made")  # as a manifest holds them
+_STORED = (*_TOP, "made")  # as a manifest holds them
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,32 +37,6 @@ class EditSet:
         tables = [{k: v for k, v in asdict(edit).items() if v or v == 0.0} for edit in self.edits]
         return {"name": self.name, "profile": self.profile, "edit": tables}
 
-    def words_of(self, token: str, edited: Mapping[str, Any]) -> list[str]:
-        """What is edited in a scenario, in words; `edited` is what `describe` gave for the run."""
-        found = edited.get(token, {})
-        return [
-            f"edit {edit.name} of {found['base']}: {line}"
-            for edit in self.edits
-            if edit.digest == found.get("digest")
-            for line in edit.words
-        ]
-
-    def with_splits(self, find: Callable[[str], Sequence[str]]) -> "EditSet":
-        """The same edits, splits replaced by the scenarios that they list."""
-        edits = (
-            replace(edit, split="", tokens=tuple(find(edit.split))) if edit.split else edit
-            for edit in self.edits
-        )
-        return replace(self, edits=tuple(edits))
-
-    def over(self, store: ScenarioStore) -> "EditedStore":
-        """The store that the edits make of a store."""
-        return EditedStore(store, self)
-
-    def describe(self, store: ScenarioStore, tokens: Iterable[str]) -> dict[str, Any]:
-        """For a manifest: base token and digest of the edited scenarios, by id."""
-        return describe(self.expand(store, tokens))
-
     @property
     def digest(self) -> str:
         """What the edited scenarios depend on, beside the recorded ones."""
@@ -75,20 +49,22 @@ class EditSet:
             ConfigError: An edit names a scenario that the store does not have, or one id occurs
                 twice, or nothing is edited.
         """
-        chosen, out = dict.fromkeys(tokens), dict[str, Edited]()
+        chosen, out = set(tokens), dict[str, Edited]()
         columns = (store.summary()[name].to_pylist() for name in ("token", "type"))
         types = dict(zip(*columns, strict=True))
         for edit in self.edits:
-            for token in self._of(edit, store, types):
-                if token not in chosen:
+            where = f"edits {self.name!r}, edit {edit.name!r}: the store"
+            named = {beginning(where, "scenario", token, types) for token in edit.tokens}
+            for base in sorted(named or types):
+                if base not in chosen or (edit.types and types[base] not in edit.types):
                     continue
-                made = edited_id(token, edit)
-                if made in out or made in types:
+                token = edited_id(base, edit)
+                if token in out or token in types:
                     raise ConfigError(
-                        f"edits {self.name!r}: two scenarios have the id {made!r}",
+                        f"edits {self.name!r}: two scenarios have the id {token!r}",
                         hint="give each edit of a scenario a name of its own",
                     )
-                out[made] = Edited(token, edit)
+                out[token] = Edited(base, edit)
         if not out:
             raise ConfigError(
                 f"edits {self.name!r} are for no scenario of the {len(chosen)} chosen",
@@ -96,15 +72,12 @@ class EditSet:
             )
         return out
 
-    def _of(self, edit: Edit, store: ScenarioStore, types: Mapping[str, str]) -> Sequence[str]:
-        """Scenarios of a store that an edit is for, sorted."""
-        where = f"edits {self.name!r}, edit {edit.name!r}: the store"
-        found = set(types)
-        if edit.tokens:
-            found = {beginning(where, "scenario", token, types) for token in edit.tokens}
-        if edit.types:
-            found = {token for token in found if types[token] in edit.types}
-        return sorted(found)
+    def describe(self, store: ScenarioStore, tokens: Iterable[str]) -> dict[str, Any]:
+        """For a manifest: base token and digest of the edited scenarios, by id."""
+        return {
+            token: {"base": found.base, "edit": found.edit.name, "digest": found.edit.digest}
+            for token, found in self.expand(store, tokens).items()
+        }
 
     def require_traffic(self, traffic: str) -> None:
         """Refuse traffic that cannot drive what an edit asks for.
@@ -194,20 +167,18 @@ class EditedStore(ScenarioStore):
         return apply_edit(recorded, self.edited[token].edit, driven_lanes)
 
 
-def describe(edited: Mapping[str, Edited]) -> dict[str, Any]:
-    """For a manifest: base token and digest of edited scenarios, by id."""
-    return {
-        token: {"base": found.base, "edit": found.edit.name, "digest": found.edit.digest}
-        for token, found in edited.items()
-    }
-
-
 def edit_words(manifest: Mapping[str, Any], token: str) -> list[str]:
     """What was edited in a scenario of a run, in words; empty where nothing was."""
-    table = manifest.get("edits")
-    if not table:
+    table = manifest.get("edits", {})
+    found = table.get("made", {}).get(token)
+    if found is None:
         return []
-    return make_edits(table, "of the run").words_of(token, table.get("made", {}))
+    return [
+        f"edit {edit.name} of {found['base']}: {line}"
+        for edit in make_edits(table, "of the run").edits
+        if edit.digest == found["digest"]
+        for line in edit.words
+    ]
 
 
 def make_edits(table: Mapping[str, Any], name: str) -> EditSet:
@@ -218,7 +189,7 @@ def make_edits(table: Mapping[str, Any], name: str) -> EditSet:
     """
     where = f"edits {name!r}"
     for key in table:
-        if key not in _KEPT:
+        if key not in _STORED:
             near = nearest(key, _TOP)
             hint = f"did you mean {near!r}? " if near else ""
             raise ConfigError(

@@ -6,8 +6,7 @@ from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
-from operator import attrgetter
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 from shiftsim.errors import DataError
 from shiftsim.runs.folder import RunWriter
@@ -17,9 +16,7 @@ from shiftsim.runs.results import Run, open_run
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.tables import FAILED, OK, TIMEOUT, TaskResult
 from shiftsim.runs.task import Batch
-
-if TYPE_CHECKING:
-    from shiftsim.runs.workers import Outcome
+from shiftsim.runs.workers import Outcome, map_on_cluster, map_unordered
 
 _LOG = logging.getLogger(__name__)
 
@@ -66,7 +63,7 @@ def execute(
     try:
         if plan.config.resumes and plan.before == "complete":
             return open_run(plan.folder)
-        return _execute(plan, _manifest(plan, argv), on_progress)
+        return _execute(plan, argv, on_progress)
     except OSError as error:
         raise DataError(
             f"run {str(plan.folder)!r} cannot be written: {error.strerror or error}",
@@ -76,45 +73,35 @@ def execute(
         plan.close_planners()
 
 
-def _manifest(plan: RunPlan, argv: Sequence[str]) -> dict[str, Any]:
+def _execute(plan: RunPlan, argv: Sequence[str], on_progress: OnProgress) -> Run:
+    config, selection = plan.config, plan.selection
     manifest = make_manifest(
         plan.folder,
-        config=plan.config,
-        split=plan.selection.split,
+        config=config,
+        split=selection.split,
         store=plan.store,
         fingerprint=plan.fingerprint,
         argv=argv,
     )
     manifest["workers"] = plan.workers
-    if (edits := plan.selection.edits) is not None:
-        manifest["edits"] = {**edits.to_dict(), "made": dict(plan.selection.edited)}
-    if plan.config.shard:  # what the whole run would be, for `merge`
-        manifest["tokens"] = sorted(plan.selection.tokens)
-    return manifest
-
-
-def _execute(plan: RunPlan, manifest: dict[str, Any], on_progress: OnProgress) -> Run:
-    missing, interrupted = set(plan.missing), False
-    with closing(RunWriter(plan.folder, manifest, resume=plan.config.resumes)) as writer:
+    if selection.edits is not None:
+        manifest["edits"] = {**selection.edits.to_dict(), "made": dict(selection.edited)}
+    if config.shard:  # what the whole run would be, for `merge`
+        manifest["tokens"] = sorted(selection.tokens)
+    reasons = dict.fromkeys(plan.missing, "the store does not hold this scenario")
+    state = "finished"
+    with closing(RunWriter(plan.folder, manifest, resume=config.resumes)) as writer:
         try:
             _do_tasks(plan, writer, on_progress)
         except KeyboardInterrupt:
             if plan.before == "complete":
                 raise
-            interrupted = True
-        if plan.config.bundle:
+            state = "interrupted"
+        if config.bundle:
             manifest["bundle"] = _bundle(plan)
-        state = "interrupted" if interrupted else "finished"
-        run = writer.finish(
-            {**manifest, "state": state, "ended": now()},
-            (*plan.tasks, *plan.missing),
-            lambda task: (
-                "the store does not hold this scenario"
-                if task in missing
-                else "the run was interrupted"
-            ),
-        )
-    if interrupted:
+        manifest |= {"state": state, "ended": now()}
+        run = writer.finish(manifest, (*plan.tasks, *plan.missing), reasons)
+    if state == "interrupted":
         raise KeyboardInterrupt
     return run
 
@@ -124,8 +111,7 @@ def _bundle(plan: RunPlan) -> dict[str, Any]:
 
     store, tokens = open_named_store(plan.store), {task.token for task in plan.tasks}
     if plan.selection.edits is not None:
-        edited = plan.selection.edits.over(store)
-        tokens = {edited.base(token) for token in tokens}
+        tokens = {plan.selection.edited[token]["base"] for token in tokens}
     return write_bundle(store, plan.folder, tokens)
 
 
@@ -133,15 +119,11 @@ def _do_tasks(plan: RunPlan, writer: RunWriter, on_progress: OnProgress) -> None
     """Do what is not finished."""
     statuses = {task: record.status for task, record in writer.ended.items()}
     batches = remaining(plan.batches, statuses, retry=plan.config.retry_failed)
-    todo = {task for batch in batches for task in batch.tasks}
+    todo = {task for batch in batches for task in batch}
     earlier = (writer.result(task) for task in statuses if task not in todo)
-    progress = Progress(len(plan.tasks) - len(todo), len(plan.tasks), 0)
-
-    def with_earlier(progress: Progress) -> None:
-        on_progress(replace(progress, news=chain(earlier, progress.news)))
-
+    progress = Progress(len(plan.tasks) - len(todo), len(plan.tasks), 0, news=earlier)
     with closing(_results(plan, batches)) as results:
-        record(results, writer.add, progress, with_earlier)
+        record(results, writer.add, progress, on_progress)
 
 
 def record(
@@ -150,8 +132,8 @@ def record(
     progress: Progress,
     on_progress: OnProgress,
 ) -> None:
-    """Put results on disk as they come, batch by batch, and report how far the run is."""
-    warned = set[str]()
+    """Put results on disk as they come, and report how far the run is; it begins at `progress`."""
+    earlier, warned = iter(progress.news), set[str]()
     for results in batches:
         for result in results:
             add(result)
@@ -159,7 +141,7 @@ def record(
             if result.warning and result.task.planner not in warned:
                 warned.add(result.task.planner)
                 _LOG.warning("planner %s: %s", result.task.planner, result.warning)
-        on_progress(replace(progress, news=results))
+        on_progress(replace(progress, news=chain(earlier, results)))
 
 
 def remaining(batches: Iterable[Batch], ended: Mapping[Task, str], *, retry: bool) -> list[Batch]:
@@ -170,33 +152,27 @@ def remaining(batches: Iterable[Batch], ended: Mapping[Task, str], *, retry: boo
     """
     out: list[Batch] = []
     for batch in batches:
-        failed = tuple(task for task in batch.tasks if ended.get(task) in (FAILED, TIMEOUT))
-        if not all(task in ended for task in batch.tasks):
+        failed = tuple(task for task in batch if ended.get(task) in (FAILED, TIMEOUT))
+        if not all(task in ended for task in batch):
             out.append(batch)
         elif retry and failed:
-            out.append(Batch(failed))
+            out.append(failed)
     return out
 
 
 def _results(plan: RunPlan, batches: Sequence[Batch]) -> Generator[list[TaskResult], None, None]:
     """The results of each batch, in whatever order they end."""
     with _networks_in_background(plan) if plan.shared else nullcontext(plan) as plan:
-        if plan.is_serial:
-            with closing(plan.runner()()) as run_batch:
-                yield from map(run_batch, batches)
-            return
         options: dict[str, Any] = {
-            "alone": min(len(plan.planners), len(batches)),
+            "alone": min(len(plan.config.planners), len(batches)),
             "limit": plan.config.timeout,
-            "pieces": Batch.split,
+            "in_batches": True,
         }
-        from shiftsim.runs.workers import map_on_cluster, map_unordered
-
         if plan.config.executor == "dask":
             scheduler = plan.config.scheduler
             outcomes = map_on_cluster(plan.runner(), batches, scheduler=scheduler, **options)
         else:
-            options |= {"workers": plan.workers, "group": attrgetter("token")}
+            options |= {"workers": plan.workers, "group": lambda batch: batch[0].token}
             outcomes = map_unordered(plan.runner(), batches, **options)
         with closing(outcomes):
             yield from map(results_of, outcomes)
@@ -208,23 +184,20 @@ def _networks_in_background(plan: RunPlan) -> Iterator[RunPlan]:
     from shiftsim.planners.learned.owner import InferenceClient, InferenceServer, new_address
     from shiftsim.processes import in_background
 
-    traffic = {plan.config.traffic: plan.traffic} if plan.traffic else {}
-    known, address = {**plan.planners, **traffic}, new_address()
-    makers = {name: known[name].make for name in plan.shared}
-    for name in plan.shared:
-        known[name] = replace(known[name], ask=InferenceClient(address, name))
+    address = new_address()
+    makers = {name: plan.planners[name].make for name in plan.shared}
+    asking = {
+        name: replace(plan.planners[name], ask=InferenceClient(address, name))
+        for name in plan.shared
+    }
     with in_background(partial(InferenceServer, makers, address)):
-        yield replace(
-            plan,
-            planners={name: known[name] for name in plan.planners},
-            traffic=known.get(plan.config.traffic, plan.traffic),
-        )
+        yield replace(plan, planners={**plan.planners, **asking})
 
 
-def results_of(outcome: "Outcome[Batch, list[TaskResult]]") -> list[TaskResult]:
+def results_of(outcome: Outcome[Batch, list[TaskResult]]) -> list[TaskResult]:
     """The results of a batch, whose worker may have died."""
     if outcome.result is not None:
         return outcome.result
     status = TIMEOUT if outcome.is_late else FAILED
     hint = "run this scenario alone with --workers 1 to see why"
-    return [TaskResult(task, status, error=outcome.death, hint=hint) for task in outcome.task.tasks]
+    return [TaskResult(task, status, error=outcome.death, hint=hint) for task in outcome.task]

@@ -8,7 +8,7 @@ Runs over a whole store use the accepted ones.
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -82,7 +82,13 @@ class FilterResults:
     # one row per scenario, sorted by token; the columns of the file
     rows: tuple[Mapping[str, Any], ...]
     hash: str  # digest of the file
-    config: Mapping[str, Any]  # what a scenario had to satisfy
+    conditions: Mapping[str, Any]  # everything that the verdicts depend on
+
+    @property
+    def config(self) -> Mapping[str, Any]:
+        """What a scenario had to satisfy."""
+        config: Mapping[str, Any] = self.conditions["config"]
+        return config
 
     @property
     def accepted(self) -> tuple[str, ...]:
@@ -113,10 +119,9 @@ def _read(store: Path) -> FilterResults:
     """
     path = store / RESULTS
     table = Table(path, SCHEMA)
-    config = table.footer.get("config")
-    if not isinstance(config, dict):
+    if not isinstance(table.footer.get("config"), dict):
         raise DataError(f"{path}: the footer has no 'config'", hint=f"shiftsim filter {store}")
-    return FilterResults(path, tuple(table.read().to_pylist()), digest(path), config)
+    return FilterResults(path, tuple(table.read().to_pylist()), digest(path), table.footer)
 
 
 def read_filter_results(store: str | Path, store_hash: str) -> FilterResults | None:
@@ -129,7 +134,7 @@ def read_filter_results(store: str | Path, store_hash: str) -> FilterResults | N
     if not (path / RESULTS).is_file():
         return None
     found = _read(path)
-    if Table(found.path, SCHEMA).footer.get("store") != store_hash:
+    if found.conditions.get("store") != store_hash:
         raise DataError(
             f"{found.path}: the verdicts are of another content of the store",
             hint=f"shiftsim filter {path}, or --all to use every scenario",
@@ -146,11 +151,11 @@ class Playback:
 
     def __call__(self, token: str) -> dict[str, Any]:
         """The row of the verdict, also where the scenario cannot be driven."""
-        found = attempt(Task("log-playback", "none", 0, token), partial(self._verdict, token))
+        found = attempt(
+            Task("log-playback", "none", 0, token),
+            lambda: judge_scenario(self._scenarios.read(token), self.config),
+        )
         return _failed(token, found.error) if isinstance(found, TaskResult) else found
-
-    def _verdict(self, token: str) -> dict[str, Any]:
-        return judge_scenario(self._scenarios.read(token), self.config)
 
 
 def judge_scenario(scenario: Scenario, config: FilterConfig) -> dict[str, Any]:
@@ -215,8 +220,13 @@ def filter_store(
     unfinished.parent.mkdir(exist_ok=True)
     journal = Journal(unfinished, keep=True)
     try:
-        resumed = [row for _, key, row, _ in journal.items() if key.startswith(conditions["hash"])]
-        rows = (*_finished(path, conditions), *resumed)
+        rows: list[Mapping[str, Any]] = [
+            row for _, key, row, _ in journal.items() if key.startswith(conditions["hash"])
+        ]
+        with suppress(DataError):  # it is written anew
+            earlier = _read(path)
+            if earlier.conditions.get("hash") == conditions["hash"]:
+                rows = [*earlier.rows, *rows]
         done = {row["token"]: row for row in rows if row["verdict"] != FAILED}
         waiting = [token for token in opened.tokens if token not in done]
         on_progress(len(done), len(opened))
@@ -227,8 +237,7 @@ def filter_store(
                 journal.put(f"{conditions['hash']} {outcome.task}", row)
                 done[outcome.task] = row
                 on_progress(len(done), len(opened))
-        found = [dict(done[token]) for token in opened.tokens]
-        table = pa.Table.from_pylist(found, schema=SCHEMA)
+        table = pa.Table.from_pylist([done[token] for token in opened.tokens], schema=SCHEMA)
         write_blocks(path / RESULTS, [table], conditions)
         journal.remove()
     finally:
@@ -253,14 +262,3 @@ def _conditions(config: FilterConfig, store_hash: str, route_hash: str) -> dict[
 def _failed(token: str, reason: str) -> dict[str, Any]:
     row = {"token": token, "verdict": FAILED, "reason": reason}
     return dict.fromkeys(SCHEMA.names) | row
-
-
-def _finished(store: Path, conditions: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
-    if not (store / RESULTS).is_file():
-        return ()
-    try:
-        found = _read(store)
-    except DataError:
-        return ()  # it is written anew
-    same = Table(found.path, SCHEMA).footer.get("hash") == conditions["hash"]
-    return found.rows if same else ()

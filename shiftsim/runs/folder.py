@@ -7,12 +7,12 @@ of the tables, both one by one, so that memory does not grow with the run.
 import json
 import os
 import shutil
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import pyarrow as pa
@@ -26,13 +26,10 @@ from shiftsim.runs.rollouts import Task
 from shiftsim.runs.rollouts.columns import decode_rows
 from shiftsim.runs.rollouts.files import (
     FOLDER,
-    PartWriter,
-    Place,
+    RolloutLocation,
     RolloutReader,
-    next_number,
-    num_rows,
-    part_name,
-    without_key,
+    new_file,
+    write_rollouts,
 )
 from shiftsim.runs.tables import MISSING, STATUSES, TABLES, TaskResult, stored_results
 
@@ -52,7 +49,8 @@ class TaskRecord(NamedTuple):
 
     number: int  # its entry in the journal
     status: str  # what became of it
-    place: Place | None  # where its rollout is, where a Parquet file has it already
+    # where its rollout is, where a Parquet file has it already
+    location: RolloutLocation | None
     has_rollout: bool  # whether the journal has its rollout
 
 
@@ -78,24 +76,33 @@ class RunWriter:
         path.mkdir(parents=True, exist_ok=True)
         self.rollouts = safe_join(path, FOLDER)
         self._journal = Journal(path / JOURNAL, keep=resume)
-        self.ended = dict(self._records())
+        self.ended: dict[Task, TaskRecord] = {}
+        self._outdated = set[Path]()
+        self._read_journal()
         try:
             before = open_run(path)
         except (ConfigError, DataError):
             before = None
         if before is not None and resume and not self.ended:
             self._journal.put_all(map(_entry, stored_results(path)))
-            self.ended = dict(self._records())
+            self._read_journal()
         if before is None or not before.is_complete:
             self._write_manifest(manifest | {"state": "running", "counts": {}})
         self.rollouts.mkdir(exist_ok=True)
-        self._number = next_number(self.rollouts)  # of the next file that is linked to
         self._linked: dict[Path, Path] = {}
 
-    def _records(self) -> Iterator[tuple[Task, TaskRecord]]:
+    def _read_journal(self) -> None:
         for number, key, values, has_rollout in self._journal.items():
             result = TaskResult.from_json(Task(*json.loads(key)), values, self.rollouts)
-            yield result.task, TaskRecord(number, result.status, result.location, has_rollout)
+            self._note(result, number, has_rollout=has_rollout)
+
+    def _note(self, result: TaskResult, number: int, *, has_rollout: bool) -> None:
+        """What has ended; a file that holds an earlier rollout of the task is out of date."""
+        before = self.ended.get(result.task)
+        if before is not None and before.location is not None:
+            self._outdated.add(before.location.file)
+        record = TaskRecord(number, result.status, result.location, has_rollout)
+        self.ended[result.task] = record
 
     def result(self, task: Task) -> TaskResult:
         """What became of a task that has ended, without its rollout."""
@@ -112,33 +119,34 @@ class RunWriter:
             file = self._link(result.location.file)
             result = replace(result, location=result.location._replace(file=file))
         number = self._journal.put(*_entry(result), result.rollout)
-        record = TaskRecord(number, result.status, result.location, bool(result.rollout))
-        self.ended[result.task] = record
+        self._note(result, number, has_rollout=bool(result.rollout))
 
     def _link(self, file: Path) -> Path:
         """Have a file of another run in this one too, without its bytes where the disk can."""
         if file not in self._linked:
-            target = self.rollouts / part_name(self._number)
+            target = new_file(self.rollouts)
             try:
                 os.link(file, target)
             except OSError:
                 with atomic_write(target) as partial:
                     shutil.copyfile(file, partial)
-            self._linked[file], self._number = target, self._number + 1
+            self._linked[file] = target
         return self._linked[file]
 
     def finish(
         self,
         manifest: dict[str, Any],
         expected: Iterable[Task],
-        absent: Callable[[Task], str] = lambda task: "the run was interrupted",
+        reasons: Mapping[Task, str] = MappingProxyType({}),
+        default: str = "the run was interrupted",
     ) -> Run:
         """Write tables and manifest, whose `counts` are filled in.
 
-        `expected` are all tasks of a complete run; `absent` says why one has no result.
+        `expected` are all tasks of a complete run; `reasons`, or the `default`, say why one has no
+        result.
         """
         counts = {"expected": 0, **dict.fromkeys(STATUSES, 0)}
-        places = self._write_rollouts()
+        locations = self._write_rollouts()
         tasks = iter(sorted(expected))
         with ExitStack() as files:
             tables = {name: files.enter_context(self._table(name)) for name in TABLES}
@@ -146,9 +154,9 @@ class RunWriter:
                 rows: dict[str, list[dict[str, Any]]] = {name: [] for name in TABLES}
                 for task in chunk:
                     if task in self.ended:
-                        result = replace(self.result(task), location=places.get(task))
+                        result = replace(self.result(task), location=locations.get(task))
                     else:
-                        result = TaskResult(task, MISSING, error=absent(task))
+                        result = TaskResult(task, MISSING, error=reasons.get(task, default))
                     counts["expected"] += 1
                     counts[result.status] += 1
                     for name, found in result.rows().items():
@@ -157,7 +165,7 @@ class RunWriter:
                     table.write_table(pa.Table.from_pylist(rows[name], TABLES[name]))
         self._write_manifest({**manifest, "counts": counts})
         self._journal.remove()  # what it points to is needed until then
-        used = {place.file for place in places.values()}
+        used = {location.file for location in locations.values()}
         for path in self.rollouts.iterdir():
             if path not in used:
                 path.unlink()
@@ -175,7 +183,7 @@ class RunWriter:
         """Let another process work on the folder."""
         self._journal.close()
 
-    def _write_rollouts(self) -> dict[Task, Place]:
+    def _write_rollouts(self) -> dict[Task, RolloutLocation]:
         """Put the rollouts of a run that ends into files, those of a scenario together.
 
         A file from an earlier attempt stays as it is, unless some of its rollouts have been made
@@ -184,30 +192,35 @@ class RunWriter:
         Returns:
             Where they are.
         """
-        rows_used: Counter[Path] = Counter()
-        for record in self.ended.values():
-            if record.place:
-                rows_used[record.place.file] += record.place.rows
-        complete = {file for file, rows in rows_used.items() if rows == num_rows(file)}
-        places: dict[Task, Place] = {}
-        writer, reader = PartWriter(self.rollouts), RolloutReader()
-        try:
-            for task in sorted(self.ended, key=lambda task: (task.token, task)):
-                number, _, place, has_rollout = self.ended[task]
-                if place and place.file in complete:
-                    places[task] = place
-                elif place:
-                    places[task] = writer.add(task, without_key(reader.read(place)))
-                elif has_rollout:
-                    places[task] = writer.add(task, decode_rows(self._journal.data(number)))
-            writer.close()
-        finally:
-            writer.discard()
-        return places
+        records = [(task, self.ended[task]) for task in sorted(self.ended, key=_by_scenario)]
+        locations = {
+            task: record.location
+            for task, record in records
+            if record.location and record.location.file not in self._outdated
+        }
+        reader = RolloutReader()
+        written = write_rollouts(
+            self.rollouts,
+            (
+                (
+                    task,
+                    reader.read(record.location)
+                    if record.location
+                    else decode_rows(self._journal.data(record.number)),
+                )
+                for task, record in records
+                if task not in locations and (record.location or record.has_rollout)
+            ),
+        )
+        return locations | written
 
     def _write_manifest(self, manifest: dict[str, Any]) -> None:
         text = json.dumps(manifest, indent=2, ensure_ascii=False)
         write_text(self.path / "manifest.json", f"{text}\n")
+
+
+def _by_scenario(task: Task) -> tuple[str, Task]:
+    return task.token, task
 
 
 def _entry(result: TaskResult) -> tuple[str, dict[str, Any]]:

@@ -6,7 +6,7 @@ What was checked is what is run: `prepare` makes the plan that `shiftsim.runs.ex
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -48,8 +48,8 @@ class RunPlan:
     store: str  # folder or URL of the scenario store
     provenance: Mapping[str, Any]  # what made synthetic scenarios; empty for recorded ones
     selection: Selection  # the scenarios
-    planners: Mapping[str, RunPlanner]  # the planners, by name
-    traffic: RunPlanner | None  # who drives the other vehicles, where that is a planner
+    # the planners by name, that of the traffic by the name of the traffic
+    planners: Mapping[str, RunPlanner]
     noises: Mapping[str, NoiseModel]  # the noise models, by name
     batches: tuple[Batch, ...]  # all tasks whose scenario exists, as they are handed out
     missing: tuple[Task, ...]  # tasks whose scenario the store does not hold
@@ -63,7 +63,7 @@ class RunPlan:
     @property
     def tasks(self) -> tuple[Task, ...]:
         """All tasks whose scenario exists."""
-        return tuple(task for batch in self.batches for task in batch.tasks)
+        return tuple(task for batch in self.batches for task in batch)
 
     @property
     def is_serial(self) -> bool:
@@ -73,12 +73,12 @@ class RunPlan:
 
     def runner(self) -> "partial[TaskRunner]":
         """What makes the function that does batches, in this process or in another one."""
-        given = (self.config, self.store, self.planners, self.noises)
-        return partial(TaskRunner, *given, traffic=self.traffic, edits=self.selection.edits)
+        given = (self.config, self.store, self.planners, self.noises, self.selection.edits)
+        return partial(TaskRunner, *given)
 
     def close_planners(self) -> None:
-        """Close the planners that were made to be checked and are not needed in this process."""
-        for planner in (*self.planners.values(), *([self.traffic] if self.traffic else [])):
+        """Close the planners of this process."""
+        for planner in self.planners.values():
             planner.close()
 
 
@@ -105,14 +105,14 @@ def prepare(
     config = replace(
         config, noise=tuple(model.name for model in models), traffic=traffic_name(config.traffic)
     )
-    traffic, traffic_fingerprint, in_batches = _traffic(config)
+    traffic, traffic_fingerprint, is_batched = _traffic(config)
     thresholds = asdict(thresholds_of(config.thresholds))
     for metric in config.metrics:
         load_metric(metric)
     entries = _planners(config, planners or config.planners)
     store = open_named_store(config.store)
     selection = select_scenarios(config, store, edits)
-    grouped = {entry.name for entry in entries if entry.in_batches or in_batches}
+    grouped = {entry.name for entry in entries if entry.in_batches or is_batched}
     fingerprint = {
         **selection.fingerprint,
         **_fingerprint(config, entries, models, thresholds),
@@ -130,20 +130,23 @@ def prepare(
     ]
     # scenario by scenario, so that a worker can often reuse the one it has read
     tasks = [Task(*run, token) for token in selection.present for run in runs]
-    missing = [Batch((Task(*run, token),)) for token in selection.missing for run in runs]
+    missing: list[Batch] = [(Task(*run, token),) for token in selection.missing for run in runs]
     batches = _of_shard(config.shard, _batches(grouped, tasks, config.batch_size))
-    shared = _on_gpu(config, entries, traffic)
+    by_name = {entry.name: entry for entry in entries}
+    by_name |= {config.traffic: traffic} if traffic else {}
+    # of this machine; workers on others would not reach the process
+    on_gpu = tuple(name for name, entry in by_name.items() if entry.on_gpu)
+    shared = on_gpu if config.executor == "processes" else ()
     workers = _workers(config, entries, len(batches), shared)
     plan = RunPlan(
         config=config,
         store=store.source,
         provenance=store.generator,
         selection=selection,
-        planners={entry.name: entry for entry in entries},
-        traffic=traffic,
+        planners=by_name,
         noises={model.name: model for model in models},
         batches=tuple(_leading_first(batches)),
-        missing=tuple(batch.tasks[0] for batch in _of_shard(config.shard, missing)),
+        missing=tuple(task for task, *_ in _of_shard(config.shard, missing)),
         fingerprint=fingerprint,
         folder=folder,
         before=before,
@@ -249,16 +252,6 @@ def _check_folder(config: RunConfig, folder: Path, fingerprint: dict[str, Any]) 
     return before
 
 
-def _on_gpu(
-    config: RunConfig, entries: Sequence[RunPlanner], traffic: RunPlanner | None
-) -> tuple[str, ...]:
-    """Planners whose networks the workers of this machine can share."""
-    if config.executor != "processes":
-        return ()
-    names = [entry.name for entry in entries if entry.on_gpu]
-    return (*names, *([config.traffic] if traffic is not None and traffic.on_gpu else ()))
-
-
 def _workers(
     config: RunConfig, entries: Sequence[RunPlanner], num_batches: int, shared: Sequence[str]
 ) -> int:
@@ -287,11 +280,11 @@ def _batches(grouped: set[str], tasks: list[Task], size: int) -> list[Batch]:
     The groups depend on the whole run only, not on workers, shards or what is finished already. The
     first is a single task: other workers wait until it has compiled the planner's kernels.
     """
-    batches = [Batch((task,)) for task in tasks if task.planner not in grouped]
+    batches: list[Batch] = [(task,) for task in tasks if task.planner not in grouped]
     for name in sorted(grouped):
-        own = tuple(task for task in tasks if task.planner == name)
-        batches += [Batch(own[:1])]
-        batches += [Batch(own[i : i + size]) for i in range(1, len(own), size)]
+        of_planner = tuple(task for task in tasks if task.planner == name)
+        batches += [of_planner[:1]]
+        batches += [of_planner[i : i + size] for i in range(1, len(of_planner), size)]
     return batches
 
 
@@ -305,14 +298,13 @@ def _of_shard(shard: str, batches: list[Batch]) -> list[Batch]:
         digest = hashlib.blake2b(repr(tuple(task)).encode(), digest_size=8).digest()
         return int.from_bytes(digest, "little") % count
 
-    return [batch for batch in batches if bucket(batch.tasks[0]) == number - 1]
+    return [batch for batch in batches if bucket(batch[0]) == number - 1]
 
 
-def _leading_first(batches: list[Batch]) -> Iterator[Batch]:
+def _leading_first(batches: list[Batch]) -> list[Batch]:
     """One batch per planner to the front: they compile all the kernels."""
-    leading = {batch.planner: batch for batch in reversed(batches)}
-    yield from (batch for batch in batches if leading[batch.planner] is batch)
-    yield from (batch for batch in batches if leading[batch.planner] is not batch)
+    leading = {batch[0].planner: batch for batch in reversed(batches)}
+    return sorted(batches, key=lambda batch: leading[batch[0].planner] is not batch)
 
 
 def _fingerprint(

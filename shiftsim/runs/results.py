@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.runs.rollouts import Task, complete_rollout, describe
-from shiftsim.runs.rollouts.files import Place, RolloutReader
+from shiftsim.runs.rollouts.files import RolloutLocation, RolloutReader
 from shiftsim.runs.tables import LOCATION, OK, damaged, read_table, stored_location
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.scenario import Scenario
@@ -60,7 +60,7 @@ class Run:
         return read_table(self.path / "tasks.parquet")
 
     @cached_property
-    def rollout_places(self) -> dict[Task, Place | None]:
+    def rollout_places(self) -> dict[Task, RolloutLocation | None]:
         """Where every rollout is stored; None where there is none."""
         keys, places = (
             zip(*(self.tasks[name].to_pylist() for name in names), strict=True)
@@ -85,13 +85,13 @@ class Run:
         Raises:
             DataError: It was not stored, or cannot be read.
         """
-        place = self.rollout_places.get(task)
-        if place is None:
+        location = self.rollout_places.get(task)
+        if location is None:
             raise DataError(
                 f"run {self.path.name!r} holds no rollout of {describe(task)}",
                 hint="run again with --save-rollouts all",
             )
-        return self._reader.read(place)
+        return self._reader.read(location)
 
     @cached_property
     def _reader(self) -> RolloutReader:

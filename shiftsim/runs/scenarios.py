@@ -9,7 +9,7 @@ import json
 import shutil
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -57,31 +57,30 @@ def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
     Raises:
         DataError: It is not there, or is another one.
     """
-    bundle = run.path / BUNDLE
+    bundle, place = run.path / BUNDLE, store or run.manifest["store"]
+    recorded = wanted = run.manifest["determining"]["store"]
     if store is None and bundle.is_dir():
-        found = open_store(bundle)
-        wanted = run.manifest.get("bundle", {}).get("hash")
-    else:
-        place = store or run.manifest["store"]
-        if "://" in place and store is None:  # which may be anybody's
+        found, wanted = open_store(bundle), run.manifest.get("bundle", {}).get("hash")
+    elif "://" in place:
+        if store is None:  # which may be anybody's
             raise DataError(
                 f"the store of run {run.path.name!r} is behind the URL {place!r}",
                 hint=f"if you trust it: --store {place}",
             )
-        path = store_path(place)
-        if "://" not in place and not path.exists():
-            raise DataError(
-                f"the store of run {run.path.name!r} is not at {str(path)!r}",
-                hint="say where it is with --store",
-            )
-        found = open_store(place if "://" in place else path)
-        wanted = run.manifest["determining"]["store"]
+        found = open_store(place)
+    elif not (path := store_path(place)).exists():
+        raise DataError(
+            f"the store of run {run.path.name!r} is not at {str(path)!r}",
+            hint="say where it is with --store",
+        )
+    else:
+        found = open_store(path)
     if found.hash != wanted:
         raise DataError(
             f"store {str(found.path)!r} is not the one run {run.path.name!r} was made with",
             hint="name the right one with --store, or run again",
         )
-    found.hash = run.manifest["determining"]["store"]
+    found.hash = recorded
     if edits := run.manifest.get("edits"):
         from shiftsim.runs.edited import EditedStore, make_edits
 
@@ -97,9 +96,15 @@ def open_edits(name: str, store: ScenarioStore) -> "EditSet":
     """
     from shiftsim.runs.edited import read_edits
 
-    path, known = Path(store.path), store.tokens
+    path = Path(store.path)
     edits = read_edits(name, path)
-    return edits.with_splits(lambda split: find_split(split, path, known).tokens)
+    resolved = (
+        replace(edit, split="", tokens=find_split(edit.split, path, store.tokens).tokens)
+        if edit.split
+        else edit
+        for edit in edits.edits
+    )
+    return replace(edits, edits=tuple(resolved))
 
 
 class Selection(NamedTuple):
@@ -130,9 +135,8 @@ def select_scenarios(
     known = tuple(store.tokens)
     usable, fingerprint = known, {"store": store.hash}
     if config.split in ("", store.path.name) and not config.all_scenarios:
-        usable, filter_hash = _usable(config, store)
-        if filter_hash:
-            fingerprint["filter"] = filter_hash
+        usable, filter_hash = _usable(config.store, store)
+        fingerprint |= {"filter": filter_hash} if filter_hash else {}
     split = find_split(config.split, Path(store.path), usable)
     name, tokens, store_tokens, edited = split.name, split.tokens, set(known), dict[str, Any]()
     edits = given or (open_edits(config.edits, store) if config.edits else None)
@@ -162,43 +166,36 @@ def select_scenarios(
     return Selection(name, present, missing, dropped, fingerprint, edits, edited)
 
 
-def _usable(config: RunConfig, store: ScenarioStore) -> tuple[tuple[str, ...], str]:
+def _usable(name: str, store: ScenarioStore) -> tuple[tuple[str, ...], str]:
     """The scenarios of a whole store that filter and review accept, and the filter's hash."""
     from shiftsim.runs.filter import read_filter_results
 
-    known, filter_hash = tuple(store.tokens), ""
-    usable, results = known, read_filter_results(store.path, store.hash)
+    usable, results = tuple(store.tokens), read_filter_results(store.path, store.hash)
     if results is not None:
         if not results.accepted:
             raise DataError(
-                f"store {config.store!r}: the filter dropped all {len(results.rows)} scenarios",
+                f"store {name!r}: the filter dropped all {len(results.rows)} scenarios",
                 hint="`shiftsim filter` says why; --all to use them nevertheless",
             )
-        accepted, filter_hash = set(results.accepted), results.hash
-        usable = tuple(token for token in known if token in accepted)
+        accepted = set(results.accepted)
+        usable = tuple(token for token in usable if token in accepted)
     if store.is_reviewed:
-        usable = store.reviews.usable(known, usable)
-    return usable, filter_hash
+        usable = store.reviews.usable(tuple(store.tokens), usable)
+    return usable, results.hash if results else ""
 
 
 def write_bundle(store: ScenarioStore, folder: Path, tokens: Iterable[str]) -> dict[str, Any]:
     """Copy scenarios with their recordings and maps into a run folder; for its manifest."""
-    target = safe_join(folder, BUNDLE)
-    if not target.exists():
-        partial = safe_join(folder, f".{BUNDLE}.tmp")
-        shutil.rmtree(partial, ignore_errors=True)
-        _copy(store, partial, set(tokens))
-        partial.rename(target)
-    return {"hash": open_store(target).hash}
-
-
-def _copy(store: ScenarioStore, target: Path, tokens: set[str]) -> None:
     from shiftsim.data.store.writing import StoreWriter, window_row
 
+    target, partial = (safe_join(folder, name) for name in (BUNDLE, f".{BUNDLE}.tmp"))
+    if target.exists():
+        return {"hash": open_store(target).hash}
+    shutil.rmtree(partial, ignore_errors=True)
     columns = (store.summary()[name].to_pylist() for name in ("token", "recording", "city"))
-    used = [row for row in zip(*columns, strict=True) if row[0] in tokens]
-
-    with StoreWriter(target, store.generator or None) as writer:
+    wanted = set(tokens)
+    used = [row for row in zip(*columns, strict=True) if row[0] in wanted]
+    with StoreWriter(partial, store.generator or None) as writer:
         for city in sorted({city for _, _, city in used}):
             writer.add_map(store.map(city))
         for recording in sorted({recording for _, recording, _ in used}):
@@ -207,12 +204,14 @@ def _copy(store: ScenarioStore, target: Path, tokens: set[str]) -> None:
                 for token, name, city in used
                 if name == recording
             ]
-            copied = target / ".recording"
+            copied = partial / ".recording"
             shutil.copytree(store.recording_folder(recording), copied)
             writer.take_recording(copied, recording, rows)
     if (store.path / REVIEW).is_file():
-        (target / REVIEW).parent.mkdir()
-        shutil.copyfile(store.path / REVIEW, target / REVIEW)
+        (partial / REVIEW).parent.mkdir()
+        shutil.copyfile(store.path / REVIEW, partial / REVIEW)
+    partial.rename(target)
+    return {"hash": open_store(target).hash}
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from shiftsim.errors import DataError
 from shiftsim.metrics import SHORT_NAMES
 from shiftsim.runs.rollouts import Task, describe
-from shiftsim.runs.rollouts.files import FOLDER, Place, part_file
+from shiftsim.runs.rollouts.files import FOLDER, RolloutLocation, part_file
 from shiftsim.world.ranges import RUN, require
 
 OK, FAILED, TIMEOUT, MISSING = STATUSES = ("ok", "failed", "timeout", "missing")
@@ -93,7 +93,9 @@ class TaskResult:
     # the rows of `metrics.parquet` beyond the key
     metrics: list[dict[str, Any]] = field(default_factory=list)
     rollout: bytes = b""  # the rollout, encoded; empty where it is not stored, or stored elsewhere
-    location: Place | None = None  # where the rollout is stored, where it is in a file already
+    location: RolloutLocation | None = (
+        None  # where the rollout is stored, where it is in a file already
+    )
     warning: str = ""  # why the first plan is most likely not what was meant
 
     def to_json(self) -> dict[str, Any]:
@@ -107,14 +109,14 @@ class TaskResult:
     def from_json(task: Task, values: dict[str, Any], folder: Path) -> "TaskResult":
         """A result from JSON values; `folder` is that of its rollout."""
         found = values["location"]
-        location = found and Place(part_file(folder, found[0]), *found[1:])
+        location = found and RolloutLocation(part_file(folder, found[0]), *found[1:])
         return TaskResult(task, **{**values, "location": location})
 
     def rows(self) -> dict[str, list[dict[str, Any]]]:
         """Its rows by table."""
         key = self.task._asdict()
-        place = self.location
-        stored = (place.file.name, place.row, place.rows) if place else (None, None, None)
+        at = self.location
+        stored = (at.file.name, at.row, at.rows) if at else (None, None, None)
         row = key | {name: getattr(self, name) for name in _TEXTS} | self.seconds
         return {
             "tasks": [row | dict(zip(LOCATION, stored, strict=True))],
@@ -123,9 +125,9 @@ class TaskResult:
         }
 
 
-def stored_location(run: Path, rollout: str | None, row: Any, rows: Any) -> Place | None:
+def stored_location(run: Path, rollout: str | None, row: Any, rows: Any) -> RolloutLocation | None:
     """Where a rollout of a run is, by the columns of `tasks.parquet`."""
-    return Place(part_file(run / FOLDER, rollout), row, rows) if rollout else None
+    return RolloutLocation(part_file(run / FOLDER, rollout), row, rows) if rollout else None
 
 
 def stored_results(run: Path) -> Iterator[TaskResult]:

@@ -6,12 +6,12 @@ them: the open store, what copies of each planner are made from, and the last sc
 """
 
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -20,7 +20,6 @@ from shiftsim.data.store.reading import ScenarioStore, open_store
 from shiftsim.errors import ConfigError, ShiftsimError, readable
 from shiftsim.files import place_of
 from shiftsim.metrics import METRIC_VERSION, SHORT_NAMES, MetricRow, compute_metrics
-from shiftsim.planners.prototype import PlannerPrototype
 from shiftsim.planners.registry import RunPlanner
 from shiftsim.runs.config import RunConfig
 from shiftsim.runs.rollouts import Task
@@ -39,25 +38,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
-@dataclass(frozen=True, slots=True)
-class Batch:
-    """What a worker is handed at once."""
-
-    tasks: tuple[Task, ...]  # one task, or several of one planner that are driven in lock step
-
-    @property
-    def planner(self) -> str:
-        """Name of the planner of all tasks."""
-        return self.tasks[0].planner
-
-    @property
-    def token(self) -> str:
-        """Scenario of the first task."""
-        return self.tasks[0].token
-
-    def split(self) -> list["Batch"]:
-        """The tasks one by one."""
-        return [Batch((task,)) for task in self.tasks]
+# what a worker is handed at once: one task, or several of one planner that are driven in lock step
+Batch: TypeAlias = tuple[Task, ...]
 
 
 class ScenarioReader:
@@ -71,8 +53,11 @@ class ScenarioReader:
     def read(self, token: str) -> Scenario:
         """A scenario; several tasks on one follow each other."""
         if self._open is None:
-            found = open_store(self.store)
-            self._open = self.edits.over(found) if self.edits else found
+            self._open = open_store(self.store)
+            if self.edits is not None:
+                from shiftsim.runs.edited import EditedStore
+
+                self._open = EditedStore(self._open, self.edits)
         if self._last is None or self._last.token != token:
             self._last = self._open.read(token)
         return self._last
@@ -97,77 +82,64 @@ class TaskRunner:
         store: str,
         planners: Mapping[str, RunPlanner],
         noises: Mapping[str, NoiseModel],
-        *,
-        traffic: RunPlanner | None = None,
         edits: "EditSet | None" = None,
     ) -> None:
-        """Planners and noise models are by name; `traffic` is a planner that drives vehicles."""
+        """Planners and noise models are by name; one of the traffic is a planner, too."""
         self.config, self.planners, self.noises = config, planners, noises
-        self.traffic, self.edits = traffic, edits
+        self.edits = edits
         self._scenarios = ScenarioReader(store, edits)
-        self._prototypes: dict[str, PlannerPrototype] = {}
         self._network: BatchTraffic | None = None
 
     def __call__(self, batch: Batch) -> list[TaskResult]:
-        """One result per task."""
-        if len(batch.tasks) == 1:
-            return [self._run_one(batch.tasks[0])]
-        return self._run_together(batch)
+        """One result per task; several are driven in lock step, and each fails for itself."""
+        seconds = {task: dict[str, float]() for task in batch}
+        found = {task: attempt(task, partial(self._begin, task, seconds[task])) for task in batch}
+        rollouts = {task: one for task, one in found.items() if isinstance(one, Rollout)}
+        began = perf_counter()
+        logs: Sequence[SimulationLog | BaseException]
+        try:
+            if len(batch) > 1:
+                logs = simulate_together(list(rollouts.values()))
+            else:
+                logs = [drive(rollout) for rollout in rollouts.values()]
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            if len(batch) > 1:  # the shared pass itself failed: too little memory for all of them?
+                return [result for task in batch for result in self((task,))]
+            logs = [error]
+        finally:
+            for task, rollout in rollouts.items():
+                self._release(task, rollout.planner)
+        share = (perf_counter() - began) / max(1, len(rollouts))
+        for (task, rollout), log in zip(rollouts.items(), logs, strict=True):
+            seconds[task]["simulate_seconds"] += share
+            found[task] = attempt(task, partial(self._score, task, rollout, log, seconds[task]))
+        return [
+            replace(result, seconds=seconds[task])
+            for task, result in found.items()
+            if isinstance(result, TaskResult)
+        ]
 
-    def _run_one(self, task: Task) -> TaskResult:
-        seconds: dict[str, float] = {}
-        return replace(attempt(task, partial(self._drive, task, seconds)), seconds=seconds)
-
-    def _drive(self, task: Task, seconds: dict[str, float]) -> TaskResult:
+    def _begin(self, task: Task, seconds: dict[str, float]) -> Rollout:
         with _timed(seconds, "read_seconds"):
             scenario = self._scenarios.read(task.token)
         with _timed(seconds, "simulate_seconds"):
             planner = self._planner(task)
             try:
-                rollout = Rollout(scenario, planner, self._setting(task))
-                log = drive(rollout)
-            finally:
+                return Rollout(scenario, planner, self._setting(task))
+            except BaseException:
                 self._release(task, planner)
-        return self._score(task, rollout, log, seconds)
-
-    def _run_together(self, batch: Batch) -> list[TaskResult]:
-        """Several tasks in lock step; each of them fails for itself."""
-        seconds: dict[Task, dict[str, float]] = {task: {} for task in batch.tasks}
-        results, rollouts = dict[Task, TaskResult](), dict[Task, Rollout]()
-        for task in batch.tasks:
-            found = attempt(task, partial(self._begin, task, seconds[task]))
-            if isinstance(found, TaskResult):
-                results[task] = found
-            else:
-                rollouts[task] = found
-        began = perf_counter()
-        try:
-            logs = simulate_together(list(rollouts.values()))
-        except (Exception, SystemExit):
-            # the shared pass itself failed: too little memory for all of them?
-            return [self._run_one(task) for task in batch.tasks]
-        finally:
-            for task, rollout in rollouts.items():
-                self._release(task, rollout.planner)
-        share = (perf_counter() - began) / max(1, len(logs))
-        for (task, rollout), log in zip(rollouts.items(), logs, strict=True):
-            seconds[task]["simulate_seconds"] = share
-            results[task] = attempt(task, partial(self._score, task, rollout, log, seconds[task]))
-        return [replace(results[task], seconds=seconds[task]) for task in batch.tasks]
-
-    def _begin(self, task: Task, seconds: dict[str, float]) -> Rollout:
-        with _timed(seconds, "read_seconds"):
-            scenario = self._scenarios.read(task.token)
-        return Rollout(scenario, self._planner(task), self._setting(task))
+                raise
 
     def _score(
         self,
         task: Task,
         rollout: Rollout,
-        log: SimulationLog | Exception,
+        log: SimulationLog | BaseException,
         seconds: dict[str, float],
     ) -> TaskResult:
-        if isinstance(log, Exception):
+        if isinstance(log, BaseException):
             raise log
         scenario, per_step = rollout.scenario, log.planning_seconds * 1e3
         seconds["planner_seconds"] = float(log.planning_seconds.sum())
@@ -204,18 +176,18 @@ class TaskRunner:
         """The planner of a task, which has nothing of other tasks."""
         if self.config.controller == "log-playback":
             return None
-        return self._prototype(task.planner, self.planners[task.planner]).copy()
+        return self.planners[task.planner].prototype.copy()
 
     def _release(self, task: Task, planner: Planner | None) -> None:
         if planner is not None:
-            self._prototypes[task.planner].release(planner)
+            self.planners[task.planner].prototype.release(planner)
 
     def _make_traffic(self) -> Traffic:
         """The traffic of one rollout; a network is loaded once."""
-        if self.traffic is not None:
+        if (planner := self.planners.get(self.config.traffic)) is not None:
             from shiftsim.sim.traffic.planned import PlannedTraffic
 
-            return PlannedTraffic(self._prototype(self.config.traffic, self.traffic).copy)
+            return PlannedTraffic(planner.prototype.copy)
         if self._network is None:
             model = make_traffic(self.config.traffic, self.config.device)
             if not isinstance(model, BatchTraffic):
@@ -223,16 +195,10 @@ class TaskRunner:
             self._network = model
         return self._network.fork()
 
-    def _prototype(self, name: str, planner: RunPlanner) -> PlannerPrototype:
-        if name not in self._prototypes:
-            self._prototypes[name] = PlannerPrototype(planner.make)
-        return self._prototypes[name]
-
     def close(self) -> None:
         """Let the planners release what they hold."""
-        for prototype in self._prototypes.values():
-            prototype.close()
-        self._prototypes.clear()
+        for planner in self.planners.values():
+            planner.close()
 
 
 def attempt(task: Task, work: Callable[[], T]) -> T | TaskResult:
@@ -297,17 +263,14 @@ _METRIC_COLUMNS = pa.schema(
 
 
 def _metric_row(row: MetricRow, start_us: int, profile: Mapping[str, str]) -> dict[str, Any]:
-    first = row.violation
-    return {
-        "metric": row.metric,
-        "value": row.value,
-        "unit": row.unit,
-        "threshold": row.threshold,
-        "score": row.score,
-        "first_violation_iteration": None if first is None else first.iteration,
-        "first_violation_time_us": None if first is None else first.time_us,
-        "first_violation_s": None if first is None else (first.time_us - start_us) * 1e-6,
-        "first_violation_value": None if first is None else first.value,
-        "partner_token": None if first is None else first.partner,
-        **profile,
-    }
+    plain = ("metric", "value", "unit", "threshold", "score")
+    values = dict.fromkeys(_METRIC_COLUMNS.names) | {name: getattr(row, name) for name in plain}
+    if (first := row.violation) is not None:
+        values |= {
+            "first_violation_iteration": first.iteration,
+            "first_violation_time_us": first.time_us,
+            "first_violation_s": (first.time_us - start_us) * 1e-6,
+            "first_violation_value": first.value,
+            "partner_token": first.partner,
+        }
+    return {**values, **profile}

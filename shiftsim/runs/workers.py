@@ -10,7 +10,7 @@ import pickle
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -55,7 +55,7 @@ def map_unordered(
     workers: int,
     alone: int = 0,
     limit: float = 0.0,
-    pieces: Callable[[T], Sequence[T]] | None = None,
+    in_batches: bool = False,
     group: Callable[[T], object] | None = None,
 ) -> Generator[Outcome[T, R], None, None]:
     """Apply a function to every task, in whatever order they finish.
@@ -68,14 +68,14 @@ def map_unordered(
         workers: Number of worker processes; with 1 and no limit everything happens in this process.
         alone: So many leading tasks are done one at a time before the others, so that kernels
             which are not in the disk cache yet are compiled once.
-        limit: Time that each piece of a task may take [s]; 0 for any. What a worker has to load,
-            or to compile, does not count.
-        pieces: Splits a task that is several in one; when its worker dies, they are done one by
-            one, so that only one of them is lost.
+        limit: Time that each task, or each part of a batch, may take [s]; 0 for any. What a worker
+            has to load, or to compile, does not count.
+        in_batches: Whether the tasks are tuples of several in one; when the worker of one dies,
+            its parts are done one by one, so that only one of them is lost.
         group: What a worker should stay with, as it has read it already; neighbours only.
 
     Yields:
-        One outcome per task, or per piece of one whose worker died.
+        One outcome per task, or per part of a batch whose worker died.
 
     Raises:
         ConfigError: Workers cannot be started.
@@ -88,7 +88,7 @@ def map_unordered(
         finally:
             close(function)
         return
-    pool = Pool(packed(make), max(1, workers), limit, pieces, group)
+    pool = Pool(packed(make), max(1, workers), limit, group, in_batches=in_batches)
     try:
         yield from pool.run(tasks, alone)
     finally:
@@ -126,13 +126,13 @@ class Pool:
         payload: bytes,
         size: int,
         limit: float = 0.0,
-        pieces: Callable[[Any], Sequence[Any]] | None = None,
         group: Callable[[Any], object] | None = None,
+        *,
+        in_batches: bool,
     ) -> None:
         """A pool without workers; `payload` is for `processes.start`."""
         self.payload, self.size, self.limit = payload, size, limit
-        self.pieces = pieces or (lambda task: (task,))
-        self.group = group
+        self.group, self.in_batches = group, in_batches
         self.workers: list[_Worker] = []
         self.failed_starts = 0
 
@@ -151,29 +151,31 @@ class Pool:
                 worker.give(task, self._seconds(task))
             for outcome in self._wait():
                 done += 1
-                parts = self.pieces(outcome.task) if outcome.death else ()
-                if len(parts) > 1:
-                    waiting.extendleft(reversed(parts))
+                if outcome.death and self.in_batches and len(outcome.task) > 1:
+                    waiting.extendleft((part,) for part in reversed(outcome.task))
                 else:
                     yield outcome
 
     def _next_task(self, waiting: deque[Any], worker: _Worker) -> Any:
         """The next task for a worker: of its own group, else of one that no other is at."""
-        place = 0
+        index = 0
         if self.group is not None:
             groups = [self.group(task) for task in islice(waiting, _LOOK_AHEAD)]
-            own = None if worker.task is None else self.group(worker.task)
             # also of those that have just ended a task and are given their next one after this
-            at = (other.task for other in self.workers if other is not worker)
-            others = {self.group(task) for task in at if task is not None}
+            others = {
+                self.group(other.task)
+                for other in self.workers
+                if other is not worker and other.task is not None
+            }
             fresh = (i for i, found in enumerate(groups) if found not in others)
-            place = groups.index(own) if own in groups else next(fresh, 0)
-        task = waiting[place]
-        del waiting[place]
+            last = None if worker.task is None else self.group(worker.task)
+            index = groups.index(last) if last in groups else next(fresh, 0)
+        task = waiting[index]
+        del waiting[index]
         return task
 
-    def _seconds(self, task: object) -> float:
-        return self.limit * len(self.pieces(task)) if self.limit else inf
+    def _seconds(self, task: Any) -> float:
+        return self.limit * (len(task) if self.in_batches else 1) or inf
 
     def _in(self, state: str) -> list[_Worker]:
         return [worker for worker in self.workers if worker.state == state]
@@ -238,7 +240,7 @@ def map_on_cluster(
     scheduler: str,
     alone: int = 0,
     limit: float = 0.0,
-    pieces: Callable[[T], Sequence[T]] | None = None,
+    in_batches: bool = False,
 ) -> Generator[Outcome[T, R], None, None]:
     """As `map_unordered`, on the cluster whose scheduler is at an address.
 
@@ -255,8 +257,8 @@ def map_on_cluster(
             hint="start one with `dask scheduler`, and workers with `dask worker ADDRESS`",
         ) from error
     job = uuid4().hex
-    work = partial(_work, job, pickle.dumps((sys.path, pickle.dumps(make), limit, pieces)))
-    waiting = deque(tasks)
+    work = partial(_work, job, pickle.dumps((sys.path, pickle.dumps(make), limit, in_batches)))
+    waiting: deque[Any] = deque(tasks)
     pending: dict[Any, Any] = {}  # future -> task
     done, window = 0, 1
     futures = distributed.as_completed([], loop=client.loop)
@@ -275,9 +277,8 @@ def map_on_cluster(
             try:
                 yield from future.result()
             except distributed.KilledWorker as error:  # every worker that took it was lost
-                parts = pieces(task) if pieces else (task,)
-                if len(parts) > 1:
-                    waiting.extendleft(reversed(parts))
+                if in_batches and len(task) > 1:
+                    waiting.extendleft((part,) for part in reversed(task))
                 else:
                     yield Outcome(task, None, f"lost with several workers: {error}")
     finally:
@@ -292,9 +293,9 @@ def _work(job: str, payload: bytes, task: Any) -> list[Outcome[Any, Any]]:
     if key not in _POOLS:
         for other in [other for other in _POOLS if other[1] == key[1]]:
             _POOLS.pop(other).close()  # of a run whose main process was killed
-        paths, make, limit, pieces = pickle.loads(payload)
+        paths, make, limit, in_batches = pickle.loads(payload)
         here = [*sys.path, *(path for path in paths if path not in sys.path)]
-        _POOLS[key] = Pool(pickle.dumps((here, make)), 1, limit, pieces)
+        _POOLS[key] = Pool(pickle.dumps((here, make)), 1, limit, in_batches=in_batches)
     return list(_POOLS[key].run([task], 0))
 
 

@@ -20,7 +20,6 @@ from shiftsim.runs.prepare import prepare
 from shiftsim.runs.results import JOURNAL
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.tables import TaskResult
-from shiftsim.runs.task import Batch
 from shiftsim.runs.workers import Outcome
 
 sys.path.append(str(Path(__file__).parent))  # worker processes import `drivers`, too
@@ -296,6 +295,6 @@ def test_a_worker_that_died_is_told_from_one_that_was_late():
     from shiftsim.runs.execute import results_of
 
     task = Task("p", "none", 0, "a")
-    (died,) = results_of(Outcome(Batch((task,)), None, "worker process killed by SIGKILL"))
-    (late,) = results_of(Outcome(Batch((task,)), None, "took longer than 2 s", is_late=True))
+    (died,) = results_of(Outcome((task,), None, "worker process killed by SIGKILL"))
+    (late,) = results_of(Outcome((task,), None, "took longer than 2 s", is_late=True))
     assert (died.status, late.status) == ("failed", "timeout")

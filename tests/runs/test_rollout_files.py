@@ -24,7 +24,7 @@ from shiftsim.runs.rollouts.columns import (
     stored_plans,
     stored_tracks,
 )
-from shiftsim.runs.rollouts.files import PartWriter, Place, RolloutReader, without_key
+from shiftsim.runs.rollouts.files import RolloutLocation, RolloutReader, write_rollouts
 from shiftsim.runs.tables import TaskResult
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.state import Tracks, TrafficLights
@@ -71,6 +71,11 @@ def key(number):
     return Task("p", "none" if number % 2 else "ou-high", number % 3, f"{number:04x}")
 
 
+def without_key(rows):
+    """A rollout as it was written."""
+    return rows.select(rows.schema.names[5:])
+
+
 @settings(max_examples=40, deadline=None)
 @given(
     lengths=st.lists(st.integers(1, 7), min_size=1, max_size=20),
@@ -84,51 +89,47 @@ def test_every_rollout_is_found_again(tmp_path_factory, lengths, tracks, per_gro
         key(i): made_up(length, value=float(i), tracks=tracks) for i, length in enumerate(lengths)
     }
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rollout_files, "_MAX_GROUP", (per_group, 1 << 30))
-        patch.setattr(rollout_files, "_MAX_FILE", (per_file, 1 << 30))
-        writer = PartWriter(folder)
-        places = {task: writer.add(task, rows) for task, rows in made.items()}
-        writer.close()
+        patch.setattr(rollout_files, "_GROUP", per_group)
+        patch.setattr(rollout_files, "_FILE", per_file)
+        locations = write_rollouts(folder, made.items())
     files = sorted(folder.iterdir())
     assert len(files) == -(-len(lengths) // per_file)
     assert all(pq.ParquetFile(file).metadata.row_group(0).num_rows for file in files)
     reader = RolloutReader()
-    for task, place in places.items():
-        rows = reader.read(place)
+    for task, location in locations.items():
+        rows = reader.read(location)
         assert without_key(rows).equals(made[task])
         assert rows["iteration"].to_pylist() == list(range(len(rows)))
-        named = pq.read_table(place.file, columns=[*Task._fields, "time_us"]).to_pylist()
+        named = pq.read_table(location.file, columns=[*Task._fields, "time_us"]).to_pylist()
         own = [row for row in named if Task(*(row[n] for n in Task._fields)) == task]
-        assert len(own) == place.rows
+        assert len(own) == location.rows
 
 
-def test_a_row_group_is_cut_where_it_gets_large(tmp_path, monkeypatch):
-    monkeypatch.setattr(rollout_files, "_MAX_GROUP", (100, 3 * made_up(5).get_total_buffer_size()))
-    writer = PartWriter(tmp_path)
-    for number in range(7):
-        place = writer.add(key(number), made_up(5))
-    writer.close()
-    metadata = pq.ParquetFile(place.file).metadata
+def test_a_row_group_is_cut_where_it_has_enough_rollouts(tmp_path, monkeypatch):
+    monkeypatch.setattr(rollout_files, "_GROUP", 3)
+    locations = write_rollouts(tmp_path, ((key(number), made_up(5)) for number in range(7)))
+    metadata = pq.ParquetFile(locations[key(0)].file).metadata
     assert [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)] == [15, 15, 5]
 
 
 def test_a_file_that_is_not_finished_leaves_nothing(tmp_path):
-    writer = PartWriter(tmp_path)
-    for number in range(40):
-        writer.add(key(number), made_up(3))
-    assert [path.name for path in tmp_path.iterdir()] == [".part-00000.parquet.tmp"]
-    writer.discard()
+    def broken():
+        for number in range(40):
+            yield key(number), made_up(3)
+        assert [path.name for path in tmp_path.iterdir()] == [".part-00000.parquet.tmp"]
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_rollouts(tmp_path, broken())
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("place", [(0, 9), (3, 3), (4, 1), (400, 1)])
 def test_rows_that_a_file_does_not_have_are_an_error(tmp_path, place):
-    writer = PartWriter(tmp_path)
-    file = writer.add(key(0), made_up(4)).file
-    writer.close()
-    assert len(RolloutReader().read(Place(file, 1, 3))) == 3
+    file = write_rollouts(tmp_path, [(key(0), made_up(4))])[key(0)].file
+    assert len(RolloutReader().read(RolloutLocation(file, 1, 3))) == 3
     with pytest.raises(DataError, match=r"part-00000\.parquet' cannot be read"):
-        RolloutReader().read(Place(file, *place))
+        RolloutReader().read(RolloutLocation(file, *place))
 
 
 def under_way(folder, results, *, resume):
@@ -268,17 +269,15 @@ def test_plans_are_offsets_in_single_precision(lengths, place, size):
 
 def test_pandas_polars_and_duckdb_read_rollouts_as_they_are(tmp_path):
     duckdb, pandas, polars = map(pytest.importorskip, ("duckdb", "pandas", "polars"))
-    writer = PartWriter(tmp_path)
     rows = [made_up(4, value=2.0, tracks=3), made_up(6, value=5.0, tracks=3)]
-    for number, each in enumerate(rows):
-        place = writer.add(key(number), each)
-    writer.close()
-    found = pandas.read_parquet(place.file)
+    locations = write_rollouts(tmp_path, ((key(i), each) for i, each in enumerate(rows)))
+    file = locations[key(0)].file
+    found = pandas.read_parquet(file)
     assert found.x_m.tolist() == [2.0] * 4 + [5.0] * 6
     second = found[found.token == "0001"]
     assert [list(one) for one in second.track_x_m] == rows[1]["track_x_m"].to_pylist()
-    query = f"select unnest(track_tokens) as track, unnest(track_x_m) from '{place.file}'"
+    query = f"select unnest(track_tokens) as track, unnest(track_x_m) from '{file}'"
     boxes = sum(len(one) for each in rows for one in each["track_x_m"].to_pylist())
     assert len(duckdb.sql(query).fetchall()) == boxes
     columns = ["track_tokens", "track_x_m"]
-    assert polars.read_parquet(place.file, columns=columns).explode(columns).height == boxes
+    assert polars.read_parquet(file, columns=columns).explode(columns).height == boxes

@@ -159,14 +159,10 @@ class Both:
         return sum(task)
 
 
-def singles(task):
-    return [(number,) for number in task]
-
-
 def test_what_was_with_a_task_whose_worker_died_is_done_alone():
     tasks = [(1, 2), (3, 13, 4), (5,)]
     outcomes = {
-        o.task: o.result or o.death for o in map_unordered(Both, tasks, workers=2, pieces=singles)
+        o.task: o.result or o.death for o in map_unordered(Both, tasks, workers=2, in_batches=True)
     }
     assert outcomes.pop((13,)) == "worker process ended with exit code 7"
     assert outcomes == {(1, 2): 3, (3,): 3, (4,): 4, (5,): 5}
