@@ -16,18 +16,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from shiftsim.benchmarks import INTERPLAN_THRESHOLDS, Drawn, Track, load_track
+from shiftsim.data.store.reading import open_store
 from shiftsim.edits.sampling import sample_edits
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.files import write_text
+from shiftsim.files import DEFAULT_STORE, write_text
 from shiftsim.report.groups import TRAFFIC, Group, KnownSet, distinct_sets, token_digest
 from shiftsim.report.tables import Cell, Number, Table
 from shiftsim.runs.avoidable import grade
-from shiftsim.runs.config import DEFAULT_STORE, make_config
+from shiftsim.runs.config import make_config
 from shiftsim.runs.edited import EditSet, edits_text, make_edits
 from shiftsim.runs.execute import Progress, execute
 from shiftsim.runs.prepare import RUNS, RunPlan, prepare
 from shiftsim.runs.results import Run, open_run
-from shiftsim.runs.scenarios import open_edits, open_named_store
+from shiftsim.runs.scenarios import open_edits
 from shiftsim.runs.tables import stored_results
 from shiftsim.sim.traffic import traffic_name
 
@@ -128,7 +129,7 @@ def _edits(drawn: Drawn, own: RunPlan, given: str, folder: Path) -> tuple[EditSe
 
     The text is that of a file of those that were drawn.
     """
-    store = open_named_store(own.store)
+    store = open_store(own.store)
     if given or (folder / EDITS).is_file():
         return open_edits(given or str(folder / EDITS), store), ""
     read = lru_cache(maxsize=256)(store.read)

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import shiftsim.edits  # noqa: F401  # attaches Scenario.edited
-from shiftsim.data.store.reading import ScenarioStore
+from shiftsim.data.store.reading import open_store as open_store
 from shiftsim.planners import registry
 from shiftsim.runs import results
-from shiftsim.runs.scenarios import open_named_store, open_run_store
 from shiftsim.sim import loop
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
@@ -101,6 +100,7 @@ class Run(results.Run):
         return gallery.page(gallery.find(token))
 
     def _gallery(self) -> Any:
+        from shiftsim.runs.scenarios import open_run_store
         from shiftsim.view.build import Gallery
 
         return Gallery([self], open_run_store(self))
@@ -227,22 +227,6 @@ def simulate(
     require_scenario("simulate", scenario)
     driver = load_planner(planner) if isinstance(planner, str) else planner
     return loop.simulate(scenario, driver, setting, **changes)
-
-
-def open_store(name: str | Path) -> ScenarioStore:
-    """A store by name, path or URL; the demo store is made when it is not there yet.
-
-    Raises:
-        DataError: It is not there, or damaged.
-
-    Example:
-        ```python
-        store = shiftsim.open_store("demo")
-        scenario = store["01f13e"]  # a token, or its beginning
-        print(len(store), store.cities, scenario)
-        ```
-    """
-    return open_named_store(str(name))
 
 
 def _preformatted(text: str) -> str:

@@ -22,6 +22,7 @@ from typing import Any, BinaryIO
 from shiftsim.errors import ConfigError, DataError
 
 PACKAGE = Path(__file__).parent
+DEFAULT_STORE = "demo"
 _IMPORT = re.compile(
     r"\n *(?:from shiftsim\.([\w.]+) import (?:\(([^)]*)\)|([^\n(]+))|import shiftsim\.([\w.]+))"
 )

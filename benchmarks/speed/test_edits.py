@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from parity_cases import Scenes
 
+from shiftsim.data.store.reading import open_store
 from shiftsim.edits.apply import apply_edit
 from shiftsim.edits.spec import make_edit
 from shiftsim.metrics.interplan import driven_lanes
-from shiftsim.runs.scenarios import open_named_store
 
 GOLDEN = Path(__file__).resolve().parents[2] / "tests" / "golden"
 TOKEN = "01f13ee575198fdf"
@@ -64,7 +64,7 @@ def added(read, edit, rounds):
 
 @pytest.mark.parametrize("name", EDITS)
 def test_edit(size, note, name):
-    store = open_named_store("demo")
+    store = open_store("demo")
     scenario = store.read(TOKEN)
     edit = make_edit({"name": name, **EDITS[name]}, "benchmark")
     reading, more = added(
@@ -76,7 +76,7 @@ def test_edit(size, note, name):
 
 
 def test_codes_of_interplan(size, note, codes):
-    store = open_named_store("demo")
+    store = open_store("demo")
     worst = 0.0
     for name, (scene, edit) in codes.items():
         _, more = added(

@@ -20,13 +20,13 @@ import numpy as np
 import pytest
 
 import shiftsim
+from shiftsim.data.store.reading import open_store
 from shiftsim.planners.registry import load_planner
 from shiftsim.runs.config import make_config
 from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.results import FORMAT_VERSION
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.rollouts.columns import encode_rows, rollout_rows
-from shiftsim.runs.scenarios import open_named_store
 from shiftsim.runs.tables import TaskResult
 from shiftsim.runs.task import score_rollout
 from shiftsim.runs.workers import map_unordered
@@ -66,7 +66,7 @@ def measured_run(folder: Path, **settings: object) -> dict[str, float]:
 
 @pytest.fixture(scope="module")
 def store():
-    return open_named_store("demo")
+    return open_store("demo")
 
 
 @pytest.fixture(scope="module")

@@ -25,8 +25,8 @@ from shiftsim.cli import (
     stdout_to_stderr,
 )
 from shiftsim.errors import ConfigError
-from shiftsim.files import read_toml, store_path
-from shiftsim.runs.config import DEFAULT_STORE, default_workers, make_config
+from shiftsim.files import DEFAULT_STORE, read_toml, store_path
+from shiftsim.runs.config import default_workers, make_config
 
 if TYPE_CHECKING:
     from shiftsim.runs.execute import OnProgress, Progress

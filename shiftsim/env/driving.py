@@ -18,6 +18,7 @@ from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 
+from shiftsim.data.store.reading import open_store
 from shiftsim.env.episode import REWARDS, Episode, NoObservation, Observer, Reward
 from shiftsim.env.raster import RasterObserver, picture_of
 from shiftsim.env.vector import VectorObserver
@@ -25,7 +26,7 @@ from shiftsim.errors import ConfigError, DataError, ShiftsimError, one_of
 from shiftsim.geometry.boxes import from_frame
 from shiftsim.kernels import FloatArray
 from shiftsim.planners.learned.carl.planner import command_of
-from shiftsim.runs.scenarios import find_split, open_named_store
+from shiftsim.runs.scenarios import find_split
 from shiftsim.sim.loop import Setting
 from shiftsim.sim.noise import NoiseModel, parse_noise
 from shiftsim.sim.traffic import Traffic, make_traffic, traffic_name
@@ -56,7 +57,7 @@ class Source(Protocol):
 @cache
 def _opened(name: str) -> Any:
     """A store, opened once in a process: many environments share its maps."""
-    return open_named_store(name)
+    return open_store(name)
 
 
 class DrivingEnv(gymnasium.Env[Any, Any]):

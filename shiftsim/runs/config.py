@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias, get_args, get_origin
 
 from shiftsim.errors import ConfigError, one_of
+from shiftsim.files import DEFAULT_STORE
 
 Value: TypeAlias = bool | int | float | str | list[Any]
 
-DEFAULT_STORE = "demo"
 MAX_SEED = 2**63 - 1
 MAX_SEEDS = 10_000  # of one range
 

@@ -107,9 +107,10 @@ def _execute(plan: RunPlan, argv: Sequence[str], on_progress: OnProgress) -> Run
 
 
 def _bundle(plan: RunPlan) -> dict[str, Any]:
-    from shiftsim.runs.scenarios import open_named_store, write_bundle
+    from shiftsim.data.store.reading import open_store
+    from shiftsim.runs.scenarios import write_bundle
 
-    store, tokens = open_named_store(plan.store), {task.token for task in plan.tasks}
+    store, tokens = open_store(plan.store), {task.token for task in plan.tasks}
     if plan.selection.edits is not None:
         tokens = {plan.selection.edited[token]["base"] for token in tokens}
     return write_bundle(store, plan.folder, tokens)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from shiftsim._version import __version__
+from shiftsim.data.store.reading import open_store
 from shiftsim.errors import ConfigError, one_of
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.planners.registry import (
@@ -25,7 +26,7 @@ from shiftsim.planners.registry import (
 from shiftsim.runs.config import RunConfig, Value, default_workers, parse_shard
 from shiftsim.runs.manifest import State, check_resumable, check_target, code_digest
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.scenarios import Selection, open_named_store, select_scenarios
+from shiftsim.runs.scenarios import Selection, select_scenarios
 from shiftsim.runs.task import Batch, TaskRunner
 from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
 from shiftsim.sim.traffic import PLANNER, BatchTraffic, make_traffic, traffic_name
@@ -110,7 +111,7 @@ def prepare(
     for metric in config.metrics:
         load_metric(metric)
     entries = _planners(config, planners or config.planners)
-    store = open_named_store(config.store)
+    store = open_store(config.store)
     selection = select_scenarios(config, store, edits)
     grouped = {entry.name for entry in entries if entry.in_batches or is_batched}
     fingerprint = {

@@ -18,35 +18,13 @@ from shiftsim.data.store.reading import ScenarioStore, open_store
 from shiftsim.data.store.tables import REVIEW
 from shiftsim.errors import ConfigError, DataError, nearest, one_of
 from shiftsim.files import read_toml, safe_join, store_path
-from shiftsim.runs.config import DEFAULT_STORE, RunConfig
+from shiftsim.runs.config import RunConfig
 from shiftsim.runs.results import Run
 
 if TYPE_CHECKING:
     from shiftsim.runs.edited import EditSet
 
 BUNDLE = "store"  # folder below that of the run
-
-
-def open_named_store(name: str) -> ScenarioStore:
-    """A store by name, path or URL; the demo store is made when it is not there yet.
-
-    Raises:
-        DataError: It is not there, or damaged.
-    """
-    if "://" in name:
-        return open_store(name)
-    path = store_path(name)
-    if name == DEFAULT_STORE and not path.exists():
-        from shiftsim.data.synthetic.store import demo_store
-
-        path = demo_store(path)
-    if not path.exists():
-        known = sorted(found.name for found in path.parent.glob("*") if found.is_dir())
-        raise DataError(
-            f"no store {name!r} at {str(path)!r}",
-            hint=f"there are: {', '.join(known)}" if known else "make one with `shiftsim convert`",
-        )
-    return open_store(path)
 
 
 def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:

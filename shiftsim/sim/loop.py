@@ -29,7 +29,6 @@ from shiftsim.sim.planner import (
     scene_info,
 )
 from shiftsim.sim.traffic import BatchTraffic, Move, Traffic, make_traffic
-from shiftsim.sim.traffic.scripted import Scripted
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import NUM_STATE, Command, Trajectory, center_poses
 
@@ -106,6 +105,8 @@ class Rollout:
         traffic = setting.traffic
         self._traffic = make_traffic(traffic) if isinstance(traffic, str) else traffic
         if scenario.script is not None and scenario.script.has_pedestrians:
+            from shiftsim.sim.traffic.scripted import Scripted  # few scenarios need it
+
             self._traffic = Scripted(self._traffic)
         self._traffic.start(scenario, self._tracks, start)
         arrays = self._time_us, self._ego, self._tracks, self._lights

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from shiftsim.data.store.reading import open_store
 from shiftsim.env.episode import Episode
 from shiftsim.errors import ShiftsimError
 from shiftsim.kernels import FloatArray
@@ -25,7 +26,6 @@ from shiftsim.planners.learned.carl.planner import (
     command_of,
 )
 from shiftsim.planners.pdm.planner import PdmClosed
-from shiftsim.runs.scenarios import open_named_store
 from shiftsim.sim.dynamics.lqr import NUPLAN, raise_for_status, track
 from shiftsim.sim.loop import Setting
 from shiftsim.sim.planner import Observation, SceneInfo
@@ -166,7 +166,7 @@ class Driver:
 
     def __init__(self, store: str, checkpoint: str) -> None:
         """`checkpoint` is of the network that drives; any where PDM-Closed does."""
-        self._store, self._policy = open_named_store(store), PolicyPlanner(checkpoint)
+        self._store, self._policy = open_store(store), PolicyPlanner(checkpoint)
 
     def __call__(self, job: Job) -> Driven:
         """Drive all scenarios of a job."""

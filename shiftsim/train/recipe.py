@@ -12,9 +12,10 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
+from shiftsim.data.store.reading import open_store
 from shiftsim.planners.learned.device import resolve_device
 from shiftsim.runs.filter import read_filter_results
-from shiftsim.runs.scenarios import find_split, open_named_store
+from shiftsim.runs.scenarios import find_split
 from shiftsim.train import folder
 from shiftsim.train.folder import BEST, LATEST, OnMessage, Settings, Weights
 from shiftsim.train.jobs import RunJobs, Towns, collect, divide, mean_scores, run_jobs
@@ -58,7 +59,7 @@ class Training:
         """
         self._settings, self._on_message = settings, on_message
         self.device = resolve_device(settings.device)
-        store = open_named_store(settings.store)
+        store = open_store(settings.store)
         filtered = read_filter_results(store.path, store.hash)
         usable = filtered.accepted if filtered else store.tokens
         tokens = find_split(settings.split, store.path, usable).tokens

@@ -5,12 +5,11 @@ import pytest
 from stores import write_toy_store
 from worlds import cruise_scenario
 
-from shiftsim.data.store.reading import ScenarioStore
+from shiftsim.data.store.reading import ScenarioStore, open_store
 from shiftsim.edits.sampling import GRADES, HARDEST, KINDS, sample_edits
 from shiftsim.planners.basic.log_future import LogFuture
 from shiftsim.runs.avoidable import Braking, grade, hits, is_avoidable
 from shiftsim.runs.edited import EditedStore, make_edits
-from shiftsim.runs.scenarios import open_named_store
 from shiftsim.sim.loop import simulate
 from shiftsim.world.state import VX, X
 
@@ -85,7 +84,7 @@ def test_what_the_recorded_driver_hits_anyway_is_not_in_the_way(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_sampled_edits_of_the_demo_are_valid_free_and_avoidable(kind):
-    store = open_named_store("demo")
+    store = open_store("demo")
     tables = list(sample_edits(kind, 30, 7, store.tokens, store.read, grade))
     edited = EditedStore(store, make_edits({"edit": tables}, "sampled"))
     assert len(edited.tokens) == 30

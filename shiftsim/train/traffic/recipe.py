@@ -15,9 +15,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from shiftsim.data.store.reading import ScenarioStore
+from shiftsim.data.store.reading import ScenarioStore, open_store
 from shiftsim.files import atomic_write
-from shiftsim.runs.scenarios import find_split, open_named_store
+from shiftsim.runs.scenarios import find_split
 from shiftsim.sim.traffic import Traffic, make_traffic
 from shiftsim.sim.traffic.learned.features import NUM_FEATURES
 from shiftsim.sim.traffic.learned.model import HIDDEN, SCALES, LearnedTraffic, Weights
@@ -41,7 +41,7 @@ def train_traffic(settings: TrafficSettings, on_message: OnMessage) -> Path:
         DataError: The store is not there, or has too few scenarios.
     """
     out, seed = settings.out, settings.seed
-    store = open_named_store(settings.store)
+    store = open_store(settings.store)
     tokens = find_split(settings.split, store.path, store.tokens).tokens
     towns = divide(store, tokens, seed)
     trained = [token for group in towns.trained.values() for token in sorted(group)]
