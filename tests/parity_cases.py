@@ -14,11 +14,13 @@ from nuplan_logs import read_scenario
 
 from shiftsim.data.nuplan.scenarios import find_maps, load_map
 from shiftsim.errors import DataError
+from shiftsim.sim.traffic.idm.scene import REPLAYED_KINDS
 from shiftsim.verify.report import Report
-from shiftsim.verify.rollouts import LOGGED, REACTIVE, SCORES, SIMULATED
+from shiftsim.verify.rollouts import LOGGED, REACTIVE, SCORES, SIMULATED, object_columns
 from shiftsim.verify.tables import EXACT, TOLERANCE, Groups, Source, Tolerances, read_table
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import Tracks
 
 MAPPING = (15.0, 0.0, 0.5)  # the reference scenes start at their tag
 NETS = ("carl", "diffusion_planner", "plantf", "pluto", "route_correction")
@@ -401,6 +403,21 @@ def ids(layer: Any, rows: Any) -> Any:
 def object_ids(things: Any) -> list[str | None]:
     """Ids of objects behind nuPlan's map interface; None stays None."""
     return [getattr(thing, "id", None) for thing in things]
+
+
+def order_observed(kinds: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Indices of present tracks in nuPlan's order: agents, then replayed kinds as listed."""
+    parts = [np.flatnonzero(valid & ~np.isin(kinds, REPLAYED_KINDS))]
+    parts += [np.flatnonzero(valid & (kinds == kind)) for kind in REPLAYED_KINDS]
+    return np.concatenate(parts)
+
+
+def observed_columns(tracks: Tracks, challenge: str) -> dict[str, Any]:
+    """Objects of every sample in the order of observation, without heights."""
+    listed = (lambda kinds, row: np.flatnonzero(row)) if challenge != "R" else order_observed
+    orders = [listed(tracks.kinds, row) for row in tracks.valid]
+    iteration = np.repeat(np.arange(len(orders)), [len(order) for order in orders])
+    return object_columns(tracks, iteration, np.concatenate(orders))
 
 
 def name_unknown(folder: Path, report: Report, *patterns: str, where: str = "") -> None:

@@ -33,7 +33,7 @@ from shiftsim.verify.rollouts import (
     compare_plans,
     ego_columns,
     light_columns,
-    observed_columns,
+    object_columns,
     read_ego,
     recorded_log,
     tracks_of,
@@ -269,7 +269,7 @@ def _compare_replay(run: Run, scenario: Scenario, recorded: Recorded) -> None:
     stamps = dict.fromkeys(("time_us", "ego_time_us"), log.time_us)
     ours = {"iteration": np.arange(len(log.ego)), **stamps, **ego_columns(log.ego)}
     ego.match(where, ours, SIMULATED)
-    shown = observed_columns(log.tracks, run.challenge)
+    shown = object_columns(log.tracks, *np.nonzero(log.tracks.valid))
     atol = REACTIVE if run.challenge == "R" else LOGGED
     _match_unordered(where, objects, shown, "track_token", atol)
     if run.planner in _TWINS:

@@ -12,7 +12,6 @@ from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.log import SimulationLog, as_recorded
 from shiftsim.sim.planner import Observation, observe_log, scene_info
-from shiftsim.sim.traffic.idm.agents import order_observed
 from shiftsim.verify.tables import TOLERANCE, Source
 from shiftsim.world import state
 from shiftsim.world.scenario import Scenario
@@ -91,14 +90,6 @@ def object_columns(tracks: Tracks, rows: IntArray, index: IntArray) -> dict[str,
         "type": [AgentKind(kind).name for kind in kinds.tolist()],
         **dict(zip(BOX_COLUMNS, np.concatenate(values, axis=1).T, strict=True)),
     }
-
-
-def observed_columns(tracks: Tracks, challenge: str) -> dict[str, Any]:
-    """Objects of every sample in the order of observation, without heights."""
-    listed = (lambda kinds, row: np.flatnonzero(row)) if challenge != "R" else order_observed
-    orders = [listed(tracks.kinds, row) for row in tracks.valid]
-    iteration = np.repeat(np.arange(len(orders)), [len(order) for order in orders])
-    return object_columns(tracks, iteration, np.concatenate(orders))
 
 
 def light_columns(scenario: Scenario) -> dict[str, Any]:

@@ -9,7 +9,16 @@ from typing import Any
 import numpy as np
 import places
 import pytest
-from parity_cases import Cases, File, change_array, name_unknown, noticed, read_file, tracked
+from parity_cases import (
+    Cases,
+    File,
+    change_array,
+    name_unknown,
+    noticed,
+    order_observed,
+    read_file,
+    tracked,
+)
 from worlds import rear_states
 
 from shiftsim.errors import DataError
@@ -21,7 +30,6 @@ from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, step_bicycle, step_seconds
 from shiftsim.sim.dynamics.idm import idm_acceleration, idm_step
 from shiftsim.sim.dynamics.perfect import interpolate
 from shiftsim.sim.noise import noise_from_normals, parse_noise
-from shiftsim.sim.traffic.idm.agents import order_observed
 from shiftsim.sim.traffic.idm.model import IdmTraffic
 from shiftsim.verify.rollouts import EGO_COLUMNS, ego_states
 from shiftsim.verify.worlds import read_map, read_scenario

@@ -9,14 +9,14 @@ import numpy as np
 from shiftsim.errors import TrafficError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.rings import convex_intersect
-from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.kernels import FloatArray, kernel
 from shiftsim.sim.traffic.idm.paths import (
     append_baseline,
     clamp_progress,
     finish_path,
     pose_on_path,
 )
-from shiftsim.sim.traffic.idm.scene import MAX_ROUTE, REPLAYED_KINDS, Fleet
+from shiftsim.sim.traffic.idm.scene import MAX_ROUTE, Fleet
 from shiftsim.world.lanes import Start, find_starts
 from shiftsim.world.map import VectorMap
 
@@ -98,10 +98,3 @@ def make_fleet(
         fleet.path_size[agent] = size
         fleet.pose[agent] = pose_on_path(path, size, clamp_progress(path, size, start.progress))
     return fleet
-
-
-def order_observed(kinds: IntArray, valid: BoolArray) -> IntArray:
-    """Indices of present tracks in nuPlan's order: agents, then replayed kinds as listed."""
-    parts = [np.flatnonzero(valid & ~np.isin(kinds, REPLAYED_KINDS))]
-    parts += [np.flatnonzero(valid & (kinds == kind)) for kind in REPLAYED_KINDS]
-    return np.concatenate(parts)
