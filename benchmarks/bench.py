@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from shiftsim.benchmarks import INTERPLAN_THRESHOLDS, Drawn, Track, load_track
-from shiftsim.data.store.reading import open_store
+from shiftsim.data import open_store
 from shiftsim.edits.sampling import sample_edits
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.files import DEFAULT_STORE, write_text

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import shiftsim.edits  # noqa: F401  # attaches Scenario.edited
-from shiftsim.data.store.reading import open_store as open_store
+from shiftsim.data import open_store as open_store
 from shiftsim.planners import registry
 from shiftsim.runs import results
 from shiftsim.sim import loop

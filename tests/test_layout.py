@@ -20,22 +20,22 @@ BUDGETS = {
     "shiftsim/world": 1_840,  # goal 1_800
     "shiftsim/edits": 2_270,  # goal 2_100
     "shiftsim/sim": 1_710,  # goal 1_600
-    "shiftsim/sim/traffic": 2_410,  # goal 2_200
+    "shiftsim/sim/traffic": 2_400,  # goal 2_200
     "metrics": 2_300,
     "shiftsim/runs": 4_210,  # goal 3_300
     "planners": 4_370,  # goal 4_300
     "planners/learned": 5_030,  # goal 4_600
     "data/maps": 3_510,  # goal 3_000
-    "data": 5_130,  # goal 3_900
+    "data": 5_170,  # goal 3_900
     "data/nuplan": 2_740,  # goal 2_400
-    "data/store": 2_330,  # goal 2_200
+    "data/store": 2_310,  # goal 2_200
     "data/synthetic": 2_590,  # goal 2_100
     "shiftsim/report": 2_750,  # goal 2_200
     "shiftsim/view": 2_090,  # goal 1_800
     "shiftsim/env": 1_010,
     "shiftsim/train": 1_930,  # goal 1_600
     "shiftsim/compat": 2_670,  # goal 2_300
-    "shiftsim/verify": 1_300,  # goal 1_200
+    "shiftsim/verify": 1_290,  # goal 1_200
     "shiftsim/cli": 2_470,  # goal 2_300
     "benchmarks": 700,
 }

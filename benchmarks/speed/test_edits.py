@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from parity_cases import Scenes
 
-from shiftsim.data.store.reading import open_store
+from shiftsim.data import open_store
 from shiftsim.edits.apply import apply_edit
 from shiftsim.edits.spec import make_edit
 from shiftsim.metrics.interplan import driven_lanes

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 import shiftsim
-from shiftsim.data.store.reading import open_store
+from shiftsim.data import open_store
 from shiftsim.planners.registry import load_planner
 from shiftsim.runs.config import make_config
 from shiftsim.runs.folder import RunWriter

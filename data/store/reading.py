@@ -20,7 +20,6 @@ from shiftsim.data.store import schema, tables
 from shiftsim.data.store.map import read_map_file
 from shiftsim.data.store.recordings import StoredRecording, ego_states, open_ego
 from shiftsim.errors import ConfigError, DataError, beginning
-from shiftsim.files import DEFAULT_STORE, store_path
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 
@@ -214,36 +213,18 @@ def _limit(opened: dict[Any, Any]) -> None:
         opened.pop(next(iter(opened)))
 
 
-def open_store(name: str | Path) -> ScenarioStore:
-    """A store by name, path or URL; the demo store is made when it is not there yet.
+def open_store(path: str | Path) -> ScenarioStore:
+    """Open the store in a folder, or behind the URL of one.
 
     Raises:
-        DataError: It is not there, damaged or of another version.
-
-    Example:
-        ```python
-        store = shiftsim.open_store("demo")
-        scenario = store["01f13e"]  # a token, or its beginning
-        print(len(store), store.cities, scenario)
-        ```
+        DataError: There is no store, or it is damaged or of another version.
     """
-    if "://" in str(name):
+    if "://" in str(path):
         from shiftsim.data.store.remote import RemoteFiles
 
-        remote = RemoteFiles(str(name))
+        remote = RemoteFiles(str(path))
         return ScenarioStore(remote.path, remote.url, remote.need)
-    path = store_path(str(name))
-    if name == DEFAULT_STORE and not path.exists():
-        from shiftsim.data.synthetic.store import demo_store
-
-        path = demo_store(path)
-    if not path.exists():
-        known = sorted(found.name for found in path.parent.glob("*") if found.is_dir())
-        raise DataError(
-            f"no store {str(name)!r} at {str(path)!r}",
-            hint=f"there are: {', '.join(known)}" if known else "make one with `shiftsim convert`",
-        )
-    return ScenarioStore(path)
+    return ScenarioStore(Path(path))
 
 
 def window_of(row: dict[str, Any]) -> Window:

@@ -18,7 +18,7 @@ from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 
-from shiftsim.data.store.reading import open_store
+from shiftsim.data import open_store
 from shiftsim.env.episode import REWARDS, Episode, NoObservation, Observer, Reward
 from shiftsim.env.raster import RasterObserver, picture_of
 from shiftsim.env.vector import VectorObserver

@@ -107,7 +107,7 @@ def _execute(plan: RunPlan, argv: Sequence[str], on_progress: OnProgress) -> Run
 
 
 def _bundle(plan: RunPlan) -> dict[str, Any]:
-    from shiftsim.data.store.reading import open_store
+    from shiftsim.data import open_store
     from shiftsim.runs.scenarios import write_bundle
 
     store, tokens = open_store(plan.store), {task.token for task in plan.tasks}

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from shiftsim._version import __version__
-from shiftsim.data.store.reading import open_store
+from shiftsim.data import open_store
 from shiftsim.errors import ConfigError, one_of
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.planners.registry import (

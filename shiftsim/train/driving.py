@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shiftsim.data.store.reading import open_store
+from shiftsim.data import open_store
 from shiftsim.env.episode import Episode
 from shiftsim.errors import ShiftsimError
 from shiftsim.kernels import FloatArray

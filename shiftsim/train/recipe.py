@@ -12,7 +12,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from shiftsim.data.store.reading import open_store
+from shiftsim.data import open_store
 from shiftsim.planners.learned.device import resolve_device
 from shiftsim.runs.filter import read_filter_results
 from shiftsim.runs.scenarios import find_split

@@ -5,7 +5,8 @@ import pytest
 from stores import write_toy_store
 from worlds import cruise_scenario
 
-from shiftsim.data.store.reading import ScenarioStore, open_store
+from shiftsim.data import open_store
+from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.edits.sampling import GRADES, HARDEST, KINDS, sample_edits
 from shiftsim.planners.basic.log_future import LogFuture
 from shiftsim.runs.avoidable import Braking, grade, hits, is_avoidable

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from shiftsim.data.store.reading import ScenarioStore, open_store
+from shiftsim.data import open_store
+from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.files import atomic_write
 from shiftsim.runs.scenarios import find_split
 from shiftsim.sim.traffic import Traffic, make_traffic
