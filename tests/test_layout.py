@@ -39,7 +39,7 @@ BUDGETS = {
     "shiftsim/cli": 2_470,  # goal 2_300
     "benchmarks": 700,
 }
-MOST_LINES, MOST_MODULES, MOST_KERNELS = 58_600, 300, 220  # the goal is 52_000 lines
+MOST_LINES, MOST_MODULES, MOST_KERNELS = 57_200, 300, 220  # the goal is 52_000 lines
 LONGEST_MODULE, CROWDED = 450, 16
 # modules of under 80 lines that one other module imports, and why they stand alone
 SMALL_AND_ALONE = {
