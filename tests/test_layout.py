@@ -26,7 +26,7 @@ BUDGETS = {
     "planners": 4_370,  # goal 4_300
     "planners/learned": 5_030,  # goal 4_600
     "data/maps": 3_510,  # goal 3_000
-    "data": 5_130,  # goal 3_900
+    "data": 5_340,  # goal 3_900
     "data/nuplan": 2_740,  # goal 2_400
     "data/store": 2_310,  # goal 2_200
     "data/synthetic": 2_590,  # goal 2_100
@@ -36,7 +36,7 @@ BUDGETS = {
     "shiftsim/train": 1_930,  # goal 1_600
     "shiftsim/compat": 2_670,  # goal 2_300
     "shiftsim/verify": 1_300,  # goal 1_200
-    "shiftsim/cli": 2_470,  # goal 2_300
+    "shiftsim/cli": 2_480,  # goal 2_300
     "benchmarks": 700,
 }
 MOST_LINES, MOST_MODULES, MOST_KERNELS = 58_600, 300, 220  # the goal is 52_000 lines
