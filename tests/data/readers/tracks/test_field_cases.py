@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from shiftsim.cli import main
 from shiftsim.data.readers.tracks.inspection import convert_tracks, inspect_tracks
 from shiftsim.errors import ConversionError
 from shiftsim.files import read_toml
@@ -18,6 +19,7 @@ NGSIM = (
 ).split()
 CAR, TRUCK = ([19.3408, 5.4637], (4.6, 1.9)), ([102.8758, 40.0544], (12.0, 2.5))
 SCENE = {"1": CAR, "3": TRUCK}  # centre in the first row, size; of the same scene in all folders
+LEADS = 0.05  # m, by which the way of the front of a truck leaves its heading: 6 m * 6 m / 800 m
 WALKER = {"P1": ([262.1583, 145.9621], (0.7, 0.7))}
 
 
@@ -40,14 +42,14 @@ CASES = {
     "b1": Case("b1_sumo_fcd/fcd.csv", 6, SUMO, layout="SUMO FCD"),
     "b1 with a file": Case("b1_sumo_fcd/fcd.csv", 6, SUMO, "sumo3.toml", "SUMO FCD"),
     "b1 without heading": Case(
-        "b1_sumo_fcd/fcd.csv", 6, SUMO, {"columns": {"heading": ""}}, "SUMO FCD", within=0.03
+        "b1_sumo_fcd/fcd.csv", 6, SUMO, {"columns": {"heading": ""}}, "SUMO FCD", within=LEADS
     ),
-    "b2": Case("b2_ngsim_front/trajectories.csv", 6, layout="NGSIM", within=0.03),
+    "b2": Case("b2_ngsim_front/trajectories.csv", 6, layout="NGSIM", within=LEADS),
     "b2 with reference": Case(
-        "b2_ngsim_front/trajectories.csv", 6, columns="ng4.toml", layout="NGSIM", within=0.03
+        "b2_ngsim_front/trajectories.csv", 6, columns="ng4.toml", layout="NGSIM", within=LEADS
     ),
     "b2 without": Case(
-        "b2_ngsim_front/trajectories.csv", 6, columns="ng5.toml", layout="NGSIM", within=0.03
+        "b2_ngsim_front/trajectories.csv", 6, columns="ng5.toml", layout="NGSIM", within=LEADS
     ),
     "b3": Case("b3_highd_corner/01_tracks.csv", 4, HIGHD, layout="highD"),
     "b3 with a file": Case("b3_highd_corner/01_tracks.csv", 4, HIGHD, "highd.toml", "highD"),
@@ -74,7 +76,7 @@ CASES = {
         6,
         columns={"header": NGSIM},
         layout="NGSIM",
-        within=0.03,
+        within=LEADS,
     ),
     "b7": Case("b7_songdo/A_2022.csv", 6, layout="Songdo"),
 }
@@ -128,6 +130,17 @@ def test_a_table_that_cannot_be_read_says_what_helps(name, cases):
     with pytest.raises(ConversionError, match=what) as error:
         _inspect(cases, table)
     assert re.search(remedy, error.value.hint)
+
+
+def test_the_command_says_what_it_took_positions_for(cases, tmp_path, capsys):
+    folder = cases / "b3_highd_corner"
+    files = [str(folder / name) for name in ("01_tracks.csv", "map_straight.xodr")]
+    with pytest.raises(SystemExit) as code:
+        main(["convert", "tracks", *files, "--store", str(tmp_path / "store")])
+    assert not code.value.code
+    printed = capsys.readouterr().out
+    assert " layout: highD\n point given: corner\n" in printed
+    assert "y = -y, width = height" in printed
 
 
 def test_the_remedy_of_a_shift_by_search_calls_it_approximate(cases):
