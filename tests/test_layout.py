@@ -25,8 +25,8 @@ BUDGETS = {
     "shiftsim/runs": 4_220,  # goal 3_300
     "planners": 4_380,  # goal 4_300
     "planners/learned": 5_030,  # goal 4_600
-    "data/maps": 3_510,  # goal 3_000
-    "data": 5_170,  # goal 3_900
+    "data/maps": 3_520,  # goal 3_000
+    "data": 5_380,  # goal 3_900
     "data/nuplan": 2_740,  # goal 2_400
     "data/store": 2_310,  # goal 2_200
     "data/synthetic": 2_590,  # goal 2_100
@@ -36,7 +36,7 @@ BUDGETS = {
     "shiftsim/train": 1_930,  # goal 1_600
     "shiftsim/compat": 2_670,  # goal 2_300
     "shiftsim/verify": 1_290,  # goal 1_200
-    "shiftsim/cli": 2_470,  # goal 2_300
+    "shiftsim/cli": 2_480,  # goal 2_300
     "benchmarks": 700,
 }
 MOST_LINES, MOST_MODULES, MOST_KERNELS = 57_200, 300, 220  # the goal is 52_000 lines

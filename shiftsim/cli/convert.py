@@ -137,7 +137,9 @@ def dsc3d(
 @app.command()
 def tracks(
     *,
-    source: Path = Argument(metavar="TRACKS", help="CSV or Parquet, a row per object and time."),
+    source: list[Path] = Argument(
+        metavar="TRACKS", help="CSV or Parquet, a row per object and time; several are joined."
+    ),
     map_path: Path = Argument(metavar="MAP", help="OpenDRIVE file (.xodr)."),
     store: Store,
     hz: float | None = Option(None, help="Frames per second, where time is given in frames."),
@@ -173,7 +175,7 @@ def tracks(
             source, map_path, city=city, overrides=overrides, hz=hz, config=config
         )
     except ConfigError as error:
-        raise ConfigError(f"{columns or source}: {error.message}", error.hint) from error
+        raise ConfigError(f"{columns or source[0]}: {error.message}", error.hint) from error
     picture = picture_file(folder, inspection.road.name, inspection.table.name)
     errors = inspection.diagnostics.errors
     try:
@@ -184,9 +186,10 @@ def tracks(
         _draw_tracks(picture, inspection, None)
         if not errors:
             raise
-        echo(f"error: {source}: {plural(len(errors), 'thing')} cannot be right", err=True)
+        echo(f"error: {source[0]}: {plural(len(errors), 'thing')} cannot be right", err=True)
         raise typer.Exit(cli.DATA) from None
-    names = {role: column.name for role, column in inspection.table.columns.found.items()}
+    read = inspection.table.columns
+    names = {role: column.words for role, column in read.found.items()}
     if as_json:
         content = _contents(report) | {"city": report.name, "summary": asdict(report.recordings[0])}
         print_json(content | {"figures": inspection.diagnostics.figures, "columns": names})
@@ -195,6 +198,11 @@ def tracks(
         for name, count in report.map_warnings.items():
             echo(f" map: {name} ({count})")
         echo(f" columns: {', '.join(f'{ours} = {name}' for ours, name in names.items())}")
+        for what, value in ("layout", read.layout), ("point given", read.reference):
+            if value:
+                echo(f" {what}: {value}")
+        if any(read.shift):
+            echo(f" shift: ({read.shift[0]:.1f}, {read.shift[1]:.1f}) m")
         echo("\n".join(_recording_lines(report.recordings[0])))
         for warning in inspection.diagnostics.warnings:
             echo(f" unusual: {warning.what}\n   remedy: {warning.remedy}")
