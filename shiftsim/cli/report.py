@@ -111,10 +111,10 @@ def _write_pages(
 
     folder.mkdir(parents=True, exist_ok=True)
     images = {figure.save(folder).name: figure.title for figure in drawn}
-    stored = [run for run in runs if any(run.rollout_places.values())]
+    stores = [open_run_store(run) if any(run.rollout_places.values()) else None for run in runs]
     write_site(
         folder,
-        galleries(stored, [open_run_store(run) for run in stored], Choice()),
+        galleries(runs, stores, Choice()),
         title=title,
         limit=0,
         above=report_html(runs, tables, images),
@@ -129,10 +129,12 @@ def _print_worst(runs: "Sequence[Run]", count: int) -> None:
     for run in runs:
         rows = worst_rollouts(run, count)
         if rows:
-            echo(f"\n worst scenarios of {run.path.name}, each by its worst rollout")
+            each = "one per recording and cause, each by its worst rollout"
+            echo(f"\n worst scenarios of {run.path.name}, {each}")
         for row in rows:
             where = f"{row['token']}  {task_words(row)}"
-            echo(f"  {row['cls']:.4f}  {where}  {row['reason']}".rstrip())
+            others = f"  ({row['others']} more like it)" if row["others"] else ""
+            echo(f"  {100.0 * row['cls']:6.2f}  {where}  {row['reason']}{others}".rstrip())
 
 
 def explain(

@@ -273,7 +273,7 @@ def _print_results(finished: "Run", *, allow_partial: bool) -> None:
     echo()
     echo(score_table([finished], allow_partial=allow_partial))
     worst = [
-        f"{row['token']} {task_words(row)} {row['cls']:.2f} {row['reason']}"
+        f"{row['token']} {task_words(row)} {100.0 * row['cls']:.2f} {row['reason']}"
         for row in worst_rollouts(finished, 3)
         if row["cls"] < 1.0
     ]

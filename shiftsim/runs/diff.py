@@ -156,7 +156,7 @@ def diff_lines(found: Difference) -> list[str]:
         )
         lines.append(
             f" {task.token}  {both} {task.noise}{seed}  "
-            f"{change.first:.4f} → {change.second:.4f}  {metrics}"
+            f"{100.0 * change.first:.2f} → {100.0 * change.second:.2f}  {metrics}"
         )
         lines.append(
             f"   {f'first difference {change.departure}' if change.departure else change.note}"
@@ -166,7 +166,7 @@ def diff_lines(found: Difference) -> list[str]:
 
 
 def _score(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2f}"
+    return "–" if value is None else f"{100.0 * value:.2f}"
 
 
 def _key(row: dict[str, Any]) -> Task:

@@ -118,7 +118,7 @@ def test_single_planners_are_paired_whatever_their_names(tmp_path):
     found = diff_runs(first, second, limit=3)
     assert found.worse == 4
     lines = diff_lines(found)
-    assert "old/new none  0.5000 → 0.2500" in lines[2]
+    assert "old/new none  50.00 → 25.00" in lines[2]
     assert lines[3] == "   rollouts are not stored"
     assert lines[-1] == " and 1 more (--limit)"
 
