@@ -22,7 +22,7 @@ BUDGETS = {
     "shiftsim/sim": 1_710,  # goal 1_600
     "shiftsim/sim/traffic": 2_410,  # goal 2_200
     "metrics": 2_300,
-    "shiftsim/runs": 4_410,  # goal 3_300
+    "shiftsim/runs": 4_440,  # goal 3_300
     "planners": 4_370,  # goal 4_300
     "planners/learned": 5_030,  # goal 4_600
     "data/maps": 3_510,  # goal 3_000
@@ -30,13 +30,13 @@ BUDGETS = {
     "data/nuplan": 2_740,  # goal 2_400
     "data/store": 2_310,  # goal 2_200
     "data/synthetic": 2_590,  # goal 2_100
-    "shiftsim/report": 2_790,  # goal 2_200
+    "shiftsim/report": 2_800,  # goal 2_200
     "shiftsim/view": 2_220,  # goal 1_800
     "shiftsim/env": 1_010,
     "shiftsim/train": 1_930,  # goal 1_600
     "shiftsim/compat": 2_670,  # goal 2_300
     "shiftsim/verify": 1_300,  # goal 1_200
-    "shiftsim/cli": 2_480,  # goal 2_300
+    "shiftsim/cli": 2_500,  # goal 2_300
     "benchmarks": 700,
 }
 MOST_LINES, MOST_MODULES, MOST_KERNELS = 58_600, 300, 220  # the goal is 52_000 lines

@@ -205,6 +205,7 @@ def test_planners_are_compared_on_complete_scores_only(tmp_path):
     # three recordings: all signs alike happens by chance in 2 of 8 patterns
     assert row["p"] == "0.2500"
     assert any("few recordings (3)" in note for note in table.notes)
+    assert any("not compared" in note and "gamma none NR" in note for note in table.notes)
 
 
 def test_scenario_types_are_rows(tmp_path):
