@@ -36,7 +36,7 @@ BUDGETS = {
     "shiftsim/train": 1_930,  # goal 1_600
     "shiftsim/compat": 2_670,  # goal 2_300
     "shiftsim/verify": 1_300,  # goal 1_200
-    "shiftsim/cli": 2_500,  # goal 2_300
+    "shiftsim/cli": 2_520,  # goal 2_300
     "benchmarks": 700,
 }
 MOST_LINES, MOST_MODULES, MOST_KERNELS = 58_600, 300, 220  # the goal is 52_000 lines

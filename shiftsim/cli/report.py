@@ -147,7 +147,8 @@ def _print_worst(runs: "Sequence[Run]", count: int) -> None:
         rows = worst_rollouts(run, count)
         if rows:
             each = "one per recording and cause, each by its worst rollout"
-            echo(f"\n worst scenarios of {run.path.name}, {each}")
+            of = f"{len(rows)} of {len(set(run.scores['token'].to_pylist()))}"
+            echo(f"\n worst scenarios of {run.path.name}, {of}, {each}")
         for row in rows:
             where = f"{row['token']}  {task_words(row)}"
             others = f"  ({row['others']} more like it)" if row["others"] else ""

@@ -289,6 +289,8 @@ def _print_results(finished: "Run", *, allow_partial: bool) -> None:
         echo(f" {status}: {first}{more}: {error}")
         if hint:
             echo(f"   hint: {hint}")
+    if (left := len(alike) - _MAX_NAMED_FAILURES) > 0:
+        echo(f" and {plural(left, 'other error')}, which tasks.parquet of the run holds")
     if lost:
         echo(
             f" {counts['failed']} failed, {counts['timeout']} timeout, {counts['missing']} missing"
