@@ -15,7 +15,7 @@ from shiftsim.errors import ConfigError, ConversionError, MissingExtraError, one
 from shiftsim.files import read_toml, store_path
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
 
     from shiftsim.data.readers.convert import ConversionReport
     from shiftsim.data.readers.reader import Reader
@@ -69,7 +69,7 @@ def nuplan(
     failed = list(report.failed.items())
     lines = [
         *(f" tolerated: {flaw} ({count})" for flaw, count in report.flaws.items()),
-        *(f" failed: {token}: {reason}" for token, reason in failed[:MAX_NAMED]),
+        *_failures(report.failed),
         f" {plural(len(report.converted), 'scenario')} converted, "
         f"{len(report.unchanged)} unchanged, {len(failed)} failed → {folder}",
     ]
@@ -317,13 +317,20 @@ def _convert(
         raise typer.Exit(cli.UNFINISHED)
 
 
+def _failures(failed: "Mapping[str, str]") -> "Iterator[str]":
+    """What failed and why, and how many more."""
+    for name, reason in list(failed.items())[:MAX_NAMED]:
+        yield f" failed: {name}: {reason}"
+    if len(failed) > MAX_NAMED:
+        yield f" failed: {len(failed) - MAX_NAMED} more, which --json lists"
+
+
 def _scene_lines(report: "ConversionReport", store: Path) -> "Iterator[str]":
     warnings = Counter(report.map_warnings) + report.count("warnings")
     for title, counts in ("not an ego by rule", report.count("rejected")), ("note", warnings):
         for name, number in sorted(counts.items()):
             yield f" {title}: {name} ({number})"
-    for name, reason in list(report.skipped.items())[:MAX_NAMED]:
-        yield f" failed: {name}: {reason}"
+    yield from _failures(report.skipped)
     without = sum(not summary.accepted for summary in report.recordings)
     yield (
         f" {plural(report.converted, 'scene')} converted, {without} of them without a "
