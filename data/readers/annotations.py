@@ -100,6 +100,8 @@ class Dsc3dFile(SourceFile):
                 rows <= max_rows, f"{rows} rows, at most {max_rows} can be read", "split it"
             )
             names = [name for name in wanted if name in present]
+            twice = [name for name in names if present.count(name) > 1]
+            self.require_that(not twice, f"columns {twice} are there twice", "remove one of each")
             long = [name for name in names if name == "category"]  # its texts are not repeated
             file = pq.ParquetFile(self.path, read_dictionary=long)
             return file.read(names, use_threads=False)

@@ -19,7 +19,7 @@ from shiftsim.errors import DataError
 from shiftsim.files import safe_join, user_cache
 
 _LOG = logging.getLogger(__name__)
-_PATIENCE = 5  # s
+_PATIENCE = 3  # s
 _OVERLAYS = ("filter", Path(REVIEW).parent.name, "splits")  # may change, and are fetched each time
 
 
@@ -115,6 +115,7 @@ class RemoteFiles:
                     )
                 partial.replace(target)
         except (OSError, pa.ArrowException) as error:
-            raise DataError(
-                f"{self.url}/{name} cannot be read: {error}", hint="check the URL and the access"
-            ) from error
+            text = " ".join(str(error).split())
+            text = text if len(text) < 400 else f"{text[:200]} … {text[-150:]}"
+            what = f"{self.url}/{name} cannot be read: {text}"
+            raise DataError(what, "check the URL, the network and the access") from error

@@ -19,7 +19,7 @@ from shiftsim.data.store.tables import encodings
 from shiftsim.errors import DataError
 from shiftsim.files import temp_path
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.rollouts.columns import STATES, TRACKS
+from shiftsim.runs.rollouts.columns import NOISE_COLUMNS, STATES, TRACKS
 
 FOLDER = "rollouts"
 _PART = re.compile(r"part-\d+\.parquet")
@@ -101,7 +101,18 @@ class RolloutReader:
         rows = self._rows.slice(first, place.rows).combine_chunks()
         if len(rows) != place.rows:
             raise _unreadable(place.file, IndexError(f"rows {place.row} and after are cut off"))
-        return rows.to_batches()[0]
+        batch = rows.to_batches()[0]
+        noise = {batch[name].null_count for name in NOISE_COLUMNS}
+        for field in batch.schema:
+            column = batch[field.name]
+            nulls = column.null_count
+            if pa.types.is_list(field.type):
+                nulls += column.flatten().null_count
+            is_left_out = field.name in NOISE_COLUMNS and noise == {len(batch)}
+            if nulls and not is_left_out:
+                what = f"column {field.name!r} holds {nulls} nulls"
+                raise _unreadable(place.file, ValueError(what))
+        return batch
 
 
 def _check_columns(found: pa.Schema) -> None:

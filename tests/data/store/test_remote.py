@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from time import monotonic
 
 import numpy as np
 import pytest
@@ -145,3 +146,14 @@ def test_a_store_behind_a_url_is_not_reviewed_in_its_copy(remote, tmp_path):
     asked = call(tmp_path, "inspect", url)
     assert asked.returncode == 1
     assert "is behind a URL" in asked.stderr
+
+
+@pytest.mark.slow
+def test_without_a_network_a_url_of_google_ends_soon_and_in_one_line(tmp_path):
+    # where there is a network, there is no such store either
+    begin = monotonic()
+    asked = call(tmp_path, "check", "gs://shiftsim-no-such-bucket-7f3a/store")
+    assert asked.returncode != 0
+    assert "Traceback" not in asked.stderr
+    assert len(asked.stderr.splitlines()) == 2  # what, and a hint
+    assert monotonic() - begin < 15  # imports included
