@@ -4,7 +4,6 @@ The child runs `stub.py`, in our interpreter with everything of ours, or in anot
 NumPy alone. What it computes is the same, and so are the scores.
 """
 
-import os
 import sys
 from collections.abc import Mapping
 from dataclasses import replace
@@ -83,7 +82,7 @@ class Isolated:
                 hint="--planner-python takes the path of a Python interpreter",
             ) from error
         plain = {name: str(v) if isinstance(v, Path) else v for name, v in arguments.items()}
-        path = [] if python else [*filter(None, sys.path), os.getcwd()]
+        path = [] if python else [*filter(None, sys.path)]
         self._about = self._ask("make", {"spec": spec, "arguments": plain, "path": path})
         return self._about
 

@@ -13,6 +13,7 @@ import ctypes
 import dataclasses
 import hashlib
 import importlib
+import importlib.machinery
 import json
 import os
 import signal
@@ -157,6 +158,26 @@ class Trajectory:
         return Trajectory(np.rint(seconds * 1e6).astype(np.int64), states, True)
 
 
+class _Folder:
+    """Finds the planner's module in a folder, and for what it found there the neighbours."""
+
+    def __init__(self, folder: str, name: str) -> None:
+        self.folder, self.name = folder, name.partition(".")[0]
+        self.found: Any = set()
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> Any:
+        frame: Any = sys._getframe(1)
+        while frame and frame.f_globals.get("__name__", "").startswith("importlib."):
+            frame = frame.f_back
+        importer = frame and frame.f_globals.get("__name__", "").partition(".")[0]
+        if path is None and (name == self.name or importer in self.found):
+            spec = importlib.machinery.PathFinder.find_spec(name, [self.folder], target)
+            if spec:
+                self.found.add(name)
+            return spec
+        return None
+
+
 def _alone(hello: Any) -> Any:
     """What makes planners, the classes of records, and the fingerprint, without shiftsim."""
     ours: Any = types.ModuleType("shiftsim")
@@ -164,7 +185,7 @@ def _alone(hello: Any) -> Any:
     sys.modules["shiftsim"] = ours
     module_name, _, name = hello["spec"].rpartition(":")
     folder, file = os.path.split(module_name) if module_name.endswith(".py") else ("", module_name)
-    sys.path.append(os.path.abspath(folder))
+    sys.meta_path.append(_Folder(os.path.abspath(folder), file.removesuffix(".py")))
     module: Any = importlib.import_module(file.removesuffix(".py"))
     kind = getattr(module, name)
     with open(module.__file__, "rb") as file:

@@ -5,16 +5,19 @@ half written: `atomic_write` is the one way to replace one. What a file that may
 is looked for inside its folder only, with `safe_join`.
 """
 
+import inspect
 import json
 import os
 import re
 import sys
+import tempfile
 import tomllib
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import import_module
+from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from types import ModuleType
 from typing import Any, BinaryIO
@@ -33,7 +36,7 @@ def store_path(name: str) -> Path:
 
     A store in the current directory may be named without `./`, unless the name is taken below.
     """
-    path = Path(name).expanduser()
+    path = expand(name)
     if path.is_absolute() or len(path.parts) != 1 or name in (".", ".."):
         return path
     below = Path(os.environ.get("SHIFTSIM_DATA", "shiftsim-data")) / name
@@ -42,8 +45,7 @@ def store_path(name: str) -> Path:
 
 def checkpoint_folder() -> Path:
     """Folder where checkpoints are found by name: `SHIFTSIM_CHECKPOINTS`, or below the cache."""
-    default = "~/.cache/shiftsim/checkpoints"
-    return Path(os.environ.get("SHIFTSIM_CHECKPOINTS", default)).expanduser()
+    return expand(os.environ.get("SHIFTSIM_CHECKPOINTS", f"{_home_cache()}/checkpoints"))
 
 
 def user_cache(part: str) -> Path:
@@ -51,7 +53,19 @@ def user_cache(part: str) -> Path:
 
     `stores` are files copied from stores behind a URL, `kernels` are compiled kernels.
     """
-    return Path(os.environ.get("SHIFTSIM_CACHE", "~/.cache/shiftsim")).expanduser() / part
+    return expand(os.environ.get("SHIFTSIM_CACHE", _home_cache())) / part
+
+
+def _home_cache() -> str:
+    """Default folder of caches; that of temporary files for a user without a home."""
+    if (home := os.path.expanduser("~")) != "~":
+        return f"{home}/.cache/shiftsim"
+    return f"{tempfile.gettempdir()}/shiftsim-{os.getuid()}"
+
+
+def expand(name: str) -> Path:
+    """A path with the home folder in the place of `~`, where there is one."""
+    return Path(os.path.expanduser(name))
 
 
 def safe_join(folder: Path, name: str) -> Path:
@@ -160,7 +174,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(
             f"cannot read {str(path)!r}: {error.strerror or error}", hint="check the path"
         ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # also a number of thousands of digits
         raise ConfigError(
             f"{str(path)!r} is not TOML: {error}", hint="repair the line named above"
         ) from error
@@ -169,16 +183,17 @@ def read_toml(path: Path) -> dict[str, Any]:
 def import_named(module: str) -> ModuleType:
     """A module by its name, or by its file, `folder/name.py`.
 
-    One that the user has named may lie in the current folder. Nothing else is ever imported from
-    there: a stray file is not code.
+    One that the user has named may lie in the current folder, and what it imports, too. Nothing
+    else is ever imported from there: a stray file is not code.
 
     Raises:
         ImportError: There is none, it fails, or it ends the process.
     """
     name, folder = (module, Path.cwd()) if not module.endswith(".py") else _module_of(Path(module))
-    own = not name.startswith("shiftsim.")
-    if own and str(folder) not in sys.path:
-        sys.path.append(str(folder))
+    if not name.startswith("shiftsim.") and str(folder) not in sys.path:
+        finder = UserFolder(str(folder), name.partition(".")[0])
+        if finder not in sys.meta_path:
+            sys.meta_path.append(finder)
     try:
         found = import_module(name)
     except ImportError:
@@ -190,6 +205,57 @@ def import_named(module: str) -> ModuleType:
     if module.endswith(".py") and not Path(module).samefile(found.__file__ or ""):
         raise ImportError(f"{name!r} is the name of {found.__file__}; rename the file", name=name)
     return found
+
+
+class UserFolder:
+    """Finds a module that the user names in a folder that is not on the search path.
+
+    What it finds may import its neighbours; libraries, which try many names, may not.
+    """
+
+    def __init__(self, folder: str, name: str) -> None:
+        self.folder, self.name = folder, name
+        self.found = set[str]()
+
+    def __eq__(self, other: object) -> bool:
+        mine = (self.folder, self.name)
+        return isinstance(other, UserFolder) and mine == (other.folder, other.name)
+
+    def __hash__(self) -> int:
+        return hash((self.folder, self.name))
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """As Python asks a finder, which it does after all others."""
+        if path is not None or not (name == self.name or _importer() in self.found):
+            return None
+        spec = PathFinder.find_spec(name, [self.folder], target)
+        if spec is not None:
+            self.found.add(name)
+        return spec
+
+
+def _importer() -> str:
+    """The top-level name of the module whose import statement is at work."""
+    frame = inspect.currentframe()
+    while frame is not None:
+        name = str(frame.f_globals.get("__name__", ""))
+        if name != __name__ and not name.startswith("importlib."):
+            return name.partition(".")[0]
+        frame = frame.f_back
+    return ""
+
+
+def user_folders() -> list[UserFolder]:
+    """Where modules that the user named are found; other processes need them, too."""
+    return [finder for finder in sys.meta_path if isinstance(finder, UserFolder)]
+
+
+def take_search_path(path: list[str], folders: list[UserFolder]) -> None:
+    """Find modules where another process finds them."""
+    sys.path[:] = path
+    sys.meta_path += [folder for folder in folders if folder not in sys.meta_path]
 
 
 def _module_of(file: Path) -> tuple[str, Path]:

@@ -2,15 +2,17 @@
 
 numba's disk cache looks only at the file of the outermost kernel. The cache folder is therefore
 named by a hash of all kernel sources and of the versions of numba and NumPy: an edit of any of them
-starts a fresh cache.
+starts a fresh cache. Machine code is a program: what another user may have written is not read.
 """
 
 import hashlib
 import logging
 import os
 import shutil
+import sys
 import tempfile
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -39,12 +41,31 @@ def kernel_hash() -> str:
     return digest.hexdigest()[:16]
 
 
-def _is_writable(folder: Path) -> bool:
+def _is_usable(folder: Path, mode: int = 0o700) -> bool:
+    """Whether machine code can be kept in a folder, which is made if needed."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode, parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
     except OSError:
         return False
+    return _is_trusted(folder)
+
+
+@cache
+def _is_trusted(folder: Path) -> bool:
+    """Whether nobody but this user and root can have written what is in a folder; else said."""
+    if sys.platform == "win32":
+        return True
+    # others do not reach what is in a private folder: there the group is what a umask left
+    forbidden = 0o022 if folder.stat().st_mode & 0o077 else 0o002
+    for path in (folder, *folder.rglob("*")):
+        with suppress(OSError):  # another process may be writing it
+            info = path.stat()
+            if info.st_uid not in (0, os.getuid()) or info.st_mode & forbidden:
+                text = "%s may be written by other users: compiled kernels in %s are not read; %s"
+                remedy = "remove that folder, or give NUMBA_CACHE_DIR one of your own"
+                logging.getLogger(__name__).warning(text, path, folder, remedy)
+                return False
     return True
 
 
@@ -57,13 +78,14 @@ def _cache_folder() -> str:
     is_checkout = (PACKAGE.parent / "pyproject.toml").is_file()
     base = PACKAGE.parent / ".numba-cache" if is_checkout else PACKAGE / "__pycache__" / "kernels"
     shipped, own = (folder / kernel_hash() for folder in (base, user_cache("kernels")))
-    folder = shipped if _is_writable(shipped) else own
-    if not _is_writable(folder):
+    mode = 0o700 if sys.platform == "win32" or os.getuid() else 0o755  # root's is that of an image
+    folder = shipped if _is_usable(shipped, mode) else own
+    if not _is_usable(folder):
         logging.getLogger(__name__).warning(
-            "%s cannot be written: kernels are compiled anew by every process", folder
+            "%s cannot be used: kernels are compiled anew by every process", folder
         )
         return ""
-    if folder is own:
+    if folder is own and shipped.is_dir() and _is_trusted(shipped):
         for path in shipped.rglob("*.nb?"):  # without its permissions
             copy = own / path.relative_to(shipped)
             copy.parent.mkdir(exist_ok=True)
@@ -82,6 +104,9 @@ def _cache_folder() -> str:
 config: Any = numba.config
 if not config.CACHE_DIR:  # NUMBA_CACHE_DIR
     config.CACHE_DIR = _cache_folder()
+elif not _is_usable(Path(config.CACHE_DIR)):
+    # processes that this one starts take the same one, and need not say it again
+    os.environ["NUMBA_CACHE_DIR"] = config.CACHE_DIR = _cache_folder()
 
 CACHE_FOLDER: str = config.CACHE_DIR
 # no fastmath, no parallel loops: results must not depend on the processor or the number of threads;

@@ -19,7 +19,7 @@ from threading import Event, Thread
 from typing import Any
 
 from shiftsim.errors import ConfigError
-from shiftsim.files import PACKAGE
+from shiftsim.files import PACKAGE, take_search_path, user_folders
 
 _PAUSE = 0.5  # s, before a process that ended is started again
 _PATIENCE = 5.0  # s, for a process to end by itself
@@ -95,7 +95,7 @@ class Process:
 
 def packed(make: Callable[[], object]) -> bytes:
     """What `start` needs to call `make` in another process: our search path and `make`."""
-    return pickle.dumps((sys.path, pickle.dumps(make)))
+    return pickle.dumps((sys.path, user_folders(), pickle.dumps(make)))
 
 
 def start(payload: bytes) -> Process:
@@ -115,8 +115,8 @@ def serve(parent: int, handle: int) -> None:
         handle = socket.fromshare(sys.stdin.buffer.read()).detach()
     connection: Connection[Any, Any] = Connection(handle)
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):  # the parent has ended
-        path, pickled = pickle.loads(connection.recv_bytes())
-        sys.path[:] = path
+        path, folders, pickled = pickle.loads(connection.recv_bytes())
+        take_search_path(path, folders)
         function = pickle.loads(pickled)()
         try:
             connection.send("ready")

@@ -205,6 +205,83 @@ def test_a_kernel_cached_as_a_part_of_another_can_be_called_itself(tmp_path: Pat
         subprocess.run([sys.executable, "-c", code], env=environment, check=True)
 
 
+def _poison(folder: Path) -> None:
+    """An index of numba's that runs a command when it is read, wherever one may lie."""
+    done = subprocess.run(
+        [sys.executable, "-c", "from family import *; child(4)"],
+        env=os.environ | {"NUMBA_CACHE_DIR": str(folder), "PYTHONPATH": _search(folder)},
+        check=True,
+    )
+    assert done.returncode == 0
+    for index in folder.rglob("*.nbi"):
+        index.write_bytes(b"cos\nsystem\n(S'touch %s'\ntR." % str(folder.parent / "ran").encode())
+
+
+def _search(folder: Path) -> str:
+    return os.pathsep.join([str(folder.parent), str(PACKAGE.parent)])
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no owners and modes of files")
+@pytest.mark.parametrize("change", ["folder", "part", "file", "group", "owner"])
+def test_machine_code_that_others_may_have_written_is_not_read(tmp_path: Path, change: str) -> None:
+    (tmp_path / "family.py").write_text(CHILD_AND_PARENT)
+    folder = tmp_path / "cache"
+    _poison(folder)
+    index = next(folder.rglob("*.nbi"))
+    assert folder.stat().st_mode & 0o777 == 0o700
+    if change == "owner":
+        if os.getuid():
+            pytest.skip("only root can give a file away")
+        os.chown(index, 4321, -1)
+    elif change == "group":
+        folder.chmod(0o755)
+        index.chmod(0o664)
+    else:
+        {"folder": folder, "part": index.parent, "file": index}[change].chmod(0o777)
+    code = "from family import *; assert child(4)[3] == 3"
+    own = {"NUMBA_CACHE_DIR": str(folder), "SHIFTSIM_CACHE": str(tmp_path / "own")}
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | own | {"PYTHONPATH": _search(folder)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert not (tmp_path / "ran").exists()
+    assert done.stderr.count("may be written by other users") == 1
+    assert str(folder) in done.stderr
+
+
+def test_a_process_that_is_started_does_not_say_it_again(tmp_path: Path) -> None:
+    (tmp_path / "cache").mkdir(mode=0o700)
+    (tmp_path / "cache").chmod(0o777)
+    code = "import shiftsim.kernels as k, subprocess as s, sys; print(k.CACHE_FOLDER, flush=True);"
+    code += "s.run([sys.executable, '-c', 'import shiftsim.kernels as k; print(k.CACHE_FOLDER)'])"
+    own = {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(PACKAGE.parent)}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | own, capture_output=True, text=True
+    )
+    first, second = done.stdout.split()
+    assert first == second != str(tmp_path / "cache")
+    assert done.stderr.count("may be written by other users") == 1
+
+
+@pytest.mark.skipif(sys.platform == "win32" or os.getuid() != 0, reason="needs another user")
+def test_a_user_without_a_home_has_a_cache_all_the_same() -> None:
+    code = "import os; from shiftsim.files import checkpoint_folder, store_path, user_cache; "
+    code += "os.environ.pop('HOME', None); os.setuid(54321); "
+    code += "print(user_cache('kernels'), checkpoint_folder(), store_path('~/x'))"
+    names = ("SHIFTSIM_CACHE", "SHIFTSIM_CHECKPOINTS")
+    env = {k: v for k, v in os.environ.items() if k not in names}
+    env |= {"PYTHONPATH": str(PACKAGE.parent)}
+    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    cache, checkpoints, store = done.stdout.split()
+    assert cache.endswith("/shiftsim-54321/kernels")
+    assert checkpoints.endswith("/shiftsim-54321/checkpoints")
+    assert store == "~/x"
+
+
 @pytest.mark.slow
 def test_runs_of_several_planners_in_turn_share_a_cache(toy: Path, tmp_path: Path) -> None:
     environment = os.environ | {

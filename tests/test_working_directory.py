@@ -46,6 +46,19 @@ def my_metric(log, road):
 def my_noise(accel, steering, num_steps, dt):
     return accel.normal(size=(num_steps, 2)) * 0.01
 """
+ALONE = """
+import importlib.util
+import my_helper
+from shiftsim import Command
+
+class Still:
+    def reset(self, scene):
+        assert importlib.util.find_spec("my_helper") and my_helper.SPEED
+        import json.tool
+
+    def plan(self, observation):
+        return Command(0.0, 0.0)
+"""
 
 
 @pytest.fixture
@@ -124,3 +137,73 @@ def test_the_command_works_where_the_folder_has_gone(tmp_path):
     done = subprocess.run([sys.executable, "-P", "-c", code], cwd=tmp_path, check=False)
     assert done.returncode == 0
     assert not os.path.exists(tmp_path)
+
+
+PROBE = """
+import sys
+tried = set()
+class Recorder:
+    @staticmethod
+    def find_spec(name, path=None, target=None):
+        if path is None:
+            tried.add(name)
+sys.meta_path.append(Recorder)
+import shiftsim.cli
+import shiftsim.files
+try:
+    shiftsim.cli.main(sys.argv[1:])
+finally:
+    print("tried:", *sorted(tried - {"my_plugins", "my_helper", "my_late_helper"}))
+"""
+
+
+@pytest.fixture
+def own(tmp_path):
+    """A folder with a planner of one's own and its helpers, and what a run of it is called with."""
+    write_toy_store(tmp_path / "toy", count=2)
+    (tmp_path / "my_plugins.py").write_text(PLUGINS)
+    (tmp_path / "my_helper.py").touch()
+    (tmp_path / "my_late_helper.py").touch()
+    words = ["-p", "my_plugins:MyPlanner", "-s", "./toy", "--limit", "2"]
+    return tmp_path, words
+
+
+@pytest.mark.slow
+def test_no_import_that_is_tried_in_vain_finds_a_stray_file(own):
+    folder, words = own
+    probe = [sys.executable, "-P", "-c", PROBE, "run", *words, "--workers", "1", "--out", "probe"]
+    done = subprocess.run(probe, cwd=folder, capture_output=True, text=True, check=False)
+    tried = done.stdout.rpartition("tried:")[2].split()
+    for name in {*NAMES, *tried, "colorama", "cupy"}:
+        (folder / f"{name}.py").write_text(STRAY)
+    for number, more in enumerate([["--workers", "2"], ["--workers", "1", "--isolate"]]):
+        done = call(folder, "run", *words, *more, "--out", f"run-{number}")
+        assert done.returncode == 0, done.stderr
+    assert not (folder / "stray-was-executed").exists()
+
+
+@pytest.mark.slow
+def test_a_planner_in_another_interpreter_finds_its_neighbours_and_no_stray_file(tmp_path):
+    write_toy_store(tmp_path / "toy", count=1)
+    (tmp_path / "my_planner.py").write_text(ALONE)
+    (tmp_path / "my_helper.py").write_text("SPEED = 1.0\n")
+    (tmp_path / "numpy.py").write_text(STRAY)
+    (tmp_path / "colorama.py").write_text(STRAY)
+    words = ["run", "-p", "my_planner:Still", "-s", "./toy", "--planner-python", sys.executable]
+    done = call(tmp_path, *words, "--workers", "1", "--out", "run")
+    assert done.returncode == 0, done.stderr
+    assert not (tmp_path / "stray-was-executed").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("more", [["--workers", "2"], ["--isolate"]])
+def test_a_planner_in_a_package_of_the_working_directory_is_found(own, more):
+    folder, words = own
+    (folder / "mine" / "deep").mkdir(parents=True)
+    (folder / "mine" / "__init__.py").touch()
+    (folder / "mine" / "tools.py").write_text("import my_helper\n")
+    text = PLUGINS.replace("import my_helper", "from mine import tools")
+    (folder / "mine" / "deep" / "planner.py").write_text(text)
+    words[1] = "mine.deep.planner:MyPlanner"
+    done = call(folder, "run", *words, *more, "--out", "run")
+    assert done.returncode == 0, done.stderr

@@ -80,7 +80,12 @@ def convert_nuplan(
         conversion = _Conversion(chosen, mapping, find_maps(Path(maps)), writer)
         report = conversion.report
         show = progress or (lambda done, total, name: None)
-        taken = _thinned(files, conversion, show) if chosen.thins_out else None
+        is_all = chosen == ScenarioFilter()
+        taken = _thinned(files, conversion, show) if chosen.thins_out or is_all else None
+        if is_all:
+            text = "%d scenarios of %d logs will be made, one of every sweep as in nuPlan; %s"
+            fewer = "--types, --tokens or --filter takes fewer"
+            _LOG.warning(text, len(taken or ()), len(files) - len(report.failed), fewer)
         readable = [path for path in files if path.stem not in report.failed]
         for done, path in enumerate(readable):
             show(done, len(readable), path.stem)

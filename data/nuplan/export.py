@@ -55,6 +55,8 @@ class ExportReport:
     mappings: Counter[tuple[str, Mapping]] = field(default_factory=Counter)
     # scenarios whose recording ends less than 0.5 s after the last plan: log-future fails in nuPlan
     cut_off: int = 0
+    # scenarios whose log goes on behind their window: log-future sees more of it in nuPlan
+    longer: int = 0
     # maps that nuPlan's own code opens and that are not in the folder
     missing_maps: list[str] = field(default_factory=list)
 
@@ -95,6 +97,9 @@ def export_nuplan(
         report.tokens[token] = log_token(token).hex()
         report.mappings[scene.scenario_type, mapping] += 1
         report.cut_off += int(scene.iteration_rows[-2]) + ROWS_AHEAD >= len(scene.time_us)
+        behind = len(scene.time_us) - int(scene.iteration_rows[-1])
+        window = windows[token]
+        report.longer += behind > window.last_row - int(window.iteration_rows[-1])
     progress(len(chosen), len(chosen), "")
     report.token_file.write_text("\n".join(sorted(report.tokens.values())) + "\n", "utf-8")
     return report
@@ -165,7 +170,7 @@ def _write_maps(store: ScenarioStore, report: ExportReport) -> None:
     try:
         listed = json.loads(index.read_text("utf-8")) if index.is_file() else {}
         versions = {name: entry["version"] for name, entry in listed.items()}
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         what = f"{index}: not an index of maps: {error!r}"
         raise ConversionError(what, hint="choose another folder") from error
     for city in report.cities:

@@ -11,6 +11,7 @@ import numpy as np
 import yaml
 
 from shiftsim.errors import ConfigError
+from shiftsim.files import expand
 
 _TOKEN = re.compile(r"[0-9a-f]{16}\Z")
 
@@ -133,7 +134,7 @@ def _token_set(path: Path, values: Mapping[str, Any]) -> frozenset[str] | None:
     if name is None:
         return None
     try:
-        tokens = json.loads(Path(str(name)).expanduser().read_text("utf-8"))
+        tokens = json.loads(expand(str(name)).read_text("utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         what = f"{path}: token_set_path: {name}: not readable JSON: {error}"
         raise ConfigError(what, hint="give a path that holds from the current folder") from error

@@ -224,7 +224,7 @@ def find_maps(folder: Path) -> dict[str, Path]:
                 out[name] = folder / name / str(entry["version"]) / "map.gpkg"
         except (TypeError, KeyError, AttributeError) as error:
             raise DataError(f"{index}: a map has no version", hint="get it again") from error
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise DataError(f"{index}: not readable JSON: {error}", hint="get it again") from error
     return out
 

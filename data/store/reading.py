@@ -266,6 +266,6 @@ def read_report(store: Path, city: str) -> dict[str, Any]:
         if manifest["files"].get(path.relative_to(store).as_posix()) != tables.digest(path):
             return {}
         content: dict[str, Any] = json.loads(path.read_text("utf-8"))
-    except (DataError, OSError, ValueError):
+    except (DataError, OSError, ValueError, RecursionError):
         return {}
     return content

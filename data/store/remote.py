@@ -1,9 +1,11 @@
 """The files of a store behind a URL: copied when they are first needed, checked, and kept.
 
 Any file system that pyarrow knows will do (`s3://`, `gs://`, `hdfs://`, `file://`, …). The copies
-lie in a folder named by the content hash of the store, so that they are never those of another one.
+lie in a folder named by the URL and the manifest, so that they are never those of another store.
+What lies beside the scenarios is mirrored: what the source no longer has is removed here, too.
 """
 
+import hashlib
 import logging
 import shutil
 import tempfile
@@ -17,6 +19,7 @@ from shiftsim.errors import DataError
 from shiftsim.files import safe_join, user_cache
 
 _LOG = logging.getLogger(__name__)
+_PATIENCE = 3  # s
 _OVERLAYS = ("filter", Path(REVIEW).parent.name, "splits")  # may change, and are fetched each time
 
 
@@ -31,7 +34,11 @@ class RemoteFiles:
     def __init__(self, url: str) -> None:
         self.url = url.rstrip("/")
         try:
-            self._remote, self._root = fs.FileSystem.from_uri(self.url)
+            # Google's client would go on trying for a quarter of an hour
+            limit = f"{'&' if '?' in self.url else '?'}retry_limit_seconds={_PATIENCE}"
+            is_endless = self.url.startswith(("gs:", "gcs:")) and "retry_limit" not in self.url
+            given = self.url + limit * is_endless
+            self._remote, self._root = fs.FileSystem.from_uri(given)
         except (pa.ArrowException, OSError, ValueError) as error:
             hint = "give a URL such as s3://bucket/folder"
             raise DataError(f"store {url!r}: {error}", hint) from error
@@ -44,8 +51,7 @@ class RemoteFiles:
             self._temporary = tempfile.TemporaryDirectory()  # goes away with this object
             self.path = self._identify(Path(self._temporary.name))
         self.need(SCENARIOS)
-        for name in self._overlays():
-            self._fetch(name, safe_join(self.path, name))
+        self._mirror_overlays()
 
     def need(self, name: str) -> None:
         """Copy a file of the store, or all of a folder, as far as they are not here, and whole.
@@ -71,19 +77,25 @@ class RemoteFiles:
             self._fetch(MANIFEST, found)
             manifest = read_manifest(Path(folder))
             self._files = manifest["files"]
-            path = cache / manifest["hash"][:16] / self._root.rstrip("/").rpartition("/")[2]
+            key = hashlib.sha256(self.url.encode() + b"\0" + found.read_bytes()).hexdigest()
+            path = cache / key[:16] / self._root.rstrip("/").rpartition("/")[2]
             path.mkdir(parents=True, exist_ok=True)
             found.replace(path / MANIFEST)
         return path
 
-    def _overlays(self) -> list[str]:
-        """Files beside the scenarios that are not part of the hash."""
-        selectors = [
-            fs.FileSelector(f"{self._root}/{name}", allow_not_found=True) for name in _OVERLAYS
-        ]
-        found = [info for selector in selectors for info in self._remote.get_file_info(selector)]
+    def _mirror_overlays(self) -> None:
+        """Files beside the scenarios that are not part of the hash: here what is there now."""
         start = len(self._root.rstrip("/")) + 1
-        return [info.path[start:] for info in found if info.type == fs.FileType.File]
+        for folder in _OVERLAYS:
+            selector = fs.FileSelector(f"{self._root}/{folder}", allow_not_found=True)
+            found = self._remote.get_file_info(selector)
+            names = {info.path[start:] for info in found if info.type == fs.FileType.File}
+            for copy in (self.path / folder).glob("*"):
+                # a folder is a file that another process is fetching
+                if f"{folder}/{copy.name}" not in names and not copy.is_dir():
+                    copy.unlink(missing_ok=True)
+            for name in names:
+                self._fetch(name, safe_join(self.path, name))
 
     def _fetch(self, name: str, target: Path) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -103,6 +115,7 @@ class RemoteFiles:
                     )
                 partial.replace(target)
         except (OSError, pa.ArrowException) as error:
-            raise DataError(
-                f"{self.url}/{name} cannot be read: {error}", hint="check the URL and the access"
-            ) from error
+            text = " ".join(str(error).split())
+            text = text if len(text) < 400 else f"{text[:200]} … {text[-150:]}"
+            what = f"{self.url}/{name} cannot be read: {text}"
+            raise DataError(what, "check the URL, the network and the access") from error

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 from shiftsim.errors import CheckpointError, nearest
-from shiftsim.files import checkpoint_folder
+from shiftsim.files import checkpoint_folder, expand
 from shiftsim.planners import table
 from shiftsim.planners.learned.deterministic import network_weights
 from shiftsim.planners.learned.device import prepare_inference, require_torch, resolve_device
@@ -120,7 +120,7 @@ def weights_note(fingerprint: str, planner: str) -> str:
 
 def split_ensemble(spec: str, planner: str = "") -> tuple[str, ...]:
     """The checkpoints of `A,B,C`, or of a folder with one folder for each; else the one given."""
-    path = _meant_by(spec, planner) or Path(spec).expanduser()
+    path = _meant_by(spec, planner) or expand(spec)
     members = [] if (path / _MEMBER).exists() else sorted(path.glob(f"*/{_MEMBER}"))
     if members:
         return tuple(str(member) for member in members)
@@ -130,7 +130,7 @@ def split_ensemble(spec: str, planner: str = "") -> tuple[str, ...]:
 def find_checkpoint(spec: str, planner: str = "") -> Path:
     """The file that is meant; else a CheckpointError."""
     meant = _meant_by(spec, planner)
-    given, named = meant or Path(spec).expanduser(), meant or checkpoint_folder() / spec
+    given, named = meant or expand(spec), meant or checkpoint_folder() / spec
     for path in (given, named, *(named.with_name(named.name + suffix) for suffix in SUFFIXES)):
         if path.is_file():
             return path
@@ -221,7 +221,7 @@ def _args_of(path: Path, contents: Contents) -> dict[str, Any] | None:
     if "args" in contents.metadata:
         try:
             value = json.loads(contents.metadata["args"])
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             what = f"checkpoint {str(path)!r}: args in it are not JSON"
             raise CheckpointError(what, ARGS_HINT) from error
         return value if isinstance(value, dict) else None

@@ -197,7 +197,7 @@ def export_to_nuplan(
     ]
     names = ("logs", "maps", "token_file", "tokens", "cities")
     shown = {name: getattr(report, name) for name in names} | {"mappings": mappings}
-    rest = {"cut_off": report.cut_off, "missing_maps": report.missing_maps}
+    rest = {"cut_off": report.cut_off, "longer": report.longer, "missing_maps": report.missing_maps}
     print_result(shown | rest, _export_lines(report, mappings), as_json=as_json)
 
 
@@ -211,6 +211,9 @@ def _export_lines(report: "ExportReport", mappings: list[dict[str, Any]]) -> "It
     if report.cut_off:
         ended = plural(report.cut_off, "recording")
         yield f" {ended} ended within 0.5 s of the last plan: nuPlan's LogFuturePlanner fails there"
+    if report.longer:
+        logs = plural(report.longer, "log")
+        yield f" {logs} with rows behind the window: log-future sees them in nuPlan only"
     if report.missing_maps:
         yield f" nuPlan's own code also opens the maps {', '.join(report.missing_maps)}: add them"
     words = {",".join(f"{value:.12g}" for value in row["mapping"]) for row in mappings}

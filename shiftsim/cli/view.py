@@ -119,6 +119,8 @@ def inspect(
     from shiftsim.data.store.tables import REVIEW
     from shiftsim.view.review import ReviewServer, ReviewService
 
+    if "://" in store:  # where the source's own review would take the place of what is decided
+        raise ConfigError(f"store {store!r} is behind a URL", "review a copy of its folder")
     path = shiftsim.open_store(store).path
     with ReviewServer(ReviewService(path, reviewer), port) as server:
         echo(f"review     {server.address}")

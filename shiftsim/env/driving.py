@@ -8,6 +8,7 @@ import signal
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from functools import cache, partial
+from multiprocessing import TimeoutError as NoAnswerError
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, Protocol
@@ -205,6 +206,7 @@ def DrivingVectorEnv(
     *,
     num_workers: int = 1,
     autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+    timeout: float = 600.0,
     **settings: Any,
 ) -> "VectorEnv[Any, Any, Any]":
     """Environments side by side: Gymnasium's `SyncVectorEnv`, or its `AsyncVectorEnv`.
@@ -214,6 +216,8 @@ def DrivingVectorEnv(
         num_workers: 1 to step all of them in this process; with more, each of them has a process
             of its own.
         autoreset_mode: When an ended episode is followed by a new one, as in Gymnasium.
+        timeout: How long a reset or a step may take in other processes [s]; kernels are compiled
+            in the first ones.
         settings: Those of `DrivingEnv`.
 
     Raises:
@@ -226,46 +230,56 @@ def DrivingVectorEnv(
             hint="num_workers must be at least 1, and at most num_envs",
         )
     makers = [partial(DrivingEnv, **settings)] * num_envs
-    return vector_env(makers, num_workers, autoreset_mode=autoreset_mode)
+    return vector_env(makers, num_workers, timeout, autoreset_mode=autoreset_mode)
 
 
 def vector_env(
-    makers: Sequence[Make], num_workers: int, **settings: Any
+    makers: Sequence[Make], num_workers: int, timeout: float = 600.0, **settings: Any
 ) -> "VectorEnv[Any, Any, Any]":
     """Environments side by side, in this process or in one each; `settings` as in Gymnasium."""
     return (
         SyncVectorEnv(makers, **settings)
         if num_workers == 1
-        else ProcessVectorEnv(makers, **settings)
+        else ProcessVectorEnv(makers, timeout, **settings)
     )
 
 
 class ProcessVectorEnv(AsyncVectorEnv):
-    """Environments in a process each; an error in one of them, or its death, closes all."""
+    """Environments in a process each; an error, the death or the silence of one closes all."""
 
-    def __init__(self, makers: Sequence[Make], **settings: Any) -> None:
+    def __init__(self, makers: Sequence[Make], timeout: float, **settings: Any) -> None:
         """Start the processes; forking is unsafe beside the threads of torch."""
+        self._timeout = timeout
         self._close_on_error(partial(super().__init__, context="spawn", **settings), makers)
 
     def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
         """As Gymnasium's."""
-        return self._close_on_error(partial(super().reset, **arguments))
+        self._close_on_error(partial(self.reset_async, **arguments))
+        return self._close_on_error(self.reset_wait, self._timeout)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """As Gymnasium's."""
-        return self._close_on_error(super().step, actions)
+        self._close_on_error(self.step_async, actions)
+        return self._close_on_error(self.step_wait, self._timeout)
 
     def close_extras(self, timeout: float | None = None, terminate: bool = True) -> None:
         """End the processes; there is nothing that they would have to write."""
         processes = getattr(self, "processes", ())  # none where a setting was refused
         for process in processes:
-            process.terminate()
+            process.kill()  # also one that is stopped
         for process in processes:
             process.join()
 
     def _close_on_error(self, call: Callable[..., Any], *arguments: Any) -> Any:
         try:
             return call(*arguments)
+        except NoAnswerError as error:
+            number = next(n for n, pipe in enumerate(self.parent_pipes) if not pipe.poll())
+            self.close()
+            raise ShiftsimError(
+                f"environment {number} has not answered for {self._timeout:g} s",
+                hint="its process is stopped or busy; a longer `timeout` waits for it",
+            ) from error
         except (EOFError, ConnectionError) as error:
             ended = wait([process.sentinel for process in self.processes], timeout=5.0)
             number = next(n for n, one in enumerate(self.processes) if one.sentinel in ended)

@@ -243,7 +243,7 @@ def parse_argument(text: str, planners: tuple[str, ...]) -> tuple[str, str, Valu
     name = key[len(planner) + 1 :] if named else key
     try:
         value = tomllib.loads(f"value = {raw}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         value = raw
     return planner, name, value
 

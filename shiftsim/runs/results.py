@@ -23,7 +23,7 @@ _MANIFEST = {  # what is read of it, and its type
     **dict.fromkeys(("config", "counts", "determining", "determining.planners"), dict),
     **dict.fromkeys(("determining.store", "determining.traffic", "determining.controller"), str),
     "determining.metric_version": str,
-    "config.planners": list,
+    **dict.fromkeys(("config.planners", "config.noise", "config.seeds"), list),
     "determining.thresholds.name": str,
 }
 
@@ -159,4 +159,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
                 f"{str(path)!r} cannot be read: {key!r} is missing or no {kind.__name__}",
                 hint="make the run again",
             )
+    named, found = manifest["config"]["planners"], manifest["determining"]["planners"]
+    if not all(isinstance(name, str) for name in named) or not all(
+        isinstance(about, dict) for about in found.values()
+    ):
+        what = f"{str(path)!r} cannot be read: its planners are no names with what they are"
+        raise DataError(what, hint="make the run again")
     return manifest

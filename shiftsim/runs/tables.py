@@ -175,10 +175,12 @@ def _batches(path: Path) -> Iterator[pa.RecordBatch]:
     """A table part by part, with columns of the right types and numbers within their ranges."""
     try:
         file = pq.ParquetFile(path)
+        names = file.schema_arrow.names
         types = {column.name: column.type for column in file.schema_arrow}
         for column in TABLES[path.stem]:
-            if types.get(column.name) != column.type:
-                raise damaged(path, f"column {column.name!r} is missing or not {column.type}")
+            if types.get(column.name) != column.type or names.count(column.name) > 1:
+                what = f"column {column.name!r} is missing, there twice or not {column.type}"
+                raise damaged(path, what)
         for batch in file.iter_batches(batch_size=4096):
             batch.validate(full=True)  # that texts are UTF-8
             for name in set(_RANGES) & set(batch.schema.names):

@@ -257,7 +257,7 @@ def map_on_cluster(
             hint="start one with `dask scheduler`, and workers with `dask worker ADDRESS`",
         ) from error
     job = uuid4().hex
-    work = partial(_work, job, pickle.dumps((sys.path, pickle.dumps(make), limit, in_batches)))
+    work = partial(_work, job, pickle.dumps((packed(make), limit, in_batches)))
     waiting: deque[Any] = deque(tasks)
     pending: dict[Any, Any] = {}  # future -> task
     done, window = 0, 1
@@ -293,9 +293,10 @@ def _work(job: str, payload: bytes, task: Any) -> list[Outcome[Any, Any]]:
     if key not in _POOLS:
         for other in [other for other in _POOLS if other[1] == key[1]]:
             _POOLS.pop(other).close()  # of a run whose main process was killed
-        paths, make, limit, in_batches = pickle.loads(payload)
+        given, limit, in_batches = pickle.loads(payload)
+        paths, folders, make = pickle.loads(given)
         here = [*sys.path, *(path for path in paths if path not in sys.path)]
-        _POOLS[key] = Pool(pickle.dumps((here, make)), 1, limit, in_batches=in_batches)
+        _POOLS[key] = Pool(pickle.dumps((here, folders, make)), 1, limit, in_batches=in_batches)
     return list(_POOLS[key].run([task], 0))
 
 

@@ -13,7 +13,7 @@ from threading import Event, Lock, Thread
 from time import monotonic
 from types import TracebackType
 from typing import Any, NamedTuple
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 import numpy as np
 
@@ -221,7 +221,8 @@ class _Handler(LocalHandler):
 
     def do_GET(self) -> None:
         """The page, what it shows, or one of the replays that it names."""
-        url = urlsplit(self.path)
+        if (url := self.url()) is None:
+            return
         given = self.headers.get(TOKEN_HEADER) or parse_qs(url.query).get("token", [""])[0]
         if not self.may(given):
             return

@@ -11,6 +11,7 @@ import secrets
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
+from urllib.parse import SplitResult, urlsplit
 
 HOST = "127.0.0.1"
 TOKEN_HEADER = "X-Shiftsim-Token"
@@ -55,6 +56,15 @@ class LocalHandler(BaseHTTPRequestHandler):
     server_version = "shiftsim"
     sys_version = ""
     protocol_version = "HTTP/1.1"
+    timeout = 60.0  # s, for a request that never ends
+
+    def url(self) -> SplitResult | None:
+        """What is asked for; None where it is no address, which is answered."""
+        try:
+            return urlsplit(self.path)
+        except ValueError as error:
+            self.refuse(HTTPStatus.BAD_REQUEST, f"not an address: {error}")
+            return None
 
     def may(self, given: str) -> bool:
         """Whether the request comes from our own page; else it is refused."""

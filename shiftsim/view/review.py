@@ -10,7 +10,7 @@ from http import HTTPStatus
 from pathlib import Path
 from threading import Lock
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 import numpy as np
 
@@ -173,7 +173,7 @@ def _checked_route(route: Any, recorded: Scenario) -> tuple[str, ...] | None:
     if route is None:
         return None
     known = recorded.map.blocks.index
-    if not isinstance(route, list) or not route or not all(name in known for name in route):
+    if not _is_route(route) or not route or not all(name in known for name in route):
         raise ConfigError("a route is a list of roadblocks of the map, or null")
     return None if tuple(route) == recorded.route else tuple(route)
 
@@ -225,7 +225,8 @@ class _Handler(LocalHandler):
 
     def do_GET(self) -> None:
         """The page, the list of scenarios, or one of them."""
-        url = urlsplit(self.path)
+        if (url := self.url()) is None:
+            return
         query = parse_qs(url.query)
         given = self.headers.get(TOKEN_HEADER) or query.get("token", [""])[0]
         if not self.may(given if url.path == "/" else self.headers.get(TOKEN_HEADER, "")):
@@ -248,7 +249,9 @@ class _Handler(LocalHandler):
         if body is None:
             return
         token, values = str(body.get("token", "")), body.get("values")
-        path = urlsplit(self.path).path
+        if (url := self.url()) is None:
+            return
+        path = url.path
         if path == "/api/review" and isinstance(values, dict):
             self._work(lambda service: service.keep(token, values))
         elif path == "/api/route" and _is_route(values):
@@ -258,12 +261,15 @@ class _Handler(LocalHandler):
 
     def _body(self) -> dict[str, Any] | None:
         length = self.headers.get("Content-Length", "")
-        if not length.isdecimal() or int(length) > MAX_BODY:
+        if not length.isdecimal():
+            self.refuse(HTTPStatus.BAD_REQUEST, "the request has no Content-Length")
+            return None
+        if len(length) > 9 or int(length) > MAX_BODY:
             self.refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "the request is too long")
             return None
         try:
             body = json.loads(self.rfile.read(int(length)))
-        except ValueError:
+        except (ValueError, RecursionError):
             body = None
         if not isinstance(body, dict):
             self.refuse(HTTPStatus.BAD_REQUEST, "the request is not a JSON object")

@@ -136,6 +136,20 @@ def test_a_process_that_dies_is_one_clear_error(toy):
 
 
 @pytest.mark.slow
+def test_a_process_that_is_stopped_is_one_clear_error_in_time(toy):
+    envs = DrivingVectorEnv(2, num_workers=2, store=str(toy), observation="none", timeout=60.0)
+    envs.reset(seed=0)
+    envs._timeout = 0.5  # what is compiled is compiled
+    processes = multiprocessing.active_children()
+    os.kill(envs.processes[1].pid, signal.SIGSTOP)
+    with pytest.raises(ShiftsimError, match=r"environment 1 has not answered for 0\.5 s"):
+        envs.step(np.zeros((2, 2)))
+    with pytest.raises(ClosedEnvironmentError):
+        envs.step(np.zeros((2, 2)))
+    assert not any(process.is_alive() for process in processes)
+
+
+@pytest.mark.slow
 def test_an_error_in_a_process_is_that_error(toy):
     envs = DrivingVectorEnv(2, num_workers=2, store=str(toy), observation="none")
     envs.reset(seed=0)

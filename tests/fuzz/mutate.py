@@ -20,6 +20,7 @@ NUMBERS = (
     *(-1, 0, 1, 2**31, 2**53 + 1, 2**63 - 1, 2**63, 10**30),
 )
 TEXTS = ("", " ", "x", "nan", "-1", "../..", "\u202e\U0001f697", "a" * 100_000, "9" * 5_000)
+DEEP = "[" * 20_000 + "]" * 20_000
 WHOLE = (-1, 0, 1, 127, 10**4, 2**31 - 1, 2**53 + 1, 2**63 - 1, -(2**63))
 _TOKEN = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][+-]?\d+)?")
 _QUOTED = re.compile(rb"\"[^\"\n]*\"")
@@ -73,7 +74,8 @@ def _text(path: Path, random: Random) -> str:
     if spot[0].startswith(b'"'):
         new = json.dumps(random.choice((*TEXTS, *map(str, NUMBERS))))
     else:
-        new = str(random.choice((*NUMBERS, "", "true", '"x"', "[]", "{}", "null", "1979-05-27")))
+        words = ("", "true", '"x"', "[]", "{}", "null", "1979-05-27", "9" * 5_000, DEEP)
+        new = str(random.choice((*NUMBERS, *words)))
     path.write_bytes(data[: spot.start()] + new.encode() + data[spot.end() :])
     return f"{spot[0][:40]!r} -> {new[:40]!r}"
 
@@ -146,6 +148,10 @@ def change_value(content: Any, random: Random) -> str:
         deep = [deep]
     new = random.choice((*NUMBERS, *TEXTS, None, True, [], {}, [1, "x", None], {"x": -1}, deep))
     kind = random.random()
+    if isinstance(node[key], dict) and kind > 0.7:
+        new = [*node[key]]  # the names alone
+    elif isinstance(node[key], list) and kind > 0.7:
+        new = [[item] for item in node[key]]
     if kind < 0.15:
         del node[key]
         return f"{key!r} away"
@@ -254,8 +260,10 @@ def _table(table: pa.Table, random: Random) -> tuple[pa.Table, str]:
     name = random.choice(table.column_names)
     index, kind = table.column_names.index(name), random.random()
     field = table.schema.field(index)
-    if kind < 0.06:
+    if kind < 0.05:
         return table.drop_columns([name]), f"{name} away"
+    if kind < 0.07:
+        return table.append_column(field, table[name]), f"{name} twice"
     if kind < 0.12:
         other = random.choice((pa.string(), pa.int64(), pa.float64(), pa.float32()))
         if pa.types.is_list(field.type) and random.random() < 0.7:
@@ -289,6 +297,7 @@ def _table(table: pa.Table, random: Random) -> tuple[pa.Table, str]:
     else:
         values[row] = _like(old, random)
         what += f" = {str(values[row])[:30]}"
+    field = field.with_nullable(True)
     return table.set_column(index, field, pa.array(values, field.type)), what
 
 
@@ -340,6 +349,8 @@ def _header(path: Path, random: Random) -> str:
     end = 8 + int.from_bytes(data[:8], "little")
     header = json.loads(data[8:end])
     what = change_value(header, random)
+    if random.random() < 0.2:
+        header["__metadata__"], what = {"args": DEEP}, "deep args"
     new = json.dumps(header).encode()
     path.write_bytes(len(new).to_bytes(8, "little") + new + data[end:])
     return what

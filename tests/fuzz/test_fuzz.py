@@ -4,17 +4,21 @@
 """
 
 import json
+import shutil
 import subprocess
 import sys
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from random import Random
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
-from fuzz.mutate import damage
-from fuzz.server import CORPUS, run_case
+from fuzz.mutate import DEEP, damage
+from fuzz.server import CORPUS, run_case, seeds_of
 from fuzz.targets import TARGETS, Target
 from worlds import cruise_scenario, straight_road
 
@@ -42,6 +46,67 @@ def outcomes(*arguments: object) -> Counter[str]:
 @pytest.mark.thorough
 def test_what_once_failed_is_read_or_refused():
     assert outcomes().total() == sum(1 for _ in CORPUS.glob("*/*"))
+
+
+def _twice(path, name):
+    table = pq.read_table(path)
+    with pq.ParquetWriter(path, table.append_column(name, table[name]).schema) as writer:
+        writer.write_table(table.append_column(name, table[name]))
+
+
+def _null(path, name):
+    table = pq.read_table(path)
+    kind = table[name].type
+    hole = pa.chunked_array([pa.array([None, *table[name].to_pylist()[1:]], kind)])
+    index = table.column_names.index(name)
+    pq.write_table(table.set_column(index, pa.field(name, kind), hole), path)
+
+
+def _planners(path, where, value):
+    content = json.loads(path.read_text())
+    content[where]["planners"] = value
+    path.write_text(json.dumps(content))
+
+
+def _deep_args(path, _):
+    data = path.read_bytes()
+    end = 8 + int.from_bytes(data[:8], "little")
+    header = json.loads(data[8:end]) | {"__metadata__": {"args": DEEP}}
+    new = json.dumps(header).encode()
+    path.write_bytes(len(new).to_bytes(8, "little") + new + data[end:])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("target", "seed", "file", "change"),
+    [
+        ("settings", "run", "run.toml", lambda path: path.write_text(f"limit = {DEEP}")),
+        ("settings", "run", "run.toml", lambda path: path.write_text("limit = " + "9" * 5000)),
+        ("dsc3d", "site", "annotations.parquet", partial(_twice, name="translation_x")),
+        ("dsc3d", "site", "frames.parquet", partial(_twice, name="frame_id")),
+        ("run-folder", "run", "scores.parquet", partial(_twice, name="noise")),
+        ("run-folder", "run", "part-*.parquet", partial(_null, name="planning_seconds")),
+        ("run-folder", "run", "part-*.parquet", partial(_null, name="degraded")),
+        (
+            *("run-folder", "run", "manifest.json"),
+            partial(_planners, where="config", value=[["constant-velocity"]]),
+        ),
+        (
+            *("run-folder", "run", "manifest.json"),
+            partial(_planners, where="determining", value={"constant-velocity": ["x"]}),
+        ),
+        pytest.param(
+            *("checkpoint", "safetensors", "model.safetensors", partial(_deep_args, _=0)),
+            marks=pytest.mark.learned,
+        ),
+    ],
+)
+def test_what_was_once_a_traceback_is_refused(target, seed, file, change):
+    with seeds_of(target) as (seeds, place):
+        folder = next(found for found in seeds if found.name == seed)
+        case = shutil.copytree(folder, place / "case")
+        change(next(case.rglob(file)))
+        assert run_case(target, case)[0] == "refused"
 
 
 @pytest.mark.thorough

@@ -233,3 +233,32 @@ def test_a_full_disk_is_reported_and_what_was_kept_stays(server, store, monkeypa
     assert "No space left" in text
     assert listing["scenarios"][0]["decision"] == "accept"
     assert json.loads((store / REVIEW).read_text())["decision"] == "accept"
+
+
+@pytest.mark.parametrize(
+    ("path", "body"),
+    [
+        ("/api/review", b"[" * 100_000),
+        ("/api/review", b"9" * 5000),
+        ("/api/review", b"\xff"),
+        ("/api/review", {"token": FIRST, "values": {"route": [["1"]]}}),
+        ("/api/review", {"token": FIRST, "values": {"route": [{}]}}),
+        ("/api/review", {"token": FIRST, "values": {"decision": []}}),
+        ("/api/review", {"token": [FIRST], "values": {}}),
+        ("/api/route", {"token": {}, "values": ["1"]}),
+    ],
+)
+def test_a_malformed_request_is_answered(server, path, body):
+    status, text = ask(server, "POST", path, body)
+    assert status == 400
+    assert json.loads(text)["error"]
+
+
+@pytest.mark.parametrize("path", ["http://[/", "http://[::1"])
+def test_a_malformed_address_is_answered(server, path):
+    assert ask(server, "GET", path)[0] == 400
+
+
+def test_a_request_without_a_length_is_answered(server):
+    assert ask(server, "POST", "/api/review")[0] == 400
+    assert ask(server, "POST", "/api/review", **{"Content-Length": "9" * 5000})[0] == 413

@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 from shiftsim.data.store.tables import write_blocks
 from shiftsim.errors import DataError
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.rollouts.columns import STATES, TRACKS
+from shiftsim.runs.rollouts.columns import NOISE_COLUMNS, STATES, TRACKS
 
 FOLDER = "rollouts"
 _PART = re.compile(r"part-(\d+)\.parquet")
@@ -66,7 +66,15 @@ class RolloutReader:
             rows = self._rows.slice(first, location.rows).combine_chunks()
             if len(rows) != location.rows:
                 raise IndexError(f"rows {location.row} and after are cut off")
-            return rows.to_batches()[0]
+            batch = rows.to_batches()[0]
+            noise = {batch[name].null_count for name in NOISE_COLUMNS}
+            for name, column in zip(batch.schema.names, batch.columns, strict=True):
+                nulls = column.null_count
+                if pa.types.is_list(column.type):
+                    nulls += column.flatten().null_count
+                if nulls and not (name in NOISE_COLUMNS and noise == {len(batch)}):
+                    raise ValueError(f"column {name!r} holds {nulls} nulls")
+            return batch
         except (OSError, ValueError, TypeError, IndexError, pa.ArrowException) as error:
             raise DataError(
                 f"{str(location.file)!r} cannot be read: {error}", hint="make the run again"

@@ -10,11 +10,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import shapely
+import stores
+from worlds import straight_road
 
 from shiftsim.data.nuplan.export import export_nuplan
 from shiftsim.data.nuplan.export_log import cut_of
 from shiftsim.data.nuplan.export_map import write_nuplan_map
 from shiftsim.data.nuplan.map import read_map
+from shiftsim.data.store.reading import ScenarioStore
+from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import ConversionError, DataError
 from shiftsim.world.layers import make_lists
 
@@ -349,3 +353,22 @@ def test_layers_in_several_or_unknown_systems_are_refused(trip, tmp_path):
             gpkg.commit()
         with pytest.raises(DataError, match=message):
             read_map(path, "us-ma-boston")
+
+
+class ShortWindows(StoreWriter):
+    """Writes windows that end with their last iteration."""
+
+    def add_window(self, window):
+        super().add_window(replace(window, last_row=int(window.iteration_rows[-1]) + 1))
+
+
+def test_logs_that_go_on_behind_the_window_are_counted(tmp_path):
+    with ShortWindows(tmp_path / "short") as writer:
+        writer.add_map(straight_road())
+        stores._add(writer, 0, stores.ITERATIONS)
+    stores.write_toy_store(tmp_path / "toy", count=1)
+    longer = [
+        export_nuplan(ScenarioStore(tmp_path / name), tmp_path / f"out-{name}").longer
+        for name in ("toy", "short")
+    ]
+    assert longer == [0, 1]

@@ -226,3 +226,15 @@ def test_the_set_of_a_filter_is_read_from_its_file(log_path: Path, tmp_path: Pat
     )
     path.write_text(line)  # without a share it is off
     assert read_filter(path).token_set is None
+
+
+def test_a_conversion_of_all_says_how_many_there_will_be_and_what_limits_them(tmp_path, caplog):
+    report = convert_nuplan(GOLDEN / "logs", MAPS, tmp_path / "all")
+    said = [text for text in caplog.messages if "will be made" in text]
+    count = len(report.converted) + len(report.failed)
+    assert len(said) == 1
+    assert said[0].startswith(f"{count} scenarios of ")
+    assert "--types, --tokens or --filter takes fewer" in said[0]
+    caplog.clear()
+    convert_nuplan(GOLDEN / "logs", MAPS, tmp_path / "one", tokens=[report.converted[0]])
+    assert not [text for text in caplog.messages if "will be made" in text]

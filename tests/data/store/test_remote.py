@@ -1,13 +1,17 @@
 """Stores behind a URL; the local file system stands for any that pyarrow knows."""
 
+import json
 import shutil
+from time import monotonic
 
 import numpy as np
 import pytest
+from commands import call
 from stores import write_toy_store
 
 import shiftsim
 from shiftsim.data.store.reading import open_store
+from shiftsim.data.store.review import Review, Reviews, write_reviews
 from shiftsim.errors import DataError
 
 TOKEN = "0001cafe"
@@ -108,3 +112,48 @@ def test_a_url_that_leads_nowhere_is_named(url, monkeypatch, tmp_path):
     monkeypatch.setenv("SHIFTSIM_CACHE", str(tmp_path))
     with pytest.raises(DataError, match=url):
         open_store(url)
+
+
+def test_what_the_source_no_longer_has_is_removed_from_the_copy(remote):
+    folder, url = remote
+    review = write_reviews(folder, Reviews([Review(TOKEN, route=("1",))]))
+    (folder / "filter").mkdir()
+    (folder / "filter" / "results.parquet").touch()
+    copy = open_store(url).path
+    assert open_store(url).read(TOKEN).route == ("1",)
+    review.unlink()
+    shutil.rmtree(folder / "filter")
+    (folder / "splits" / "small.toml").unlink()
+    assert open_store(url).read(TOKEN).route == open_store(folder).read(TOKEN).route
+    assert not open_store(url).is_reviewed
+    overlays = [path for name in ("review", "filter", "splits") for path in (copy / name).glob("*")]
+    assert overlays == []
+
+
+def test_stores_that_claim_one_hash_share_no_copy(remote, tmp_path):
+    folder, url = remote
+    other = shutil.copytree(folder, tmp_path / "elsewhere" / "toy")
+    manifest = json.loads((folder / "store.json").read_text())
+    changed = shutil.copytree(folder, tmp_path / "changed" / "toy")
+    (changed / "store.json").write_text(json.dumps(manifest | {"generator": {"name": "x"}}))
+    paths = {open_store(f"file://{place}").path for place in (folder, other, changed)}
+    assert len(paths) == 3
+    assert open_store(url).path in paths
+
+
+def test_a_store_behind_a_url_is_not_reviewed_in_its_copy(remote, tmp_path):
+    _, url = remote
+    asked = call(tmp_path, "inspect", url)
+    assert asked.returncode == 1
+    assert "is behind a URL" in asked.stderr
+
+
+@pytest.mark.slow
+def test_without_a_network_a_url_of_google_ends_soon_and_in_one_line(tmp_path):
+    # where there is a network, there is no such store either
+    begin = monotonic()
+    asked = call(tmp_path, "check", "gs://shiftsim-no-such-bucket-7f3a/store")
+    assert asked.returncode != 0
+    assert "Traceback" not in asked.stderr
+    assert len(asked.stderr.splitlines()) == 2  # what, and a hint
+    assert monotonic() - begin < 15  # imports included
