@@ -147,14 +147,14 @@ def _driven_route(lanes: Lanes, intersections: Polygons, poses: FloatArray, out:
             if i > 1 and counts[i - 1] > 0 and lists[i - 1, 0] >= lanes.num_lanes:
                 in_crossing = count > 0 and lists[i, 0] >= lanes.num_lanes
                 if in_crossing or (count == 0 and in_any(intersections, x, y)):
-                    kept = 0
+                    num_left = 0
                     for index in range(counts[i - 1]):
                         edge = lists[i - 1, index]
                         if distance_to(lanes.polygons, edge, x, y) < _KEEP_DISTANCE:
-                            lists[i, kept] = edge
-                            kept += 1
+                            lists[i, num_left] = edge
+                            num_left += 1
                     # nuPlan rule 69: an empty selection leaves the list as it was found
-                    count = kept if kept > 0 else count
+                    count = num_left if num_left > 0 else count
         counts[i] = count
     # then the list of each sample is narrowed down by that of the next one, from the end on
     for i in range(len(counts) - 2, -1, -1):
@@ -176,12 +176,12 @@ def _driven_route(lanes: Lanes, intersections: Polygons, poses: FloatArray, out:
         if size > 0 and after[0] < lanes.num_lanes:
             incoming = lanes.incoming
             leading = incoming.items[incoming.ptr[after[0]] : incoming.ptr[after[0] + 1]]
-            kept = 0
+            num_left = 0
             for index in range(count):
                 if has(leading, len(leading), original[index]):
-                    lists[i, kept] = original[index]
-                    kept += 1
-            counts[i] = kept if kept > 0 else counts[i]
+                    lists[i, num_left] = original[index]
+                    num_left += 1
+            counts[i] = num_left if num_left > 0 else counts[i]
     return -1
 
 

@@ -28,6 +28,9 @@ _GIVEN = (
     *(layers.Layer, layers.Polygons, layers.Polylines, layers.Lists),
     *(state.Tracks, state.TrafficLights, state.VehicleParameters),
 )
+# how many values answer what is asked
+_PARTS = {("done", "make"): 2, ("done", "map"): 0, ("done", "reset"): 0, ("done", "plan"): 2}
+_PARTS |= {("failed", verb): 3 for _, verb in _PARTS}
 _RETURNED = {kind.__name__: kind for kind in (Trajectory, Command)}
 
 
@@ -46,6 +49,7 @@ class Isolated:
         self._process: Process | None = None
         self._map: VectorMap | None = None
         self._about: Any = None
+        self._asked = 0  # number of the last message
 
     def __reduce__(self) -> Any:
         return Isolated, self._given
@@ -108,23 +112,33 @@ class Isolated:
         return plan
 
     def _ask(self, verb: str, value: object) -> Any:
+        """What the child answers; it is ended, and started anew, where that is no answer."""
         process = self._process
         assert process is not None
+        self._asked += 1
         try:
-            stub.write(process.connection, (verb, value))
-            state, answer = stub.read(process.connection, _RETURNED)
-        except (OSError, EOFError, TypeError, ValueError) as error:
+            stub.write(process.connection, (self._asked, verb, value))
+            number, state, answer = stub.read(process.connection, _RETURNED)
+            parts = () if answer is None else tuple(answer)
+            if number != self._asked or len(parts) != _PARTS[state, verb]:
+                raise ValueError("a message that answers nothing")
+        except BaseException as error:  # an interrupt leaves a message under way as well
             process.kill()
+            end = process.end()
+            if not isinstance(error, Exception):
+                raise
+            if not isinstance(error, (EOFError, ConnectionError)):
+                end = f"was ended: it sent what cannot be read ({error})"
             raise PlannerError(
-                f"the process of planner {self.name!r} {process.end()}",
+                f"the process of planner {self.name!r} {end}",
                 hint="what it wrote to the standard error may say why",
             ) from error
         if state == "failed":
-            text, hint, trace = answer
+            text, hint, trace = map(str, parts)
             failure = PlannerError(text, hint)
             failure.add_note(f"in the process of planner {self.name!r}:\n{trace}")
             raise failure
-        return answer
+        return parts
 
     def close(self) -> None:
         """End the process, once its planner has released what it holds."""

@@ -50,12 +50,12 @@ def load_planner(spec: str, arguments: Mapping[str, Any] | None = None) -> Plann
     """
     factory = planner_factory(spec)
     values = _bind(spec, factory, arguments or {})
-    planner = _made(spec, lambda: factory(**values))
+    planner = _construct(spec, lambda: factory(**values))
     _require_methods(spec, planner)
     return cast(Planner, planner)
 
 
-def _made(name: str, make: Callable[[], Any]) -> Any:
+def _construct(name: str, make: Callable[[], Any]) -> Any:
     try:
         return make()
     except ShiftsimError:
@@ -237,7 +237,7 @@ def run_planner(source: Any, arguments: Mapping[str, Any]) -> RunPlanner:
     else:
         fingerprint = _object_fingerprint(source, arguments)
     found = RunPlanner(name, source, arguments, fingerprint)
-    planner = _made(name, lambda: found.prototype.planner)
+    planner = _construct(name, lambda: found.prototype.planner)
     _require_methods(name, planner)
     if sees_recording(planner):
         found.fingerprint = {**fingerprint, "sees_recording": True}

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 _KINDS = "biuf"  # of arrays that can be sent
+LONGEST = 2**30  # bytes of a part of a message
 
 
 def write(connection: Any, value: Any) -> None:
@@ -37,7 +38,7 @@ def write(connection: Any, value: Any) -> None:
 
 def read(connection: Any, classes: Any) -> Any:
     """What was sent; `classes` makes records, by name."""
-    return _unpack(json.loads(connection.recv_bytes()), connection, classes)
+    return _unpack(json.loads(connection.recv_bytes(LONGEST)), connection, classes)
 
 
 def _pack(value: Any, arrays: Any) -> Any:
@@ -73,7 +74,7 @@ def _unpack(tree: Any, connection: Any, classes: Any) -> Any:
         kind, shape = np.dtype(content[0]), tuple(content[1])
         if kind.kind not in _KINDS:
             raise ValueError("an array of " + content[0])
-        return np.ndarray(shape, kind, connection.recv_bytes())  # read-only, as bytes are
+        return np.ndarray(shape, kind, connection.recv_bytes(LONGEST))  # read-only, as bytes are
     if sign == "%":
         pairs = [[_unpack(item, connection, classes) for item in pair] for pair in content]
         return dict(pairs)
@@ -190,10 +191,10 @@ def _main() -> None:
     connection: Any = Connection(handle)
     os.dup2(2, 1)  # what the planner prints is not the output of the command
     make: Any = None
-    classes = planner = road = make
+    classes = planner = road = number = make
     while True:
         try:
-            verb, value = read(connection, classes or {})
+            number, verb, value = read(connection, classes or {})
         except EOFError:
             return _close(planner)
         try:
@@ -222,12 +223,12 @@ def _main() -> None:
                 planner.reset(value)
             else:
                 answer = (planner.plan(value), str(getattr(planner, "degraded", "")))
-            write(connection, ("done", answer))
+            write(connection, (number, "done", answer))
         except (Exception, SystemExit) as error:
             hint = getattr(error, "hint", None)
             kind = "" if isinstance(hint, str) else type(error).__name__ + ": "
             text = traceback.format_exc()
-            write(connection, ("failed", (kind + str(error), hint or "", text)))
+            write(connection, (number, "failed", (kind + str(error), hint or "", text)))
 
 
 if __name__ == "__main__":

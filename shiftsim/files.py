@@ -128,8 +128,10 @@ def lock(path: Path) -> BinaryIO:
     Raises:
         BlockingIOError: Another process has it.
     """
-    file = path.open("a+b", buffering=0)
-    if sys.platform != "win32":
+    while True:
+        file = path.open("a+b", buffering=0)
+        if sys.platform == "win32":
+            return file
         import fcntl
 
         try:
@@ -139,7 +141,10 @@ def lock(path: Path) -> BinaryIO:
             raise
         except OSError:
             pass  # a file system without locks
-    return file
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                return file
+        file.close()  # who had it has removed it since it was opened
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -99,6 +99,8 @@ def readonly(array: Any) -> Any:
 
     NumPy before 2.1 is given a copy of what could be written.
     """
+    if not (array.flags.writeable or array.base is None or isinstance(array.base, np.ndarray)):
+        return array  # it is one
     view = array.view() if _KEEPS_READ_ONLY or not array.flags.writeable else array.copy()
     view.flags.writeable = False
     return np.from_dlpack(view) if _KEEPS_READ_ONLY else np.asarray(memoryview(view))

@@ -276,8 +276,8 @@ def read_rows(
     rowids = np.array([row[-1] for row in found], np.int64)
     place = by_place[np.searchsorted(log.rowids, rowids, sorter=by_place)]
     inside = (place >= first) & (place < last)
-    kept = [row[:-1] for row, good in zip(found, inside.tolist(), strict=True) if good]
-    return place[inside], kept
+    values = [row[:-1] for row, good in zip(found, inside.tolist(), strict=True) if good]
+    return place[inside], values
 
 
 def read_lights(log: Log, first: int, last: int, flaws: Counter[str]) -> TrafficLights:

@@ -66,9 +66,9 @@ def _limit(
         return {}
     untagged = by_type.get(UNTAGGED, [])
     if total - wanted < len(untagged):
-        kept = len(untagged) - (total - wanted)
-        _refuse_draw(chosen, "limit_total_scenarios", kept, len(untagged))
-        return by_type | {UNTAGGED: _every_nth(untagged, kept)}
+        num_left = len(untagged) - (total - wanted)
+        _refuse_draw(chosen, "limit_total_scenarios", num_left, len(untagged))
+        return by_type | {UNTAGGED: _every_nth(untagged, num_left)}
     tagged = [e for kind, found in by_type.items() if kind != UNTAGGED for e in found]
     _refuse_draw(chosen, "limit_total_scenarios", wanted, len(tagged))
     out: dict[str, list[ScenarioEntry]] = {}

@@ -123,10 +123,10 @@ def offered(
     kinds = log.types if types is None else read_types(log, types)
     return [
         ScenarioEntry(token, kind, log.name, log.map_name, time_us)
-        for token, kind, time_us, kept in zip(
+        for token, kind, time_us, is_allowed in zip(
             log.tokens, kinds, log.time_us.tolist(), keep, strict=True
         )
-        if kept and (tokens is None or token in tokens) and (types is None or kind in types)
+        if is_allowed and (tokens is None or token in tokens) and (types is None or kind in types)
     ]
 
 

@@ -211,19 +211,19 @@ class _Stage:
     def __call__(self, name: str) -> DataError | None:
         """Convert one recording; the folder appears when it is complete."""
         # A process that outlives a killed conversion writes beside its successor, never into it.
-        draft = Path(tempfile.mkdtemp(prefix=".", dir=self.work))
+        temp_path = Path(tempfile.mkdtemp(prefix=".", dir=self.work))
         try:
-            self._write(name, draft)
+            self._write(name, temp_path)
         except DataError as error:
             return error
         except MemoryError:
             what = f"{name}: it does not fit into memory"
             return ConversionError(what, "split the recording, or use less workers")
         finally:
-            shutil.rmtree(draft, ignore_errors=True)
+            shutil.rmtree(temp_path, ignore_errors=True)
         return None
 
-    def _write(self, name: str, draft: Path) -> None:
+    def _write(self, name: str, temp_path: Path) -> None:
         reader, key = self.reader, self.keys[name]
         source = reader.read(name)
         if reader.site is None:  # there is no report that could hold the key
@@ -232,11 +232,11 @@ class _Stage:
         if source.needs_scenario:
             require_scenarios(converted.summary, reader.source)
         if converted.windows:
-            write_recording(draft / _FILES, converted.recording)
+            write_recording(temp_path / _FILES, converted.recording)
             for ego in converted.egos:
-                write_ego(draft / _FILES, ego)
+                write_ego(temp_path / _FILES, ego)
             if reader.site is None:
-                write_map(draft / _MAP, source.map.road)
+                write_map(temp_path / _MAP, source.map.road)
         content = {
             "city": city,
             "log_name": converted.recording.log_name,
@@ -244,9 +244,9 @@ class _Stage:
             "entry": {"key": key, "summary": asdict(converted.summary), **source.details},
             "map_warnings": {} if reader.site is not None else dict(source.map.warnings),
         }
-        (draft / _PART).write_text(json.dumps(content), "utf-8")
+        (temp_path / _PART).write_text(json.dumps(content), "utf-8")
         shutil.rmtree(self.folder(name), ignore_errors=True)
-        os.replace(draft, self.folder(name))
+        os.replace(temp_path, self.folder(name))
 
 
 def _key(reader: Reader, name: str) -> str:

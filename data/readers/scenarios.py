@@ -116,12 +116,12 @@ def convert_recording(source: SourceRecording) -> Converted:
             last_row=max(map(sum, zip(starts, lengths, strict=True))) + padding,
             padding=padding,
         )
-        made = [
+        results = [
             _scenario(source, samples, config, run, number, windows[number].span, trace)
             for number in numbers
         ]
-        rejected.update(window for window in made if isinstance(window, str))
-        usable = [window for window in made if isinstance(window, Window)]
+        rejected.update(window for window in results if isinstance(window, str))
+        usable = [window for window in results if isinstance(window, Window)]
         if usable:
             scenarios += usable
             traces.append(trace)

@@ -156,9 +156,9 @@ def _check_recording(
     where, city, duration, tracks = f"recording {name}", scenarios[0]["city"], 0.0, 0
     try:
         recording = store.recording(name)
-        time_us = column(recording.frames.read(columns=["time_us"], plausible=False), "time_us")
+        time_us = column(recording.frames.read(columns=["time_us"], validate=False), "time_us")
         duration = float(time_us[-1] - time_us[0]) / 1e6
-        boxes = recording.tracks.read(plausible=False).sort_by(
+        boxes = recording.tracks.read(validate=False).sort_by(
             [("track", "ascending"), ("row", "ascending")]
         )
         tracks = len(boxes["track"].unique())
@@ -166,14 +166,14 @@ def _check_recording(
         for ego in sorted({row["ego"] for row in scenarios}):
             table = store.ego(name, ego)
             first, last = ego_span(table)
-            states = ego_states(table, first, last, plausible=False)
+            states = ego_states(table, first, last, validate=False)
             add(f"{where}, ego {ego}", _check_ego(states, time_us[first:last]))
     except DataError as error:
         add(where, [("file", error.message, error.hint)])
     for row in scenarios:
         where = f"scenario {row['token']}"
         try:
-            scene = store.read(row["token"], plausible=False)
+            scene = store.read(row["token"], validate=False)
             add(where, _check_scenario(scene))
             if row["city"] in overlaps:
                 add(where, _check_lanes(scene, overlaps[row["city"]]))

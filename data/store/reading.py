@@ -130,16 +130,16 @@ class ScenarioStore:
         require_rows(window, str(self._file))
         return window
 
-    def read(self, token: str, *, plausible: bool = True) -> Scenario:
+    def read(self, token: str, *, validate: bool = True) -> Scenario:
         """One scenario with its map; nothing of other scenarios is read. Arrays are read-only.
 
         A route that was corrected in the review takes the place of the recorded one.
 
         Raises:
             DataError: The store has no such scenario, or a file is missing or damaged, or, where
-                `plausible` is asked for, holds a number outside of its range.
+                `validate` is asked for, holds a number outside of its range.
         """
-        scenario = self.read_recorded(token, plausible=plausible)
+        scenario = self.read_recorded(token, validate=validate)
         review = self.reviews.get(token) if self.is_reviewed else None
         if review is None or review.route is None:
             return scenario
@@ -148,19 +148,19 @@ class ScenarioStore:
         require_blocks(scenario.map, review, str(self.path / tables.REVIEW))
         return replace(scenario, route=review.route)
 
-    def read_recorded(self, token: str, *, plausible: bool = True) -> Scenario:
+    def read_recorded(self, token: str, *, validate: bool = True) -> Scenario:
         """As `read`, without the review."""
         window = self.window(token)
         first, last = window.first_row, window.last_row
         stored = self.recording(window.log_name)
-        recording = stored.read_window(window, plausible=plausible)
+        recording = stored.read_window(window, validate=validate)
         table = self.ego(window.log_name, window.ego)
         # The span starts at the window's first row, and so do the ego states.
-        states = ego_states(table, first, last, plausible=plausible)
+        states = ego_states(table, first, last, validate=validate)
         ego = EgoTrace(window.log_name, window.ego, 0, states)
         road = self.map(recording.city)
         scene = make_scenario(recording, ego, window, road, offset=first, is_chosen=True)
-        if plausible and (np.diff(scene.iteration_times) <= 0).any():
+        if validate and (np.diff(scene.iteration_times) <= 0).any():
             what = f"{stored.frames.path}: column 'time_us' does not increase"
             raise DataError(what, tables.REPAIR)
         return scene

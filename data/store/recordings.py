@@ -169,27 +169,27 @@ class StoredRecording:
         """
         return self._read(first, last, lambda valid, *_: np.flatnonzero(valid.any(axis=0)), False)
 
-    def read_window(self, window: Window, *, plausible: bool) -> Recording:
+    def read_window(self, window: Window, *, validate: bool) -> Recording:
         """The rows of a window, and the tracks that it shows.
 
         Raises:
-            DataError: A file is damaged or does not have the rows, or, where `plausible` is asked
+            DataError: A file is damaged or does not have the rows, or, where `validate` is asked
                 for, a box holds a number outside of its range.
         """
         choose = partial(visible_columns, without=window.ego)
-        return self._read(window.first_row, window.last_row, choose, plausible)
+        return self._read(window.first_row, window.last_row, choose, validate)
 
-    def _read(self, first: int, last: int, choose: _Choice, plausible: bool) -> Recording:
-        frames = _rows(self.frames, first, last, plausible)
+    def _read(self, first: int, last: int, choose: _Choice, validate: bool) -> Recording:
+        frames = _rows(self.frames, first, last, validate)
         time_us = column(frames, "time_us")
-        if plausible and (np.diff(time_us) < 0).any():
+        if validate and (np.diff(time_us) < 0).any():
             raise DataError(f"{self.frames.path}: column 'time_us' does not increase", REPAIR)
-        lights = self._lights(first, last, plausible)
-        tracks = self._tracks(first, last, choose, plausible)
+        lights = self._lights(first, last, validate)
+        tracks = self._tracks(first, last, choose, validate)
         return Recording(self.log_name, self.city, time_us, tracks, lights)
 
-    def _lights(self, first: int, last: int, plausible: bool) -> TrafficLights:
-        found = self.lights.read(self.lights.blocks(first, last), plausible=plausible)
+    def _lights(self, first: int, last: int, validate: bool) -> TrafficLights:
+        found = self.lights.read(self.lights.blocks(first, last), validate=validate)
         row = column(found, "row")
         found = found.filter(pa.array((row >= first) & (row < last)))
         light, each = _columns(found, "light")
@@ -197,8 +197,8 @@ class StoredRecording:
         status[column(found, "row") - first, light] = column(found, "status")
         return TrafficLights(tuple(found["connector"].take(each).to_pylist()), status)
 
-    def _tracks(self, first: int, last: int, choose: _Choice, plausible: bool) -> Tracks:
-        found = self.tracks.read(self.tracks.blocks(first, last), plausible=plausible)
+    def _tracks(self, first: int, last: int, choose: _Choice, validate: bool) -> Tracks:
+        found = self.tracks.read(self.tracks.blocks(first, last), validate=validate)
         row = column(found, "row") - first
         track, each = _columns(found, "track")
         tokens: list[str] = found["token"].take(each).to_pylist()
@@ -240,13 +240,13 @@ def _columns(found: pa.Table, name: str) -> tuple[IntArray, pa.Array]:
     return np.repeat(place, lengths), starts[each]
 
 
-def _rows(table: Table, first: int, last: int, plausible: bool) -> pa.Table:
+def _rows(table: Table, first: int, last: int, validate: bool) -> pa.Table:
     """The rows first … last - 1 of a recording, of a table that has one row for each.
 
     Raises:
         DataError: It is damaged or does not have them.
     """
-    found = table.read(table.blocks(first, last), plausible=plausible)
+    found = table.read(table.blocks(first, last), validate=validate)
     row = column(found, "row")
     start = int(np.searchsorted(row, first))
     rows = row[start : start + last - first]
@@ -272,11 +272,11 @@ def ego_span(table: Table) -> tuple[int, int]:
     return int(rows[0]), int(rows[-1]) + 1
 
 
-def ego_states(table: Table, first: int, last: int, *, plausible: bool = True) -> FloatArray:
+def ego_states(table: Table, first: int, last: int, *, validate: bool = True) -> FloatArray:
     """(R, 11) states of an ego over the rows first … last - 1 of the recording.
 
     Raises:
         DataError: The file is damaged or does not have the rows.
     """
-    found = _rows(table, first, last, plausible)
+    found = _rows(table, first, last, validate)
     return np.column_stack([column(found, name) for name in schema.EGO_COLUMNS])

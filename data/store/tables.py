@@ -238,12 +238,12 @@ class Table:
         blocks: list[int] | None = None,
         columns: list[str] | None = None,
         *,
-        plausible: bool = True,
+        validate: bool = True,
     ) -> pa.Table:
         """Rows of some row groups and columns; of all where None.
 
         Raises:
-            DataError: The file is damaged or, where `plausible` is asked for, holds a number
+            DataError: The file is damaged or, where `validate` is asked for, holds a number
                 outside of its range.
         """
         groups = list(range(self._file.num_row_groups)) if blocks is None else blocks
@@ -261,7 +261,7 @@ class Table:
             if name in wanted and (missing := found[name].null_count):
                 what = f"{missing} of {len(found)} values are missing"
                 raise DataError(f"{self.path}: column {name!r}: {what}", hint=REPAIR)
-        if plausible:
+        if validate:
             require_ranges(found, str(self.path))
         return found
 

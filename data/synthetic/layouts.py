@@ -15,7 +15,7 @@ from shiftsim.data.synthetic.streets import (
     AT_JUNCTION,
     are_apart,
     directions,
-    fan,
+    junction_arms,
     random_angles,
     random_gaps,
     random_street,
@@ -64,7 +64,7 @@ def _junction(rng: np.random.Generator, *, lit: bool) -> list[Street]:
     lanes = min(lanes, 2) if count == 5 else lanes
     share = float(rng.uniform(0.3, 1.0))
     arms = _arms(rng, range(1, count + 1), angles, lit=lit, lanes=lanes, crossings=share)
-    return fan(arms, angles, _rounding(rng))
+    return junction_arms(arms, angles, _rounding(rng))
 
 
 def _pair(rng: np.random.Generator, *, lanes: int) -> list[Street]:
@@ -91,7 +91,7 @@ def _pair(rng: np.random.Generator, *, lanes: int) -> list[Street]:
         )  # fmt: skip
         rounding = _rounding(rng)
         if junction == 101:
-            mid, *others = fan([mid, *arms[1:]], angles, rounding)
+            mid, *others = junction_arms([mid, *arms[1:]], angles, rounding)
             mid = replace(mid, junctions=(101, 102))
             out = [mid, *others]
         else:
@@ -99,7 +99,7 @@ def _pair(rng: np.random.Generator, *, lanes: int) -> list[Street]:
             reach = reaches(arms, angles, rounding)[0]
             center = (float(x + reach * np.cos(heading)), float(y + reach * np.sin(heading)))
             turned = [angle + heading + np.pi for angle in angles]
-            out += fan(arms, turned, rounding, center=center, junction=102)[1:]
+            out += junction_arms(arms, turned, rounding, center=center, junction=102)[1:]
     return out
 
 
@@ -208,7 +208,7 @@ def _street(rng: np.random.Generator) -> list[Street]:
             if all(last < begin - 12.0 or first > end + 12.0 for first, last in arm.crossings):
                 arm = replace(arm, narrow=(begin, end))
         arms.append(arm)
-    return fan(arms, angles, _rounding(rng))
+    return junction_arms(arms, angles, _rounding(rng))
 
 
 def _car_park(rng: np.random.Generator) -> list[Street]:
@@ -257,7 +257,7 @@ def _shared(rng: np.random.Generator) -> list[Street]:
         places = tuple((round(x, 1), round(x + 3.0, 1)) for x in spots.tolist() if x < 52.0)
         arm = random_street(rng, number, limit=20.0, length=length, parking=0.0)
         arms.append(replace(arm, sidewalk=4.0, stop=1.0, is_marked=False, crossings=places))
-    return fan(arms, angles, _rounding(rng))
+    return junction_arms(arms, angles, _rounding(rng))
 
 
 def _rounding(rng: np.random.Generator) -> float:

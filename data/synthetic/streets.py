@@ -142,7 +142,7 @@ def directions(gaps: FloatArray) -> list[float]:
     return [0.0, *np.cumsum(gaps)[:-1].tolist()]
 
 
-def fan(
+def junction_arms(
     streets: Sequence[Street],
     angles: Sequence[float],
     rounding: float,
@@ -180,20 +180,20 @@ def reaches(streets: Sequence[Street], angles: Sequence[float], rounding: float)
 
 def are_apart(streets: Sequence[Street]) -> bool:
     """Whether no two streets come too close away from the junctions that they share."""
-    ways = {}
+    baselines = {}
     for street in streets:
         places = np.append(np.arange(0.0, street.length, _STEP), street.length)
-        ways[street.id] = street.road.at(places)[:, :2]
+        baselines[street.id] = street.road.at(places)[:, :2]
     return not any(
-        _come_close(one, two, ways)
+        _come_close(one, two, baselines)
         for one in streets
         for two in streets
         if one.id < two.id and not (one.is_one_way or two.is_one_way)
     )
 
 
-def _come_close(one: Street, two: Street, ways: dict[int, FloatArray]) -> bool:
-    a, b = (_away(ways[x.id], x, y) for x, y in ((one, two), (two, one)))
+def _come_close(one: Street, two: Street, baselines: dict[int, FloatArray]) -> bool:
+    a, b = (_away(baselines[x.id], x, y) for x, y in ((one, two), (two, one)))
     if not len(a) or not len(b):
         return False
     gaps = np.hypot(*np.moveaxis(a[:, None] - b[None], -1, 0))

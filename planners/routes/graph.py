@@ -179,8 +179,8 @@ def lane_path(road: VectorMap, lanes: Iterable[int]) -> LanePath:
     line = np.ascontiguousarray(poses[:, :2])
     arc = arc_lengths(line, np.array([0, len(line)]))
     # nuPlan rule 153: of two equal vertices the second stays, and the last of all is always lost
-    kept = np.flatnonzero(np.diff(arc) > SAME_POINT)
-    return LanePath(line, arc, make_path(poses[kept], arc[kept]))
+    distinct = np.flatnonzero(np.diff(arc) > SAME_POINT)
+    return LanePath(line, arc, make_path(poses[distinct], arc[distinct]))
 
 
 @kernel

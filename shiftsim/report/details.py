@@ -136,9 +136,9 @@ def recorded_score(group: Group, where: BoolArray, others: Sequence[Group]) -> E
 
     None where no other group has all of them under the same rules.
     """
-    made = group.run.manifest["edits"]["made"]
+    edited = group.run.manifest["edits"]["made"]
     chosen = np.flatnonzero(where).tolist()
-    bases = [str(made[group.data.tokens[i]]["base"]) for i in chosen]
+    bases = [str(edited[group.data.tokens[i]]["base"]) for i in chosen]
     wanted = _driven_as(group)
     for other in others:
         place = {token: i for i, token in enumerate(other.data.tokens)}

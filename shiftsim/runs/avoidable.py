@@ -81,15 +81,15 @@ class Braking:
         """For one scenario; a deceleration of 0 [m/s^2] does not react."""
         rows = slice(int(scenario.iteration_rows[0]), None)
         states = scenario.ego[rows]
-        kept = np.flatnonzero(np.diff(scenario.time_us[rows], prepend=-1) > 0)
-        end, heading = states[kept[-1], :2], states[kept[-1], 2]
+        distinct = np.flatnonzero(np.diff(scenario.time_us[rows], prepend=-1) > 0)
+        end, heading = states[distinct[-1], :2], states[distinct[-1], 2]
         beyond = end + _BEYOND * np.array([np.cos(heading), np.sin(heading)])
-        self._time_us = scenario.time_us[rows][kept]
-        self._xy = np.concatenate([states[kept, :2], beyond[None]])
-        headings = np.unwrap(states[kept, 2])
+        self._time_us = scenario.time_us[rows][distinct]
+        self._xy = np.concatenate([states[distinct, :2], beyond[None]])
+        headings = np.unwrap(states[distinct, 2])
         self._heading = np.append(headings, headings[-1])
         self._arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self._xy, axis=0).T))])
-        self._speed = speeds(states[kept])
+        self._speed = speeds(states[distinct])
         self._deceleration = deceleration
         self._is_edit = _pedestrians_of(scenario)
         self._brakes_us: int | None = None

@@ -160,14 +160,14 @@ class EditedStore(ScenarioStore):
             )
         return self.edited[token].base
 
-    def read(self, token: str, *, plausible: bool = True) -> Scenario:
+    def read(self, token: str, *, validate: bool = True) -> Scenario:
         """One edited scenario.
 
         Raises:
             DataError: There is none of that id, or a file is missing or damaged.
             ConfigError: The edit cannot be applied.
         """
-        recorded = super().read(self.base(token), plausible=plausible)
+        recorded = super().read(self.base(token), validate=validate)
         return apply_edit(recorded, self.edited[token].edit, driven_lanes)
 
 

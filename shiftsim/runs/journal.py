@@ -119,9 +119,13 @@ class Journal:
         """Close it, and remove it from disk."""
         with suppress(FileNotFoundError):
             os.truncate(self._appended, 0)  # else closing copies all of it
-        self.close()
+        if "_database" in vars(self):
+            self._database.close()
         self._appended.unlink(missing_ok=True)
-        self.path.unlink()  # last: whoever finds it comes here again
+        if sys.platform == "win32":  # which removes no open file
+            self._lock.close()
+        self.path.unlink()  # still locked: whoever finds it comes here again
+        self._lock.close()
 
     @contextmanager
     def _errors(self) -> Iterator[None]:

@@ -4,7 +4,7 @@ A planner is any object with `reset(scene)` and `plan(observation)`; nothing nee
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -242,7 +242,7 @@ class ObservationBuilder:
         self, time_us: IntArray, ego: FloatArray, tracks: Tracks, lights: TrafficLights
     ) -> None:
         """Arrays of a rollout."""
-        self._arrays = time_us, ego, tracks, lights
+        self._arrays = time_us, ego, replace(tracks, kinds=readonly(tracks.kinds)), lights
 
     def at(self, iteration: int, row: int) -> Observation:
         """What a planner sees at an iteration, which is a row of the arrays."""

@@ -371,11 +371,11 @@ class Layer:
         # no polygon can be nearer than its box, and the nearest box gives a first bound
         guess = next(iter(self._tree.nearest((x, y, x, y), 1)))
         reach = distance_to(self.polygons, guess, x, y)
-        around = (x - reach, y - reach, x + reach, y + reach)
+        square = (x - reach, y - reach, x + reach, y + reach)
         return min(
             (
                 (number, distance_to(self.polygons, number, x, y))
-                for number in {guess, *self._tree.intersection(around)}
+                for number in {guess, *self._tree.intersection(square)}
             ),
             key=lambda found: (found[1], found[0]),
         )

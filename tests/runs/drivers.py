@@ -1,6 +1,9 @@
 """Planners that misbehave, for tests of the runner."""
 
+import json
 import os
+import struct
+import sys
 import time
 import typing
 from pathlib import Path
@@ -226,4 +229,26 @@ class Odd(ConstantVelocity):
                 raise SystemExit(3)
             if self.what == "none":
                 return None
+        return super().plan(observation)
+
+
+class Intruder(ConstantVelocity):
+    """Writes to the socket of its process, as its argument says of the scenario."""
+
+    def __init__(self, odd):
+        self.odd = odd
+
+    def reset(self, scene):
+        super().reset(scene)
+        self.what = self.odd.get(scene.token, "")
+
+    def plan(self, observation):
+        if self.what and observation.iteration == 2:
+            message = json.dumps([5, "done", None]).encode()
+            if self.what == "deep":
+                message = b"[" * 100_000
+            head = struct.pack("!i", len(message))
+            if self.what in ("endless", "large"):
+                head = struct.pack("!iQ", -1, 2**62 if self.what == "endless" else 2**40)
+            os.write(int(sys.argv[2]), head + message)
         return super().plan(observation)

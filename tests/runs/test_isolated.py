@@ -63,6 +63,17 @@ def test_whatever_happens_there_is_the_planner_s_error_and_costs_one_task(toy, t
     assert "drivers.py" in tasks["raises"]["traceback"]
 
 
+def test_a_socket_that_the_planner_writes_to_costs_one_task_each(toy, tmp_path):
+    first, second = shiftsim.open_store(str(toy)).tokens[:2]
+    for what in ("surplus", "endless", "large", "deep"):
+        given = {"planner_args": {"drivers:Intruder": {"odd": {first: what}}}, "limit": 2}
+        run = drive(toy, tmp_path / what, "drivers:Intruder", isolate=True, **given)
+        tasks = {task["token"]: task for task in run.tasks.to_pylist()}
+        assert tasks[second]["status"] == "ok", what
+        assert tasks[first]["status"] == "failed", what
+        assert "was ended: it sent what cannot be read" in tasks[first]["error"], what
+
+
 def sent(value, **classes):
     ours, theirs = Pipe()
     with ours, theirs:

@@ -1,14 +1,17 @@
 """A journal keeps what was put into it, whatever happens to the process."""
 
+import fcntl
 import os
 import shutil
 import sqlite3
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from shiftsim.errors import ConfigError, DataError
+from shiftsim.files import lock
 from shiftsim.runs.journal import Journal, has_entries
 
 CODE = """
@@ -100,6 +103,39 @@ def test_removing_leaves_nothing_and_copies_nothing(journal, path, monkeypatch):
     assert path.stat().st_size < 1 << 17
     journal.remove()
     assert not list(path.parent.iterdir())
+
+
+def test_it_is_locked_until_it_is_gone(journal, path, monkeypatch):
+    journal.put("a", {"number": 1})
+    unlink, refused = Path.unlink, []
+
+    def slowly(self, **options):
+        try:  # another process, in the moment before
+            Journal(path, keep=True).close()
+        except ConfigError:
+            refused.append(self.name)
+        unlink(self, **options)
+
+    monkeypatch.setattr(Path, "unlink", slowly)
+    journal.remove()
+    assert refused == [f"{path.name}-wal", path.name]
+
+
+def test_who_waits_for_a_file_that_is_removed_locks_the_new_one(tmp_path, monkeypatch):
+    path = tmp_path / "file"
+    flock, calls = fcntl.flock, []
+
+    def late(file, how):
+        if not calls:
+            path.unlink()
+            path.write_bytes(b"new")
+        calls.append(how)
+        flock(file, how)
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    with lock(path) as file:
+        assert file.seek(0, 2) == 3
+    assert len(calls) == 2
 
 
 def test_it_is_a_plain_database_for_other_tools(journal, path):

@@ -70,8 +70,11 @@ class Shapes:
         """(K, 2) left and right border of a piece in the direction of travel [m]."""
         shape = self.section(piece.key.road, piece.key.section)
         low, high = min(piece.begin, piece.end), max(piece.begin, piece.end)
-        kept = (shape.s >= low - 1e-9) & (shape.s <= high + 1e-9)
-        inner, outer = shape.inner[piece.key.lane][kept], shape.outer[piece.key.lane][kept]
+        inside = (shape.s >= low - 1e-9) & (shape.s <= high + 1e-9)
+        inner, outer = (
+            shape.inner[piece.key.lane][inside],
+            shape.outer[piece.key.lane][inside],
+        )
         forward = piece.end >= piece.begin
         if not forward:
             inner, outer = inner[::-1], outer[::-1]

@@ -285,13 +285,13 @@ class InterplanEditor:
 def _past(road: VectorMap, vehicles: list[Vehicle], draws: random.Random) -> FloatArray:
     """(23, V, 3) where the vehicles were, oldest first, with noise."""
     found = enumerate(_edge_and_progress(road, vehicle) for vehicle in vehicles)
-    movers = [(number, *start) for number, start in found if start is not None]
+    agents = [(number, *start) for number, start in found if start is not None]
     out = np.array([[vehicle.pose for vehicle in vehicles]] * HISTORY).reshape(HISTORY, -1, 3)
-    if not movers:
+    if not agents:
         return out
-    numbers, edges, starts = map(np.array, zip(*movers, strict=True))
+    numbers, edges, starts = map(np.array, zip(*agents, strict=True))
     # nuPlan rule 709: with noise, standing ones as well
-    noise = [draws.gauss(0, _JITTER) for _ in range(HISTORY * len(movers))]
+    noise = [draws.gauss(0, _JITTER) for _ in range(HISTORY * len(agents))]
     speeds = np.array([vehicles[number].velocity[0] for number in numbers.tolist()])
     back = speeds * _STEP * np.arange(HISTORY, 0, -1)[:, None]
     along = starts - (back + np.array(noise).reshape(HISTORY, -1))

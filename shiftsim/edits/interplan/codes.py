@@ -1,6 +1,6 @@
 """Codes of interPlan, such as `dhgsom`: a letter with one character each, read from left to right.
 
-Letters are a (share of vehicles kept), d (density), g (goal), o (manner of the agents) and s
+Letters are a (share of vehicles kept), d (density), g (goal), o (policy of the agents) and s
 (special scenario, whose number may have two digits). Later ones overwrite earlier ones.
 """
 
@@ -150,9 +150,9 @@ def import_names(
         )
     details = {str(token): found or {} for token, found in details.items()}
     edits: list[dict[str, Any]] = []
-    for name, manner in manners_in_force(map(str, listed), details).items():
+    for name, policy in manners_in_force(map(str, listed), details).items():
         token, _, code = name.partition("-")
-        edit: dict[str, Any] = {"name": code, "tokens": [token], "code": code, "agents": manner}
+        edit: dict[str, Any] = {"name": code, "tokens": [token], "code": code, "agents": policy}
         if window:
             edit["window_s"] = window
         if found := _used(details.get(token, {}), code):

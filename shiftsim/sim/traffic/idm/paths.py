@@ -48,23 +48,23 @@ def finish_path(path: FloatArray, size: int) -> int:
     The first `size` vertices of `path` (K, 4) count. Returns how many are left, at its start.
     """
     progress = 0.0
-    kept = 0
+    num_left = 0
     for vertex in range(size - 1):  # nuPlan rule 122: the last vertex is always lost
         x, y = path[vertex, 0], path[vertex, 1]
         heading = path[vertex, HEADING]
         dx, dy = path[vertex + 1, 0] - x, path[vertex + 1, 1] - y
         following = progress + np.sqrt(dx * dx + dy * dy)
         if abs(following - progress) > _SAME_PROGRESS:
-            if kept:
-                before = path[kept - 1, HEADING]
+            if num_left:
+                before = path[num_left - 1, HEADING]
                 heading = before + wrap_angle(heading - before)
-            path[kept, 0] = x
-            path[kept, 1] = y
-            path[kept, HEADING] = heading
-            path[kept, PROGRESS] = progress
-            kept += 1
+            path[num_left, 0] = x
+            path[num_left, 1] = y
+            path[num_left, HEADING] = heading
+            path[num_left, PROGRESS] = progress
+            num_left += 1
         progress = following
-    return kept
+    return num_left
 
 
 @kernel
@@ -176,12 +176,12 @@ def _drop_driven(path: FloatArray, size: int, progress: float) -> int:
     front = path[after - 1, HEADING]
     path[0, 0], path[0, 1] = x, y
     path[0, HEADING] = front + wrap_angle(heading - front)
-    kept = 1
+    num_left = 1
     for vertex in range(after, size):
         for column in range(3):
-            path[kept, column] = path[vertex, column]
-        kept += 1
-    return kept
+            path[num_left, column] = path[vertex, column]
+        num_left += 1
+    return num_left
 
 
 @kernel
