@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from shiftsim.data.nuplan.filter import (
     JUDGED,
@@ -283,7 +284,7 @@ class _Conversion:
         chosen, road = self.chosen, partial(self._map, log.map_name)
         for name in JUDGED:
             if getattr(chosen, name) is not None:
-                others = {other: None for other in JUDGED if other != name}
+                others: dict[str, Any] = {other: None for other in JUDGED if other != name}
                 if not is_taken(log, window, road, replace(chosen, **others)):
                     return
                 counts[name] += 1

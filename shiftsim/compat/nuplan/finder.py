@@ -14,17 +14,7 @@ from typing import Any
 
 from shiftsim.errors import MissingExtraError
 
-_SHIMS = (
-    "geometry",
-    "transforms",
-    "boxes",
-    "objects",
-    "ego",
-    "map_types",
-    "planning",
-    "helpers",
-    "motion",
-)
+_SHIMS = ("geometry", "transforms", "boxes", "objects", "ego", "map_types", "planning")
 _TABLE = """
 nuplan.common.actor_state: agent agent_state agent_temporal_state car_footprint dynamic_car_state
     ego_state oriented_box scene_object state_representation static_object tracked_objects

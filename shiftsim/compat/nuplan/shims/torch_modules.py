@@ -4,13 +4,13 @@ from abc import abstractmethod
 
 import torch
 
-from shiftsim.compat.nuplan.shims.helpers import (
+from shiftsim.compat.nuplan.shims.planning import (
     AbstractFeatureBuilder,
     AbstractTargetBuilder,
     FeaturesType,
     TargetsType,
+    TrajectorySampling,
 )
-from shiftsim.compat.nuplan.shims.planning import TrajectorySampling
 
 
 class TorchModuleWrapper(torch.nn.Module):
