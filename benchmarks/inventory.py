@@ -19,7 +19,7 @@ _PAGE = "docs/data.md"
 OWN = "own scenarios"  # what a track drives besides its published list
 _REMEDIES = {  # of what a track drives: how to make it
     "val14": "shiftsim convert nuplan LOGS MAPS --store val14 --filter val14_split.yaml",
-    OWN: "shiftsim convert dsc3d DOWNLOAD --store deepplan",
+    OWN: "shiftsim convert dsc3d DOWNLOAD --store dsc3d",
 }
 
 

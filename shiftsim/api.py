@@ -51,7 +51,7 @@ class Run(results.Run):
         return score_table([self], allow_partial=allow_partial)
 
     def worst(self, count: int = 10) -> list[dict[str, Any]]:
-        """The rollouts with the lowest scores: key, `cls` and `reason`."""
+        """The worst of each recording and cause: key, `cls`, `reason`, how many `others`."""
         from shiftsim.report.scores import worst_rollouts
 
         return worst_rollouts(self, count)
@@ -87,7 +87,8 @@ class Run(results.Run):
         gallery = self._gallery()
         found = gallery.find(token)
         scenario = gallery.store.read(found)
-        return still(scenario, gallery.shown(found, scenario), at=at)
+        shown, note = gallery.shown(found, scenario), gallery.shown_words(found)
+        return still(scenario, shown, at=at, note=note)
 
     def view(self, token: str) -> Any:
         """The replay of one scenario: a `Page`, which notebooks show and `.save(path)` writes.

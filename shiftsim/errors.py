@@ -1,7 +1,7 @@
 """The exception tree. A message says what is wrong, where, and what to do about it."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from importlib import import_module
 from types import ModuleType
 
@@ -93,6 +93,12 @@ def import_extra(module: str, extra: str) -> ModuleType:
 def readable(value: object) -> str:
     """A value as text that every file can hold; cut where too long."""
     return str(value)[:_MAX_TEXT].encode("utf-8", "backslashreplace").decode()
+
+
+def listed(names: Sequence[str], most: int = 8) -> str:
+    """Names in one line; those beyond `most` are counted: "a, b and 3 more"."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return f"{', '.join(names[:most])}{more}"
 
 
 def one_of(what: str, value: str, choices: Iterable[str]) -> str:

@@ -29,7 +29,7 @@ def write_run(
     **settings,
 ):
     """A run whose scores `score` gives; `missing` holds (planner, noise, seed, token)."""
-    kinds = types or ["deepplan"] * len(tokens)
+    kinds = types or ["unlabelled"] * len(tokens)
     rows, tasks = [], []
     for planner in planners:
         for name in noise:

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from shiftsim.data.readers.codes import CATEGORIES, KIND_NAMES, SIZES
+from shiftsim.data.readers.codes import CATEGORIES, KIND_NAMES, LARGE, SIZES
 from shiftsim.data.readers.motion import (
     believed_velocities,
     contradiction,
@@ -21,6 +21,7 @@ from shiftsim.data.readers.motion import (
     headings_of_motion,
     held_headings,
     track_medians,
+    unit_vectors,
 )
 from shiftsim.data.readers.samples import (
     ROW_S,
@@ -59,7 +60,7 @@ def make_samples(
         category: (A,) index into `categories`.
         categories: Names of categories; by default `category` holds AgentKind codes.
         xy: (A, 2) box centre [m].
-        headings: (A,) [rad]; the direction of motion where it is not given.
+        headings: (A,) [rad]; the direction of motion where it is not given, or NaN.
         velocities: (A, 2) in the frame of `xy` [m/s], NaN where unknown. Derived from the positions
             where they are not given, and for tracks where they contradict the positions.
         sizes: (A, 2) length, width [m]; the usual size of a kind (`SIZES`) where it is not given,
@@ -71,8 +72,10 @@ def make_samples(
             one time. Nothing is seen for an hour, or the rows span more than a day.
     """
     warnings: Counter[str] = Counter()
-    for what, values in (("position", xy), ("heading", headings)):
-        bad = 0 if values is None else int((~np.isfinite(values)).sum())
+    for what, bad in (
+        ("position", int((~np.isfinite(xy)).sum())),
+        ("heading", 0 if headings is None else int(np.isinf(headings).sum())),
+    ):
         if bad:
             raise ConversionError(
                 f"{name}: {bad} values of {what} are not finite", "leave those rows out"
@@ -100,7 +103,7 @@ def make_samples(
     if velocities is not None:
         contradicts = contradiction(velocities, derived, time, track)[0]
     velocities = believed_velocities(velocities, derived, contradicts, track, warnings)
-    raw = headings_of_motion(velocities, track, warnings) if headings is None else headings
+    raw = full_headings(headings, velocities, track, warnings)
     samples = TrackSamples(
         name=name,
         start_us=int(stamps[0]),
@@ -115,7 +118,7 @@ def make_samples(
         track_ids=track_ids,
         categories=names,
         kinds=kinds,
-        sizes=_sizes(sizes, kinds, track, warnings),
+        sizes=full_sizes(sizes, names, kinds, track, warnings),
         warnings=dict(+warnings),
     )
     if float(np.median(np.diff(samples.clock))) < 0.5 * period:
@@ -243,11 +246,30 @@ def track_categories(
     return found
 
 
-def _sizes(
-    sizes: FloatArray | None, kinds: IntArray, track: IntArray, warnings: Counter[str]
+def full_headings(
+    headings: FloatArray | None, velocities: FloatArray, track: IntArray, warnings: Counter[str]
 ) -> FloatArray:
-    """(N, 2) median of the sizes of every track, the usual one of its kind where it has none."""
-    usual = np.array([SIZES[AgentKind(kind)] for kind in kinds.tolist()])
+    """(A,) headings; where not given the direction of motion, at standstill the last or next."""
+    if headings is None:
+        return headings_of_motion(velocities, track, warnings)
+    given = np.isfinite(headings)
+    if given.all():
+        return headings
+    warnings["rows without heading (direction of motion)"] += int((~given).sum())
+    ways = np.where(given[:, None], unit_vectors(headings), velocities)
+    return np.where(given, headings, headings_of_motion(ways, track, warnings))
+
+
+def full_sizes(
+    sizes: FloatArray | None,
+    categories: Sequence[str],
+    kinds: IntArray,
+    track: IntArray,
+    warnings: Counter[str],
+) -> FloatArray:
+    """(N, 2) median of the sizes of every track; where it has none, that of its category."""
+    each = zip(categories, kinds.tolist(), strict=True)
+    usual = np.array([LARGE.get(name) or SIZES[AgentKind(kind)] for name, kind in each])
     medians = np.zeros_like(usual)
     if sizes is not None:
         known = (sizes > 0.0).all(axis=1)  # rows without a size say nothing of it

@@ -27,8 +27,8 @@ KIND_NAMES = {kind.name.lower(): kind for kind in AgentKind}
 KINDS = {
     **CATEGORIES,
     **_kinds(
-        vehicle="truck_bus lorry automobile taxi hgv suv",
-        pedestrian="ped walker passer_by",
+        vehicle="truck_bus lorry automobile taxi hgv suv medium_vehicle heavy_vehicle",
+        pedestrian="ped walker passer_by pedestrian/bicycle",
         bicycle="motorcyclist motorbike bike rider tricycle",
     ),
     **KIND_NAMES,
@@ -36,6 +36,7 @@ KINDS = {
     "static": AgentKind.GENERIC_OBJECT,
     "unknown": AgentKind.GENERIC_OBJECT,
 }
+SAME = dict.fromkeys(("passenger", "automobile", "default_vehtype"), "car")  # other words
 SIZES = {  # length and width of objects of unknown size [m]
     AgentKind.VEHICLE: (4.6, 1.9),
     AgentKind.BICYCLE: (1.8, 0.6),
@@ -45,6 +46,8 @@ SIZES = {  # length and width of objects of unknown size [m]
     AgentKind.CZONE_SIGN: (0.5, 0.5),
     AgentKind.GENERIC_OBJECT: (1.0, 1.0),
 }
+_LONG = "bus truck lorry hgv truck_bus heavy_vehicle"
+LARGE = {**dict.fromkeys(_LONG.split(), (12.0, 2.5)), "medium_vehicle": (6.0, 2.2)}  # by category
 
 
 def normalise_category(name: str) -> str:

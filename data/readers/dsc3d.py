@@ -26,7 +26,6 @@ from shiftsim.data.store.tables import digest
 from shiftsim.errors import ConversionError, DataError
 from shiftsim.world.state import AgentKind
 
-SCENARIO_TYPE = "deepplan"
 _MAX_META = 10_000_000  # bytes of data_meta.json
 _MAX_FRAME_SHIFT = 0.5  # m between the map's own georeference and that of the annotations
 _MOVING = 1.0  # m/s
@@ -106,7 +105,6 @@ class Dsc3dReader(Reader):
             replace(samples, offset=self.download.offset[:2]),
             self.site,
             config=self.config,
-            scenario_type=SCENARIO_TYPE,
             spans=window_spans(samples.duration, self.config),
             details={"placement": self._placement(samples)},
         )

@@ -22,7 +22,7 @@ class SourceRecording:
     samples: TrackSamples
     map: BuiltMap
     config: ConversionConfig | None = None
-    scenario_type: str = "unknown"
+    scenario_type: str = "unlabelled"
     egos: Sequence[str] | None = None  # ids of the egos; None for every vehicle that can be one
     spans: Sequence[Span] | None = None  # windows; None for all that fit
     left_out_s: float = 0.0  # time at its end that no scenario reaches [s]

@@ -127,7 +127,7 @@ def _report(plan: "Plan", *, published: bool, allow_partial: bool, as_json: bool
     from shiftsim.report.tables import FORMATS, render
 
     opened = open_runs([plan.folder])
-    options = Options(TABLES, None, published, allow_partial)
+    options = Options(tuple(TABLES), None, published, allow_partial)
     groups, tables = read_tables(opened, options, with_coverage=True)
     try:
         drawn = figures(groups, allow_partial=allow_partial)

@@ -15,7 +15,7 @@ from shiftsim.errors import ConfigError, ConversionError, MissingExtraError, one
 from shiftsim.files import read_toml, store_path
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
 
     from shiftsim.data.readers.convert import ConversionReport
     from shiftsim.data.readers.reader import Reader
@@ -69,7 +69,7 @@ def nuplan(
     failed = list(report.failed.items())
     lines = [
         *(f" tolerated: {flaw} ({count})" for flaw, count in report.flaws.items()),
-        *(f" failed: {token}: {reason}" for token, reason in failed[:MAX_NAMED]),
+        *_failures(report.failed),
         *(f" left by {key}: {count}" for key, count in report.left.items()),
         *(f" there are {what}: {_counted(found)}" for what, found in report.offers.items()),
         f" {plural(len(report.converted), 'scenario')} converted, "
@@ -145,7 +145,9 @@ def dsc3d(
 @app.command()
 def tracks(
     *,
-    source: Path = Argument(metavar="TRACKS", help="CSV or Parquet, a row per object and time."),
+    source: list[Path] = Argument(
+        metavar="TRACKS", help="CSV or Parquet, a row per object and time; several are joined."
+    ),
     map_path: Path = Argument(metavar="MAP", help="OpenDRIVE file (.xodr)."),
     store: Store,
     hz: float | None = Option(None, help="Frames per second, where time is given in frames."),
@@ -181,7 +183,7 @@ def tracks(
             source, map_path, city=city, overrides=overrides, hz=hz, config=config
         )
     except ConfigError as error:
-        raise ConfigError(f"{columns or source}: {error.message}", error.hint) from error
+        raise ConfigError(f"{columns or source[0]}: {error.message}", error.hint) from error
     picture = picture_file(folder, inspection.road.name, inspection.table.name)
     errors = inspection.diagnostics.errors
     try:
@@ -192,9 +194,10 @@ def tracks(
         _draw_tracks(picture, inspection, None)
         if not errors:
             raise
-        echo(f"error: {source}: {plural(len(errors), 'thing')} cannot be right", err=True)
+        echo(f"error: {source[0]}: {plural(len(errors), 'thing')} cannot be right", err=True)
         raise typer.Exit(cli.DATA) from None
-    names = {role: column.name for role, column in inspection.table.columns.found.items()}
+    read = inspection.table.columns
+    names = {role: column.words for role, column in read.found.items()}
     if as_json:
         content = _contents(report) | {"city": report.name, "summary": asdict(report.recordings[0])}
         print_json(content | {"figures": inspection.diagnostics.figures, "columns": names})
@@ -203,6 +206,11 @@ def tracks(
         for name, count in report.map_warnings.items():
             echo(f" map: {name} ({count})")
         echo(f" columns: {', '.join(f'{ours} = {name}' for ours, name in names.items())}")
+        for what, value in ("layout", read.layout), ("point given", read.reference):
+            if value:
+                echo(f" {what}: {value}")
+        if any(read.shift):
+            echo(f" shift: ({read.shift[0]:.1f}, {read.shift[1]:.1f}) m")
         echo("\n".join(_recording_lines(report.recordings[0])))
         for warning in inspection.diagnostics.warnings:
             echo(f" unusual: {warning.what}\n   remedy: {warning.remedy}")
@@ -317,13 +325,20 @@ def _convert(
         raise typer.Exit(cli.UNFINISHED)
 
 
+def _failures(failed: "Mapping[str, str]") -> "Iterator[str]":
+    """What failed and why, and how many more."""
+    for name, reason in list(failed.items())[:MAX_NAMED]:
+        yield f" failed: {name}: {reason}"
+    if len(failed) > MAX_NAMED:
+        yield f" failed: {len(failed) - MAX_NAMED} more, which --json lists"
+
+
 def _scene_lines(report: "ConversionReport", store: Path) -> "Iterator[str]":
     warnings = Counter(report.map_warnings) + report.count("warnings")
     for title, counts in ("not an ego by rule", report.count("rejected")), ("note", warnings):
         for name, number in sorted(counts.items()):
             yield f" {title}: {name} ({number})"
-    for name, reason in list(report.skipped.items())[:MAX_NAMED]:
-        yield f" failed: {name}: {reason}"
+    yield from _failures(report.skipped)
     without = sum(not summary.accepted for summary in report.recordings)
     yield (
         f" {plural(report.converted, 'scene')} converted, {without} of them without a "

@@ -79,6 +79,7 @@ def doctor(
         raise typer.Exit(cli.DATA)
 
 
+_MAX_NAMED = 20  # mismatches that are printed
 _COMPILED = (
     " kernels: {files} ({bytes:.3g} bytes) in {folder}, {compiled} of them compiled in "
     "{seconds:.0f} s"
@@ -110,6 +111,7 @@ class Diagnosis:
         packages = "  ".join(f"{name} {version}" for name, version in self.versions.items())
         memory = f"{self.memory / 1e9:.1f} GB memory" if self.memory else "memory unknown"
         equal = self.cases - len(self.mismatches)
+        more = len(self.mismatches) - _MAX_NAMED
         return [
             f" {packages}",
             f" torch: {self.torch}",
@@ -117,7 +119,8 @@ class Diagnosis:
             f" kernel cache: {self.kernel_cache}",
             *([_COMPILED.format(**self.kernels)] if self.kernels else []),
             f" reference checks {equal}/{self.cases} equal in {self.seconds:.1f} s",
-            *(f" MISMATCH {line}" for line in self.mismatches[:20]),
+            *(f" MISMATCH {line}" for line in self.mismatches[:_MAX_NAMED]),
+            *([f" and {more} more mismatches: --json lists them"] if more > 0 else []),
         ]
 
 

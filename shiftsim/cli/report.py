@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from typer import Argument, Option, echo
+from typer import Argument, Exit, Option, echo
 
 from shiftsim import cli
 from shiftsim.cli import Json, Quiet, plural, print_json, progress_bar
@@ -20,6 +20,17 @@ if TYPE_CHECKING:
     from shiftsim.runs.results import Run
 
 _WORST = 10
+
+
+def _list_tables(wanted: bool) -> None:
+    """Name the tables of a report and leave."""
+    if wanted:
+        from shiftsim.report.build import TABLES
+
+        echo("\n".join(f"{name:25} {words}" for name, words in TABLES.items()))
+        raise Exit
+
+
 RunFolder = Annotated[Path, Argument(metavar="RUN", help="A run folder, or that of a benchmark.")]
 
 
@@ -29,7 +40,10 @@ def report(
         [], "--format", "-f", help="text, md, csv, latex or html; repeatable with --out."
     ),
     table: list[str] = Option(
-        [], "--table", "-t", help="Only this table; repeatable. A wrong name shows the names."
+        [], "--table", "-t", help="Only this table, as --list names them; repeatable."
+    ),
+    names: bool = Option(
+        False, "--list", is_eager=True, callback=_list_tables, help="Name the tables, and leave."
     ),
     by: str | None = Option(None, help="Scores per scenario_type, city or seed as well."),
     published: bool = Option(False, "--published", help="The paper's figures beside the own ones."),
@@ -61,7 +75,7 @@ def report(
     if figures and out is None:
         out = safe_join(folders[0], "report")
     kind = (style or ["text"])[0]
-    default = TABLES if out or site else ("scores",) if kind == "csv" else BRIEF
+    default = tuple(TABLES) if out or site else ("scores",) if kind == "csv" else BRIEF
     options = Options(tuple(table or default), by, published, allow_partial)
     groups, tables = read_tables(opened, options, with_coverage=not table)
     drawn = draw(groups, allow_partial=allow_partial) if figures or site else []
@@ -76,6 +90,9 @@ def report(
     if out is not None or site is not None:
         return
     echo("\n\n".join(render(one, kind, width=cli.terminal_width()) for one in tables))
+    for name in table:
+        if not any(one.name.split("_")[0] == name for one in tables):
+            echo(f"no table {name}: these runs hold nothing of it", err=True)
     if kind == "text" and not table:
         _print_worst(opened.runs, worst)
 
@@ -111,10 +128,10 @@ def _write_pages(
 
     folder.mkdir(parents=True, exist_ok=True)
     images = {figure.save(folder).name: figure.title for figure in drawn}
-    stored = [run for run in runs if any(run.rollout_places.values())]
+    stores = [open_run_store(run) if any(run.rollout_places.values()) else None for run in runs]
     write_site(
         folder,
-        galleries(stored, [open_run_store(run) for run in stored], Choice()),
+        galleries(runs, stores, Choice()),
         title=title,
         limit=0,
         above=report_html(runs, tables, images),
@@ -129,10 +146,13 @@ def _print_worst(runs: "Sequence[Run]", count: int) -> None:
     for run in runs:
         rows = worst_rollouts(run, count)
         if rows:
-            echo(f"\n worst scenarios of {run.path.name}, each by its worst rollout")
+            each = "one per recording and cause, each by its worst rollout"
+            of = f"{len(rows)} of {len(set(run.scores['token'].to_pylist()))}"
+            echo(f"\n worst scenarios of {run.path.name}, {of}, {each}")
         for row in rows:
             where = f"{row['token']}  {task_words(row)}"
-            echo(f"  {row['cls']:.4f}  {where}  {row['reason']}".rstrip())
+            others = f"  ({row['others']} more like it)" if row["others"] else ""
+            echo(f"  {100.0 * row['cls']:6.2f}  {where}  {row['reason']}{others}".rstrip())
 
 
 def explain(
@@ -175,6 +195,9 @@ def diff(
     first: Path = Argument(metavar="RUN_A", help="A run folder, or that of a benchmark."),
     second: Path = Argument(metavar="RUN_B", help="Another one."),
     limit: int = Option(10, help="Look into the N largest changes."),
+    tolerance: float = Option(
+        1e-6, min=0.0, help="Rollouts part where they differ by more [m, rad, m/s …]."
+    ),
     as_json: Json = False,
 ) -> None:
     """Scenarios whose score differs between two runs, and where the rollouts part."""
@@ -183,7 +206,7 @@ def diff(
     from shiftsim.runs.diff import diff_lines, diff_runs
 
     pairs = paired_runs(first, second)
-    found = [diff_runs(one, other, limit=limit) for one, other in pairs]
+    found = [diff_runs(one, other, limit=limit, tolerance=tolerance) for one, other in pairs]
     if as_json:
         values = [pair.to_dict() for pair in found]
         print_json(values[0] if len(pairs) == 1 else values)

@@ -273,7 +273,7 @@ def _print_results(finished: "Run", *, allow_partial: bool) -> None:
     echo()
     echo(score_table([finished], allow_partial=allow_partial))
     worst = [
-        f"{row['token']} {task_words(row)} {row['cls']:.2f} {row['reason']}"
+        f"{row['token']} {task_words(row)} {100.0 * row['cls']:.2f} {row['reason']}"
         for row in worst_rollouts(finished, 3)
         if row["cls"] < 1.0
     ]
@@ -289,6 +289,8 @@ def _print_results(finished: "Run", *, allow_partial: bool) -> None:
         echo(f" {status}: {first}{more}: {error}")
         if hint:
             echo(f"   hint: {hint}")
+    if (left := len(alike) - _MAX_NAMED_FAILURES) > 0:
+        echo(f" and {plural(left, 'other error')}, which tasks.parquet of the run holds")
     if lost:
         echo(
             f" {counts['failed']} failed, {counts['timeout']} timeout, {counts['missing']} missing"

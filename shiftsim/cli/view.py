@@ -25,9 +25,7 @@ Planners = Annotated[
     list[str] | None, Option("--planner", "-p", help="Only this planner; repeatable.")
 ]
 Noises = Annotated[list[str] | None, Option("--noise", "-n", help="Only this noise; repeatable.")]
-Seeds = Annotated[
-    list[int] | None, Option("--seed", help="Only this seed; repeatable. [the first]")
-]
+Seeds = Annotated[list[int] | None, Option("--seed", help="Only this seed; repeatable.")]
 Store = Annotated[str | None, Option("--store", "-s", help="Name or folder. [the manifest's]")]
 Browser = Annotated[bool, Option("--open/--no-open", help="Open the page in the browser.")]
 
@@ -54,7 +52,9 @@ def view(
         gallery, token = _holding(found, token)
         folder.mkdir(parents=True, exist_ok=True)
         page = folder / page_name(token)
-        gallery.page(token).save(page)
+        for name, one in gallery.pages(token).items():
+            one.save(folder / name)
+        _say_shown(gallery, token, "the others are linked")
     else:
         with progress_bar(quiet=quiet) as advance:
             title = f"Replays of {run.name}"
@@ -87,8 +87,17 @@ def plot(
     found = _galleries([run, *(others or ())], store, planner, noise, seed)
     gallery, token = _holding(found, token)
     scenario = gallery.store.read(token)
-    save_figure(out, scenario, gallery.shown(token, scenario), at=_times(at), in_grid=grid)
+    shown = gallery.shown(token, scenario)
+    note = gallery.shown_words(token)
+    save_figure(out, scenario, shown, at=_times(at), in_grid=grid, note=note)
+    _say_shown(gallery, token, "--planner, --noise and --seed choose others")
     echo(f"written: {out}")
+
+
+def _say_shown(gallery: "Gallery", token: str, others: str) -> None:
+    """Say what is drawn of how much, where that is not all."""
+    if words := gallery.shown_words(token):
+        echo(f"{words}{f'; {others}' if len(gallery.parts(token)) > 1 else ''}")
 
 
 def _times(text: str) -> list[float]:

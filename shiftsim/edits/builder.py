@@ -14,7 +14,7 @@ import numpy as np
 
 from shiftsim.edits.places import EgoPath, ego_path
 from shiftsim.edits.spec import Edit, edited_id
-from shiftsim.errors import ConfigError
+from shiftsim.errors import ConfigError, listed
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.polylines import arc_lengths
 from shiftsim.geometry.rings import convex_intersect
@@ -116,7 +116,7 @@ class ScenarioBuilder:
             there = self.tracks.valid[self.now]
             seen = [t for t, is_there in zip(self.tracks.tokens, there, strict=True) if is_there]
             raise ConfigError(
-                f"there is no track {lost[0]!r}", hint=f"there are: {', '.join(seen[:8]) or 'none'}"
+                f"there is no track {lost[0]!r}", hint=f"there are: {listed(seen) or 'none'}"
             )
         chosen = np.ones(self.tracks.num_tracks, np.bool_)
         if wanted:

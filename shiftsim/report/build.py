@@ -46,31 +46,30 @@ _CITATION = """@misc{{shiftsim,
   archiveprefix = {{arXiv}}
 }}"""
 
-# the kinds of tables: names up to the first "_"
-TABLES = (
-    "semantic-shift",
-    "noise-robustness",
-    "edits",
-    "planner-comparison",
-    "planner-comparison-noise",
-    "scenario-types",
-    "scores",
-    "planning-time",
-    "data-statistics",
-    "benchmark-comparison",
-    "runs",
-)
+# the kinds of tables, names up to the first "_", and what they show
+TABLES = {
+    "semantic-shift": "clean scores by site, beside the published ones",
+    "noise-robustness": "scores under every noise",
+    "edits": "clean scores of edited scenarios by kind and difficulty",
+    "planner-comparison": "every pair of planners scenario by scenario, clean",
+    "planner-comparison-noise": "the same under every noise",
+    "scenario-types": "clean scores by scenario type",
+    "scores": "every planner, noise and metric",
+    "planning-time": "how long planners think, steps on a fallback plan",
+    "data-statistics": "what the scenarios hold",
+    "benchmark-comparison": "the data beside that of other benchmarks",
+    "runs": "settings, weights and versions",
+}
 _ASK_FOR_WEIGHTS = "the run must say --checkpoint PLANNER=shiftsim"
 _ABOUT_DATA = ("data-statistics", "benchmark-comparison", "runs")
-_LONG = ("planner-comparison-noise", *_ABOUT_DATA)
-BRIEF = tuple(name for name in TABLES if name not in _LONG)  # what a terminal shows
+BRIEF = tuple(name for name in TABLES if name not in _ABOUT_DATA)  # what a terminal shows
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
     """What a report shows."""
 
-    tables: tuple[str, ...] = TABLES  # kinds of tables, of `TABLES`
+    tables: tuple[str, ...] = tuple(TABLES)  # kinds of tables, of `TABLES`
     by: str | None = None  # splits the rows of the score table further
     with_published: bool = False  # show the published figures as well
     allow_partial: bool = False  # show labelled means of incomplete groups

@@ -20,10 +20,17 @@ ALL_KINDS = "all"
 def planner_comparison(groups: Sequence[Group], *, noisy: bool = False) -> Table | None:
     """Every pair of planners on the same scenarios, clean or noisy; None where there is no pair."""
     blocks: dict[tuple[object, ...], list[Group]] = {}  # they differ in nothing but the planner
-    for group in groups:
-        if group.is_complete and (group.noise != "none") == noisy:
+    mine = [group for group in groups if (group.noise != "none") == noisy]
+    for group in mine:
+        if group.is_complete:
             key = (group.data.key, group.traffic, group.noise, group.seeds)
             blocks.setdefault(key, []).append(group)
+    alone = [
+        f"{group.planner} {group.noise} {group.traffic}"
+        for group in mine
+        if not group.is_complete
+        or len(blocks[group.data.key, group.traffic, group.noise, group.seeds]) < 2
+    ]
     rows: list[tuple[Cell, ...]] = []
     num_recordings: set[int] = set()
     smallest = 0.0
@@ -51,6 +58,9 @@ def planner_comparison(groups: Sequence[Group], *, noisy: bool = False) -> Table
             f"few recordings ({min(num_recordings)}): intervals are too narrow, and no p can be "
             f"below {smallest:.4f}"
         )
+    if alone:
+        words = "not compared, as rollouts are missing or no other planner has the same seeds"
+        notes.append(f"{words}: {', '.join(alone)}")
     labels = ("set", "traffic", "noise", "first", "second")
     return Table(
         "planner-comparison-noise" if noisy else "planner-comparison",

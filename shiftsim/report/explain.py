@@ -105,7 +105,7 @@ def explain_tasks(
 
 
 def why(cls: float | None, metrics: list[dict[str, Any]]) -> str:
-    """A score in one line: what made it 0, or how it is composed; empty for a failed task."""
+    """A score x 100 in one line: what made it 0, or how it is composed; empty for a failed task."""
     if cls is None:
         return ""
     scored = [row for row in metrics if row["score"] is not None]
@@ -122,9 +122,9 @@ def why(cls: float | None, metrics: list[dict[str, Any]]) -> str:
     if cls == 0.0:
         return "score 0 because every weighted metric is 0"
     product = " × ".join(f"{row['score']:g}" for row in factors)
-    terms = " + ".join(f"{row['weight']:g}·{row['score']:.4g}" for row in parts)
+    terms = " + ".join(f"{row['weight']:g}·{100.0 * row['score']:.4g}" for row in parts)
     total = sum(row["weight"] for row in parts)
-    return f"{cls:.4f} = {product} × ({terms}) / {total:g}"
+    return f"{100.0 * cls:.2f} = {product} × ({terms}) / {total:g}"
 
 
 def _partner(row: dict[str, Any]) -> str:
@@ -139,9 +139,9 @@ def explain_lines(task: dict[str, Any]) -> list[str]:
         hint = [f"hint: {task['hint']}"] if task["hint"] else []
         lines = [*task["edits"], task["error"], *hint, *(task["traceback"] or "").splitlines()]
         return [f"{head}  {task['status']}", *(f"  {line}" for line in lines)]
-    rule = "the score is the product of the × rows and the weighted mean of the + rows"
+    rule = "the score is the product of the × rows and the weighted mean of the + rows, all x 100"
     lines = [*task["edits"], task["why"], rule, *map(_metric_line, task["metrics"])]
-    return [f"{head}  CLS {task['cls']:.4f}", *(f"  {line}" for line in lines)]
+    return [f"{head}  CLS {100.0 * task['cls']:.2f}", *(f"  {line}" for line in lines)]
 
 
 def _metric_line(row: dict[str, Any]) -> str:
@@ -149,7 +149,7 @@ def _metric_line(row: dict[str, Any]) -> str:
     unit = f" {unit}" if unit else ""
     role = {"multiplier": "×", "weighted": "+"}.get(row["role"], " ")
     weight = "" if row["weight"] is None else f"weight {row['weight']:g}"
-    score = "–" if row["score"] is None else f"{row['score']:.4f}"
+    score = "–" if row["score"] is None else f"{100.0 * row['score']:.2f}"
     parts = [f"{role} {in_words(name):29} {score:>6}", f"{weight:8}"]
     if row["value"] is not None:
         parts.append(f"value {row['value']:.4g}{unit}")

@@ -87,7 +87,7 @@ def semantic_shift(
         mine = [group for group in clean if group.data.key == data.key]
         compared = val14 if data.known != VAL14 else []
         columns = _columns(data, compared, published, allow_partial)
-        notes = [data.rules, *(group.data.rules for group in compared[:1]), INTERVALS]
+        notes = [data.rules, *(one.rules for one in distinct_sets(compared)), INTERVALS]
         out.append(_semantic_table(data, mine, columns, notes, published, with_published))
     alike = [one for one in distinct_sets(clean) if published and _is_paper_like(one, published)]
     if published is not None and with_published and not alike:
@@ -106,14 +106,15 @@ def _columns(
     """Val14 where it was run, too; the set; its cities; the metrics."""
     estimate = partial(Group.estimate, allow_partial=allow_partial)
 
-    def on_val14(group: Group) -> Cell:
-        same = (g for g in val14 if (g.traffic, g.planner) == (group.traffic, group.planner))
+    def on_val14(group: Group, data: DataSet) -> Cell:
+        wanted = (data.key, group.traffic, group.planner)
+        same = (g for g in val14 if (g.data.key, g.traffic, g.planner) == wanted)
         found = next(same, None)
         return None if found is None else estimate(found)
 
     cities = _cities(data, published).items()
     return [
-        *(_Column(group.data.label, VAL14, on_val14) for group in val14[:1]),
+        *(_Column(one.label, VAL14, partial(on_val14, data=one)) for one in distinct_sets(val14)),
         _Column(data.label, "all", estimate),
         _Column("95 % CI", "", score_interval),
         *(_Column(name, name, partial(estimate, where=data.within(city))) for city, name in cities),

@@ -10,12 +10,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.compute as pc
 
 from shiftsim.errors import one_of
 from shiftsim.kernels import FloatArray
-from shiftsim.metrics import MULTIPLIERS
 from shiftsim.report.groups import (
     COLUMNS,
     Group,
@@ -25,11 +23,20 @@ from shiftsim.report.groups import (
     weights_note,
 )
 from shiftsim.report.tables import Cell, Number, Table, text
-from shiftsim.report.words import REASONS, task_of
+from shiftsim.report.words import (
+    Violation,
+    gravest,
+    rows_by_task,
+    severity,
+    task_of,
+    violations,
+    worst_of,
+)
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
 
 GROUPINGS = ("scenario_type", "city", "seed")
+_NO_CAUSE: dict[str, Any] = {"cause": "", "severity": ()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,35 +162,35 @@ def _lines(
 
 
 def worst_rollouts(run: Run, count: int = 10) -> list[dict[str, Any]]:
-    """The scenarios with the lowest scores, each by its worst rollout.
+    """The worst scenarios, each by its worst rollout, in the order of `words.worst_of`.
 
-    Each with the key of that rollout, its `cls`, and the `reason` in words.
+    Each with the key of that rollout, its `cls`, the `reason` in words, and how many `others` of
+    the same recording have the same cause.
     """
-    is_noisy = pc.not_equal(run.scores["noise"], "none")
-    keys = ("cls", "token", "is_noisy", "planner", "noise", "seed")
-    scores = run.scores.append_column("is_noisy", is_noisy)
-    ordered = scores.sort_by([(key, "ascending") for key in keys])
-    _, firsts = np.unique(ordered["token"].to_numpy(), return_index=True)
-    rows = ordered.take(np.sort(firsts)[:count]).to_pylist()
-    tokens = pa.array([row["token"] for row in rows], pa.string())
-    metrics = run.metrics.filter(pc.is_in(run.metrics["token"], value_set=tokens)).to_pylist()
-    violated = {(task_of(row), row["metric"]): row["first_violation_s"] for row in metrics}
+    lowest = run.scores.group_by("token").aggregate([("cls", "min")])
+    scores = run.scores.select([*Task._fields, "cls", "log_name"]).join(lowest, "token")
+    scores = scores.filter(pc.equal(scores["cls"], scores["cls_min"]))
+    keys = [*Task._fields]
+    below = run.metrics.filter(pc.less(run.metrics["score"], 1.0))
+    metrics = rows_by_task(below.join(scores.select(keys), keys, join_type="left semi"))
+    rows = []
+    for row in scores.to_pylist():
+        task = task_of(row)
+        cause = gravest(violations(metrics.get(task, [])))
+        known = {"cause": cause.reason, "severity": severity(cause)} if cause else _NO_CAUSE
+        reason = "" if cause is None else _in_words(cause)
+        rows.append(row | known | {"log": row["log_name"], "reason": reason})
     return [
-        {**task_of(row)._asdict(), "cls": row["cls"], "reason": _reason(row, violated)}
-        for row in rows
+        {**task_of(row)._asdict(), "cls": row["cls"], "reason": row["reason"], "others": others}
+        for row, others in worst_of(rows, count)
     ]
 
 
-def _reason(row: dict[str, Any], violated: dict[tuple[Task, str], float | None]) -> str:
-    """What cost most: the first multiplier below 1, else the lowest of the other metrics."""
-    below = [name for name in MULTIPLIERS if (row[name] if row[name] is not None else 1.0) < 1.0]
-    others = [name for name in REASONS if name not in MULTIPLIERS and row[name] is not None]
-    name = below[0] if below else min(others, key=lambda other: row[other], default="")
-    if not name or row[name] == 1.0:
-        return ""
-    words = REASONS[name] if below else f"{REASONS[name]} {row[name]:.2f}"
-    seconds = violated[task_of(row), name]
-    return words if seconds is None else f"{words} {seconds:.1f} s"
+def _in_words(cause: Violation) -> str:
+    """A violation with its time; one that does not multiply the score with its own, times 100."""
+    score = "" if cause.is_multiplier else f" {100.0 * cause.row['score']:.2f}"
+    time = "" if cause.time is None else f" {cause.time:.1f} s"
+    return f"{cause.reason}{score}{time}"
 
 
 def summary(run: Run) -> dict[str, Any]:

@@ -111,6 +111,39 @@ def violations(rows: Iterable[Mapping[str, Any]]) -> list[Violation]:
     return sorted(found, key=lambda one: (one.time is None, one.time or 0.0))
 
 
+def severity(one: Violation) -> tuple[float, float, float]:
+    """What violations are ordered by, the gravest first: kind, then Δv, distance or other value."""
+    value, kind = one.row["first_violation_value"], float(list(REASONS).index(one.row["metric"]))
+    amount = abs(value) if value is not None and np.isfinite(value) else 0.0
+    if one.row["metric"] == "time_to_collision_within_bound":
+        amount = -amount
+    return (0.0, kind, -amount) if one.is_multiplier else (1.0, one.row["score"], -amount)
+
+
+def gravest(found: Iterable[Violation]) -> Violation | None:
+    """The cause of a score: the first multiplier in the order of metrics, else the lowest score."""
+    return min(found, key=severity, default=None)
+
+
+def worst_of(rows: Iterable[Mapping[str, Any]], count: int) -> list[tuple[Mapping[str, Any], int]]:
+    """The worst scenarios, each by its worst rollout, by score and by the gravity of its cause.
+
+    At most one per recording and cause; with each, how many other scenarios are like it. Rows hold
+    a task, `cls`, `cause`, its `severity`, and `log`, the recording.
+    """
+    by_token: dict[str, Mapping[str, Any]] = {}
+    for row in sorted(
+        rows, key=lambda r: (r["cls"], r["severity"], r["noise"] != "none", task_of(r))
+    ):
+        by_token.setdefault(row["token"], row)
+    alike: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
+    for row in by_token.values():
+        is_same = row["log"] and row["cause"]
+        key = (row["log"], row["cause"]) if is_same else (row["token"],)
+        alike.setdefault(key, []).append(row)
+    return [(same[0], len(same) - 1) for same in list(alike.values())[:count]]
+
+
 def worst_violation(found: Iterable[Violation]) -> Violation | None:
     """The one that cost most and has a moment: the first of a multiplier, else the first."""
     known = [one for one in found if one.time is not None]

@@ -1,7 +1,8 @@
 """Two runs scenario by scenario: where scores differ, and the first step at which rollouts part.
 
-Rollouts are compared as they were stored, bit by bit. Within one step the order is that of cause
-and effect: the world as the planner saw it, its plan, the command, the noise.
+Rollouts are compared as they were stored; they part where a quantity differs by more than a
+tolerance, in its unit, so that rounding is not taken for a cause. Within one step the order is that
+of cause and effect: the world as the planner saw it, its plan, the command, the noise.
 """
 
 import math
@@ -24,6 +25,7 @@ _NOT_COMPARED = {*Task._fields, "iteration", "time_us", "planning_seconds"}
 _LATER = ("degraded", "plan", "command_", "noise_")
 _UNITS = {"mps": "m/s", "mps2": "m/s²", "radps": "rad/s", "radps2": "rad/s²"}
 _UNITS |= {"m": "m", "rad": "rad"}
+TOLERANCE = 1e-6  # m, and the other units alike
 _AXES = ("x [m]", "y [m]", "heading [rad]")
 
 
@@ -59,6 +61,8 @@ class Change:
     # where the rollouts part; None where they do not, or are not stored
     departure: Departure | None
     note: str  # why there is no departure
+    # largest distance between the egos: metres, and its time [s from the start]; None as above
+    largest: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,10 +87,13 @@ class Difference:
         return out
 
 
-def diff_runs(first: Run, second: Run, *, limit: int = 10) -> Difference:
+def diff_runs(
+    first: Run, second: Run, *, limit: int = 10, tolerance: float = TOLERANCE
+) -> Difference:
     """Compare two runs, and look into a number of changes, the largest of the score first.
 
-    Planners are paired by name; two runs of one planner each are compared whatever their names.
+    Rollouts part where a quantity differs by more than the tolerance [m, rad, …]. Planners are
+    paired by name; two runs of one planner each are compared whatever their names.
 
     Raises:
         ConfigError: They have no rollout in common.
@@ -121,7 +128,7 @@ def diff_runs(first: Run, second: Run, *, limit: int = 10) -> Difference:
         only_second=len(theirs) - len(pairs),
         means=(float(before.mean()), float(after.mean())) if len(durations) == 1 else None,
         changes=tuple(
-            _change(first, second, task, pairs[task], ours[task], theirs[pairs[task]])
+            _change(first, second, task, pairs[task], ours[task], theirs[pairs[task]], tolerance)
             for task in changed[:limit]
         ),
     )
@@ -152,17 +159,20 @@ def diff_lines(found: Difference) -> list[str]:
         )
         lines.append(
             f" {task.token}  {both} {task.noise}{seed}  "
-            f"{change.first:.4f} → {change.second:.4f}  {metrics}"
+            f"{100.0 * change.first:.2f} → {100.0 * change.second:.2f}  {metrics}"
         )
-        lines.append(
-            f"   {f'first difference {change.departure}' if change.departure else change.note}"
-        )
+        parts = [f"first difference {change.departure}" if change.departure else change.note]
+        if change.largest and change.largest[0]:
+            parts.append(
+                "largest distance of the egos {:.3g} m at {:.1f} s".format(*change.largest)
+            )
+        lines.append(f"   {'; '.join(parts)}")
     left = found.better + found.worse - len(found.changes)
     return lines + ([f" and {left} more (--limit)"] if left else [])
 
 
 def _score(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2f}"
+    return "–" if value is None else f"{100.0 * value:.2f}"
 
 
 def _change(
@@ -172,6 +182,7 @@ def _change(
     other: Task,
     before: dict[str, Any],
     after: dict[str, Any],
+    tolerance: float,
 ) -> Change:
     """A change of the score between two rows, and where it comes from."""
     metrics = {
@@ -179,26 +190,43 @@ def _change(
         for name, short in SHORT_NAMES.items()
         if name != "score" and before[name] != after[name]
     }
-    departure, note = None, ""
+    departure, largest, note = None, None, ""
     if first.rollout_places.get(task) is None or second.rollout_places.get(other) is None:
         note = "rollouts are not stored"
     else:
         tables = first.rollout_rows(task), second.rollout_rows(other)
         try:
-            departure = find_departure(*tables)
+            departure = find_departure(*tables, tolerance=tolerance)
+            largest = _largest_distance(*tables)
         except ValueError as error:
             where = f"a rollout of scenario {task.token!r} in {first.path} or {second.path}"
             raise DataError(f"{where} is damaged: {error}", hint="make the run again") from error
         if departure is None:  # why scores differ where the ego drove the same
             traffic = [run.manifest["determining"]["traffic"] for run in (first, second)]
-            note = "the rollouts are the same: they were scored differently"
+            exact = find_departure(*tables) is None
+            same = "the same" if exact else f"the same to {tolerance:g} m"
+            note = f"the rollouts are {same}: they were scored differently"
             if traffic[0] != traffic[1]:
                 note = f"the ego drove the same, but in other traffic ({', '.join(traffic)})"
-    return Change(task, other.planner, before["cls"], after["cls"], metrics, departure, note)
+    scores = before["cls"], after["cls"]
+    return Change(task, other.planner, *scores, metrics, departure, note, largest)
 
 
-def find_departure(first: pa.RecordBatch, second: pa.RecordBatch) -> Departure | None:
-    """The first step at which two stored rollouts differ; None where they never do.
+def _largest_distance(first: pa.RecordBatch, second: pa.RecordBatch) -> tuple[float, float]:
+    """The largest distance between two egos [m] and its time since the start [s]."""
+    rows = min(len(first), len(second))
+    axes = [
+        first[name].to_numpy()[:rows] - second[name].to_numpy()[:rows] for name in ("x_m", "y_m")
+    ]
+    apart, times = np.hypot(*axes), first["time_us"].to_numpy()
+    at = int(np.argmax(apart))
+    return float(apart[at]), float((times[at] - times[0]) * 1e-6)
+
+
+def find_departure(
+    first: pa.RecordBatch, second: pa.RecordBatch, *, tolerance: float = 0.0
+) -> Departure | None:
+    """The first step at which two stored rollouts differ by more than a tolerance, if any.
 
     Raises:
         ValueError: One is damaged.
@@ -208,8 +236,9 @@ def find_departure(first: pa.RecordBatch, second: pa.RecordBatch) -> Departure |
     ours, theirs = (_quantities(table, rows, tokens) for table in (first, second))
     best: tuple[int, str] | None = None
     for name in _ordered(ours.keys() & theirs.keys()):
-        row = _first_difference(ours[name], theirs[name])
-        if row is not None and (best is None or row < best[0]):
+        parted = (_gaps(name, ours[name], theirs[name]) > tolerance).any(axis=1)
+        row = int(np.argmax(parted)) if parted.any() else rows
+        if row < (best[0] if best else rows):
             best = (row, name)
     if best is None and len(first) == len(second):
         return None
@@ -219,7 +248,7 @@ def find_departure(first: pa.RecordBatch, second: pa.RecordBatch) -> Departure |
     if not name:
         return Departure(row, seconds, "length of the rollout", len(first), len(second))
     one, other = ours[name][row], theirs[name][row]
-    index = _first_difference(one, other) or 0
+    index = int(np.argmax(_gaps(name, one[None], other[None])[0] > tolerance))
     return Departure(row, seconds, _quantity(name, index), float(one[index]), float(other[index]))
 
 
@@ -252,13 +281,16 @@ def _quantities(table: pa.RecordBatch, rows: int, tokens: list[str]) -> dict[str
     }
 
 
-def _first_difference(first: np.ndarray, second: np.ndarray) -> int | None:
+def _gaps(name: str, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """(rows, n) by how much numbers differ, headings across ±pi; infinite where one is missing."""
     if first.shape != second.shape:
-        return 0
-    differ = (first != second) & ~(np.isnan(first) & np.isnan(second))
-    if not differ.any():
-        return None
-    return int(np.argmax(differ.reshape(len(differ), -1).any(axis=1)))
+        return np.full((len(first), 1), np.inf)
+    gaps = first - second
+    if name.endswith(("heading_rad", "plan", "poses")):
+        turns = slice(None) if name.endswith("heading_rad") else slice(2, None, 3)
+        gaps[:, turns] -= 2.0 * np.pi * np.round(gaps[:, turns] / (2.0 * np.pi))
+    missing = np.isnan(first) != np.isnan(second)
+    return np.where(missing, np.inf, np.nan_to_num(np.abs(gaps)))
 
 
 def _quantity(name: str, index: int) -> str:

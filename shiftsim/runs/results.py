@@ -9,7 +9,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from shiftsim.errors import ConfigError, DataError
+from shiftsim.errors import ConfigError, DataError, listed
 from shiftsim.runs.rollouts import Task, complete_rollout, describe
 from shiftsim.runs.rollouts.files import RolloutLocation, RolloutReader
 from shiftsim.runs.tables import LOCATION, OK, damaged, read_table, stored_location
@@ -118,7 +118,7 @@ def open_run(path: str | Path) -> Run:
             for file in folder.parent.glob(f"{where}/manifest.json")
         )
         runs = sorted(str(file.parent) for file in near)
-        hint = f"there are: {', '.join(runs[:8])}" if runs else "make one with `shiftsim run`"
+        hint = f"there are: {listed(runs)}" if runs else "make one with `shiftsim run`"
         raise ConfigError(f"no run folder {str(folder)!r}", hint)
     manifest = read_manifest(folder)
     if manifest["state"] == "running":

@@ -1,7 +1,7 @@
 """Replays of runs: which rollouts belong on one page, and a folder of pages with a list of them."""
 
 import html
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,12 +9,22 @@ from typing import Any
 from shiftsim.errors import ConfigError, DataError, beginning
 from shiftsim.files import safe_join, write_text
 from shiftsim.metrics import SHORT_NAMES
-from shiftsim.report.words import REASONS, rows_by_task, violations, worst_violation
+from shiftsim.report.words import (
+    REASONS,
+    gravest,
+    rows_by_task,
+    severity,
+    violations,
+    worst_of,
+    worst_violation,
+)
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
 from shiftsim.view.page import MAX_ROLLOUTS, POLICY, Page, data_element, framed, replay_page
 from shiftsim.view.scene import ShownRollout
 
+_ENDS = [*Task._fields, "status", "error", "scenario_type"]
+_NO_PAGE = {"page": None, "index": 0}
 _WRONG = {SHORT_NAMES[name]: reason for name, reason in REASONS.items()}  # in words, in their order
 
 
@@ -24,7 +34,7 @@ class Choice:
 
     planners: tuple[str, ...] = ()  # only these; empty for all
     noises: tuple[str, ...] = ()  # only these; empty for all
-    seeds: tuple[int, ...] = ()  # only these; empty for the first one of each planner and noise
+    seeds: tuple[int, ...] = ()  # only these; empty for all
 
     def __str__(self) -> str:
         parts = zip(("planner", "noise", "seed"), vars(self).values(), strict=True)
@@ -32,7 +42,7 @@ class Choice:
 
     def of(self, tasks: Sequence[Task]) -> list[Task]:
         """The tasks chosen among those of one scenario, by planner, noise and seed."""
-        wanted = [
+        return [
             task
             for task in sorted(tasks)
             # a planner's name may end in the remark that tells runs apart
@@ -40,17 +50,17 @@ class Choice:
             and (not self.noises or task.noise in self.noises)
             and (not self.seeds or task.seed in self.seeds or task.noise == "none")
         ]
-        if self.seeds:
-            return wanted
-        first = {(task.planner, task.noise): task for task in reversed(wanted)}
-        return [task for task in wanted if first[task.planner, task.noise] == task]
 
 
 class Gallery:
-    """The stored rollouts of one or several runs on the same store, scenario by scenario."""
+    """The rollouts of one or several runs on the same store, scenario by scenario.
+
+    All are listed, also those that failed or were not stored; a page draws up to `MAX_ROLLOUTS` of
+    a scenario, the lowest scores first, and the others follow on further pages.
+    """
 
     def __init__(self, runs: Sequence[Run], store: Any, choice: Choice | None = None) -> None:
-        """Index the runs, which were made with this open store.
+        """Index the runs, which were made with this open store; None where nothing is drawn.
 
         Raises:
             DataError: A run was made with another store.
@@ -58,31 +68,71 @@ class Gallery:
         self.store = store
         self.choice = choice or Choice()
         self._runs: dict[Task, tuple[Run, Task]] = {}
+        self._stored: set[Task] = set()
         for run, name in zip(runs, _names(runs), strict=True):
-            if run.manifest["determining"]["store"] != store.hash:
+            if store is not None and run.manifest["determining"]["store"] != store.hash:
                 raise DataError(
                     f"run {run.path.name!r} was made with another store than {str(store.path)!r}",
                     hint="name the store that its manifest.json names",
                 )
             for task, place in run.rollout_places.items():
-                if place is not None:
-                    planner = f"{task.planner} ({name})" if name else task.planner
-                    self._runs[task._replace(planner=planner)] = (run, task)
+                planner = f"{task.planner} ({name})" if name else task.planner
+                key = task._replace(planner=planner)
+                self._runs[key] = (run, task)
+                if place is not None and store is not None:
+                    self._stored.add(key)
         self._scores = {run.path: rows_by_task(run.scores) for run in runs}
+        self._ends = {run.path: rows_by_task(run.tasks.select(_ENDS)) for run in runs}
         self._metrics = {run.path: rows_by_task(run.metrics) for run in runs}
         self._tokens: dict[str, list[Task]] = {}
         for task in self._runs:
             self._tokens.setdefault(task.token, []).append(task)
 
     @property
-    def tokens(self) -> list[str]:
-        """Scenarios with rollouts to show, the lowest score first."""
+    def listed(self) -> list[str]:
+        """Scenarios with rollouts of the choice: failures first, then the lowest score."""
         lowest = {
-            token: min(float(self._results(task)[0].get("cls", 1.0)) for task in chosen)
+            token: min(map(self._place, chosen))
             for token, tasks in self._tokens.items()
             if (chosen := self.choice.of(tasks))
         }
-        return sorted(lowest, key=lambda token: (lowest[token], token))
+        return sorted(lowest, key=lambda token: (lowest[token][0], token))
+
+    @property
+    def tokens(self) -> list[str]:
+        """Those of `listed` with rollouts to draw."""
+        return [token for token in self.listed if self.parts(token)]
+
+    def counts(self, tokens: Iterable[str]) -> tuple[int, int, int]:
+        """Rollouts of some scenarios, and how many of them failed and are only listed."""
+        tasks = [task for token in tokens for task in self.choice.of(self._tokens.get(token, []))]
+        failed = sum(self._place(task)[0] < 0.0 for task in tasks)
+        return len(tasks), failed, sum(task not in self._stored for task in tasks)
+
+    def __len__(self) -> int:
+        """All rollouts, whatever the choice."""
+        return len(self._runs)
+
+    def _place(self, task: Task) -> tuple[float, Task]:
+        """Where a rollout stands: failures first, then the lowest score."""
+        return float(self._results(task)[0].get("cls", -1.0)), task
+
+    def parts(self, token: str) -> list[list[Task]]:
+        """The rollouts that can be drawn, page by page, the lowest scores on the first."""
+        chosen = self.choice.of(self._tokens.get(token, []))
+        drawn = sorted((task for task in chosen if task in self._stored), key=self._place)
+        starts = range(0, len(drawn), MAX_ROLLOUTS)
+        return [sorted(drawn[start : start + MAX_ROLLOUTS]) for start in starts]
+
+    def shown_words(self, token: str, part: int = 0) -> str:
+        """What a page draws of how much, such as "6 of 16 rollouts shown"; empty for all."""
+        total, failed, lone = self.counts([token])
+        here = len(self.parts(token)[part])
+        more = [f"{failed} failed"] if failed else []
+        more += [f"{lone - failed} not stored"] if lone > failed else []
+        more += [f"only {self.choice}"] if any(vars(self.choice).values()) else []
+        words = ", ".join([f"{here} of {total} rollouts shown", *more])
+        return words if here < total or more else ""
 
     def _results(self, task: Task) -> tuple[Mapping[str, Any], list[dict[str, Any]]]:
         """The rows of a rollout in `scores.parquet` and `metrics.parquet`; empty where none."""
@@ -98,27 +148,28 @@ class Gallery:
         """
         return beginning("what is stored", "scenario", text, self._tokens)
 
-    def tasks(self, token: str) -> list[Task]:
-        """The rollouts that the page of a scenario shows.
+    def tasks(self, token: str, part: int = 0) -> list[Task]:
+        """The rollouts that a page of a scenario shows, the first page or another.
 
         Raises:
             ConfigError: There are none.
         """
-        found = self.choice.of(self._tokens.get(token, []))
+        found = self.parts(token)
         if not found:
-            there = zip(*self._tokens.get(token, []), strict=True)
+            stored = (task for task in self._tokens.get(token, []) if task in self._stored)
+            there = zip(*stored, strict=True)
             names = zip(("planners", "noise", "seeds"), there, strict=False)
             available = (f"{n}: {', '.join(map(str, dict.fromkeys(v)))}" for n, v in names)
             raise ConfigError(
                 f"scenario {token!r} has no stored rollout with {self.choice}",
                 hint="; ".join(available) or "--save-rollouts all keeps them",
             )
-        return found[:MAX_ROLLOUTS]
+        return found[part]
 
-    def shown(self, token: str, scenario: Any) -> list[ShownRollout]:
+    def shown(self, token: str, scenario: Any, part: int = 0) -> list[ShownRollout]:
         """The rollouts of a page with what is known of them."""
         out = []
-        for task in self.tasks(token):
+        for task in self.tasks(token, part):
             run, key = self._runs[task]
             score, metrics = self._results(task)
             log = run.rollout(key, scenario)
@@ -127,40 +178,76 @@ class Gallery:
             )
         return out
 
-    def page(self, token: str, *, back: str = "") -> Page:
-        """The replay of one scenario as HTML."""
+    def pages(self, token: str, *, back: str = "") -> dict[str, Page]:
+        """The replays of one scenario as HTML by file name, all rollouts that can be drawn.
+
+        Raises:
+            ConfigError: There are none.
+        """
+        self.tasks(token)
+        scenario, parts = self.store.read(token), self.parts(token)
+        names = [page_name(token, part) for part in range(len(parts))]
+        ends = [sum(map(len, parts[: part + 1])) for part in range(len(parts))]
+        words = [f"{end - len(one) + 1}–{end}" for end, one in zip(ends, parts, strict=True)]
+        links = list(zip(words, names, strict=True)) if len(names) > 1 else []
+        out = {}
+        for part, name in enumerate(names):
+            more = {"shown": self.shown_words(token, part), "parts": links, "part": part}
+            shown = self.shown(token, scenario, part)
+            out[name] = replay_page(scenario, shown, back=back, more=more)
+        return out
+
+    def page(self, token: str) -> Page:
+        """The first replay of one scenario as HTML, alone."""
         scenario = self.store.read(token)
-        return replay_page(scenario, self.shown(token, scenario), back=back)
+        more = {"shown": self.shown_words(token)} if self.parts(token) else {}
+        return replay_page(scenario, self.shown(token, scenario), more=more)
 
-    def rows(self, token: str) -> list[dict[str, Any]]:
+    def rows(self, token: str, *, with_pages: bool = True) -> list[dict[str, Any]]:
         """Rows of the scenario list: labels, scores and violated metrics of every rollout."""
-        return [self._row(task, index) for index, task in enumerate(self.tasks(token))]
+        parts = self.parts(token) if with_pages else []
+        where = {
+            task: {"page": f"replay/{page_name(token, part)}", "index": index}
+            for part, tasks in enumerate(parts)
+            for index, task in enumerate(tasks)
+        }
+        chosen = sorted(self.choice.of(self._tokens[token]), key=self._place)
+        cities = (self._results(task)[0].get("city") for task in chosen)
+        city = next(filter(None, cities), "")
+        return [{**self._row(task), "city": city, **where.get(task, _NO_PAGE)} for task in chosen]
 
-    def _row(self, task: Task, index: int) -> dict[str, Any]:
+    def _row(self, task: Task) -> dict[str, Any]:
         score, metrics = self._results(task)
+        run, key = self._runs[task]
+        (end,) = self._ends[run.path][key]
         found = violations(metrics)
-        worst = worst_violation(found)
+        worst, cause = worst_violation(found), gravest(found)
+        failed = "" if end["status"] == "ok" else f"{end['status']}: {end['error'] or ''}"
         return {
             "token": task.token,
-            "type": score.get("scenario_type", ""),
-            "city": score.get("city", ""),
+            "type": end["scenario_type"] or "",
+            "log": score.get("log_name") or "",
             "planner": task.planner,
             "noise": task.noise,
             "seed": task.seed,
             "cls": score.get("cls"),
+            "failed": failed.removesuffix(": "),
+            "cause": cause.reason if cause else "",
+            "severity": severity(cause) if cause else (),
             "violated": {one.short: one.time for one in found},
             "at": worst and worst.time,
-            "index": index,
-            "page": f"replay/{page_name(task.token)}",
         }
 
 
-def page_name(token: str) -> str:
-    """File name of a scenario's page: its token, other characters than letters and digits coded."""
+def page_name(token: str, part: int = 0) -> str:
+    """File name of a scenario's page: its token, other characters than letters and digits coded.
+
+    Further pages of the scenario have a number, from 2.
+    """
     safe = "".join(
         c if c.isascii() and (c.isalnum() or c in "-_") else f"~{ord(c):x}" for c in token
     )
-    return f"{safe}.html"
+    return f"{safe}.{part + 1}.html" if part else f"{safe}.html"
 
 
 def list_page(title: str, rows: Sequence[Mapping[str, Any]], *, above: str = "") -> str:
@@ -188,70 +275,97 @@ def write_site(
     above: str = "",
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> int:
-    """Write one page per scenario and `index.html`, which lists them; returns how many pages.
+    """Write the pages of scenarios and `index.html`; returns of how many scenarios.
 
-    The list goes to the folder, at most `limit` pages (0 for all), the lowest scores first, to its
-    subfolder `replay`. `above` is as in `list_page`; `on_progress` gets how many of how many pages.
+    The list, of all rollouts, goes to the folder; the pages of at most `limit` scenarios (0 for
+    all), failures and the lowest scores first, to its subfolder `replay`. `above` is as in
+    `list_page`; `on_progress` gets how many of how many scenarios.
     """
     pages = safe_join(folder, "replay")
     pages.mkdir(parents=True, exist_ok=True)
-    found = [(gallery, token) for gallery in galleries for token in gallery.tokens]
-    found = found[:limit] if limit else found
-    rows: list[dict[str, Any]] = []
+    drawable = [(gallery, token) for gallery in galleries for token in gallery.tokens]
+    found = drawable[:limit] if limit else drawable
     for done, (gallery, token) in enumerate(found):
-        gallery.page(token, back="../index.html").save(pages / page_name(token))
-        rows += gallery.rows(token)
+        for name, one in gallery.pages(token, back="../index.html").items():
+            one.save(pages / name)
         on_progress(done + 1, len(found))
-    page = list_page(title, rows, above="\n".join([above, worst_table(rows)]))
-    write_text(folder / "index.html", page)
+    drawn = set(found)
+    rows = [
+        row
+        for gallery in galleries
+        for token in gallery.listed
+        for row in gallery.rows(token, with_pages=(gallery, token) in drawn)
+    ]
+    words = html.escape(_left_out(galleries, len(found), len(drawable), rows))
+    parts = [above, worst_table(rows), f'<p id="shown">{words}</p>']
+    write_text(folder / "index.html", list_page(title, rows, above="\n".join(parts)))
     return len(found)
 
 
+def _left_out(
+    galleries: Sequence[Gallery], drawn: int, drawable: int, rows: Sequence[Mapping[str, Any]]
+) -> str:
+    """What a list and its replays leave out, in words; empty where that is nothing."""
+    parts, total = [], sum(map(len, galleries))
+    if len(rows) < total:
+        only = dict.fromkeys(str(gallery.choice) for gallery in galleries)
+        parts.append(f"{len(rows)} of {total} rollouts listed: only {', '.join(only)}")
+    failed = sum(bool(row["failed"]) for row in rows)
+    lone = sum(not row["failed"] for row in rows if row["page"] is None)
+    parts += [f"{failed} of {len(rows)} rollouts failed"] if failed else []
+    if drawn < drawable:
+        parts.append(f"replays of {drawn} of {drawable} scenarios, the others with --limit 0")
+    elif lone:
+        parts.append(f"{lone} rollouts have no replay: --save-rollouts all keeps them")
+    return "; ".join(parts)
+
+
 def worst_table(rows: Sequence[Mapping[str, Any]], count: int = 10) -> str:
-    """HTML: the scenarios with the lowest scores, each by its worst rollout, and what went wrong.
+    """HTML: the worst of the rollouts that finished, as `worst_of` ranks them, and what went wrong.
 
     In words, with links to that moment.
     """
-
-    def key(row: Mapping[str, Any]) -> tuple[Any, ...]:
-        names = (row["noise"] != "none", row["planner"], row["noise"], row["seed"])
-        return (row["cls"] or 0.0, row["token"], *names)
-
-    by_page: dict[str, Mapping[str, Any]] = {}
-    for row in sorted((row for row in rows if (row["cls"] or 0.0) < 1.0), key=key):
-        by_page.setdefault(row["page"], row)
-    if not by_page:
+    finished = [row for row in rows if row["cls"] is not None and row["cls"] < 1.0]
+    worst = worst_of(finished, count)
+    if not worst:
         return ""
     lines = []
-    for row in list(by_page.values())[:count]:
-        at = "" if row["at"] is None else f"t={row['at']:.2f}&amp;"
-        link = (
-            f'<a href="{row["page"]}#{at}focus={row["index"] + 1}">{html.escape(row["token"])}</a>'
-        )
-        score = "–" if row["cls"] is None else f"{100.0 * row['cls']:.2f}"
+    for row, others in worst:
+        link = html.escape(row["token"])
+        if row["page"] is not None:
+            at = "" if row["at"] is None else f"t={row['at']:.2f}&amp;"
+            link = f'<a href="{row["page"]}#{at}focus={row["index"] + 1}">{link}</a>'
+        score = f"{100.0 * row['cls']:.2f}"
         noise = row["noise"] if row["noise"] == "none" else f"{row['noise']}, seed {row['seed']}"
         times = [
             (_WRONG[short], row["violated"][short]) for short in _WRONG if short in row["violated"]
         ]
         wrong = ", ".join(w if time is None else f"{w} {time:.1f}\u00a0s" for w, time in times)
         texts = map(html.escape, (row["type"], row["planner"], noise))
-        inner = "".join(f"<td>{cell}</td>" for cell in (link, *texts, wrong))
+        alike = str(others) if others else ""
+        inner = "".join(f"<td>{cell}</td>" for cell in (link, *texts, wrong, alike))
         lines.append(f'<tr><td class="number">{score}</td>{inner}</tr>')
-    names = ("scenario", "type", "planner", "noise", "what went wrong, first time")
+    names = ("scenario", "type", "planner", "noise", "what went wrong, first time", "alike")
     heads = "".join(f"<th>{name}</th>" for name in names)
-    title = f"The worst {len(lines)} of {len({row['page'] for row in rows})} scenarios"
+    title = f"The worst {len(lines)} of {len({row['token'] for row in rows})} scenarios"
     return f"""<section id="worst"><h2>{title}</h2>
+<p>One per recording and cause; alike: other scenarios of both, which the list below holds.</p>
 <div class="wide" tabindex="0" role="region" aria-label="{title}"><table>
 <thead><tr><th class="number" title="closed-loop score (CLS)">score</th>{heads}</tr></thead>
 <tbody>{"".join(lines)}</tbody></table></div></section>"""
 
 
 def galleries(runs: Sequence[Run], stores: Sequence[Any], choice: Choice) -> list[Gallery]:
-    """One gallery per store; `stores` are the open ones of each run."""
-    by_store: dict[str, tuple[Any, list[Run]]] = {}
+    """One gallery per store; `stores` are the open ones of runs, None where nothing is drawn."""
+    by_store: dict[str, tuple[list[Any], list[Run]]] = {}
     for run, store in zip(runs, stores, strict=True):
-        by_store.setdefault(store.hash, (store, []))[1].append(run)
-    return [Gallery(members, store, choice) for store, members in by_store.values()]
+        opened, members = by_store.setdefault(run.manifest["determining"]["store"], ([], []))
+        opened += [store] if store is not None else []
+        members.append(run)
+    return [
+        Gallery(members, opened[0] if opened else None, choice)
+        for opened, members in by_store.values()
+    ]
 
 
 def _names(runs: Sequence[Run]) -> list[str]:

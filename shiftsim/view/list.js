@@ -26,7 +26,7 @@ function matches(row) {
     if (byId(name).value && row[name] !== byId(name).value) return false;
   }
   const violated = byId("violated").value;
-  if (violated && !(violated in row.violated)) return false;
+  if (violated && !(violated === "failed" ? row.failed : violated in row.violated)) return false;
   const score = row.cls === null ? 0 : 100 * row.cls;
   if (score < Number(byId("low").value) || score > Number(byId("high").value)) return false;
   const wanted = byId("find").value.trim().toLowerCase();
@@ -40,6 +40,7 @@ function compare(a, b) {
 }
 
 function violatedText(row) {
+  if (row.failed) return row.failed;
   // by time; what has none in the order of the metrics, as it stands there
   const parts = Object.entries(row.violated).sort((a, b) => (a[1] ?? 1e9) - (b[1] ?? 1e9));
   return parts
@@ -55,10 +56,11 @@ function linkOf(row) {
 
 function line(row) {
   const tr = document.createElement("tr");
-  const link = document.createElement("a");
-  link.href = linkOf(row);
+  const link = document.createElement(row.page ? "a" : "span");
+  if (row.page) link.href = linkOf(row);
+  else link.title = "no replay";
   link.textContent = row.token;
-  const score = row.cls === null ? "–" : (100 * row.cls).toFixed(2);
+  const score = row.failed ? "failed" : row.cls === null ? "–" : (100 * row.cls).toFixed(2);
   const seed = row.noise === "none" ? "" : row.seed;
   const cells = [link, row.type, row.city, row.planner, row.noise, seed, score, violatedText(row)];
   for (const [i, content] of cells.entries()) {
@@ -73,7 +75,8 @@ function line(row) {
 function show() {
   const found = rows.filter(matches).sort(compare);
   byId("list").tBodies[0].replaceChildren(...found.slice(0, room).map(line));
-  byId("count").textContent = `${found.length} of ${rows.length} rollouts`;
+  const drawn = found.length > room ? `${room} shown of ` : "";
+  byId("count").textContent = `${drawn}${found.length} of ${rows.length} rollouts`;
   byId("more").hidden = found.length <= room;
   for (const th of byId("list").tHead.rows[0].cells) {
     if (th.dataset.key === sorting.key) th.ariaSort = sorting.up ? "ascending" : "descending";

@@ -100,7 +100,8 @@ function show(state) {
     ]),
     "no rollout below 100 yet",
   );
-  byId("failed").textContent = state.num_failures ? `(${state.num_failures})` : "";
+  byId("failed").textContent = state.num_failures
+    ? `(${state.failures.length} of ${state.num_failures} shown)` : "";
   fillRows(
     "failures",
     state.failures.map((row) => [

@@ -2,7 +2,7 @@
 
 import html
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -65,8 +65,17 @@ def show(scenario: Scenario, **logs: SimulationLog) -> Page:
     return replay_page(scenario, shown)
 
 
-def replay_page(scenario: Scenario, shown: Sequence[ShownRollout], *, back: str = "") -> Page:
+def replay_page(
+    scenario: Scenario,
+    shown: Sequence[ShownRollout],
+    *,
+    back: str = "",
+    more: Mapping[str, Any] | None = None,
+) -> Page:
     """One self-contained HTML page of one to six rollouts; `back` is the address of the list.
+
+    `more` are `shown`, what is shown of how much, and `parts`, words and names of all pages of the
+    scenario, of which `part` is this one.
 
     Raises:
         ValueError: There are no rollouts, or more than six.
@@ -75,7 +84,7 @@ def replay_page(scenario: Scenario, shown: Sequence[ShownRollout], *, back: str 
         raise ValueError(f"a replay shows 1 to {MAX_ROLLOUTS} rollouts, not {len(shown)}")
     replay = Replay(scenario, shown)
     data = [
-        data_element("meta", describe_scene(replay) | {"back": back}),
+        data_element("meta", describe_scene(replay) | {"back": back, **(more or {})}),
         _data("scene", "text/plain", pack(scene_fields(replay))),
     ]
     for index in range(len(shown)):

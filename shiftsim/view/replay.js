@@ -707,6 +707,13 @@ async function start() {
     byId("edits").append(item);
   }
   byId("edits").hidden = !meta.edits.length;
+  byId("shown").textContent = meta.shown || "";
+  for (const [index, [words, name]] of (meta.parts || []).entries()) {
+    const link = document.createElement(index === meta.part ? "b" : "a");
+    link.textContent = words;
+    link.href = name;
+    byId("shown").append(" ", link);
+  }
   if (meta.back) {
     byId("back").hidden = false;
     byId("back").href = meta.back;

@@ -52,10 +52,12 @@ def save_figure(
     *,
     at: Sequence[float] = (0.0,),
     in_grid: bool = False,
+    note: str = "",
 ) -> None:
     """A still `at` seconds from the start, or a film of it all, by the ending of the file's name.
 
-    Several times, or `in_grid`, give a figure with a row per rollout and a column per time.
+    Several times, or `in_grid`, give a figure with a row per rollout and a column per time. `note`
+    says below the picture what it leaves out.
 
     Raises:
         ConfigError: The ending or a time is none of those possible.
@@ -68,14 +70,14 @@ def save_figure(
         )
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix.lower() in FILMS:
-        _film(path, scenario, shown)
+        _film(path, scenario, shown, note)
     elif in_grid or len(at) > 1:
-        save_picture(grid(scenario, shown, at=at), path)
+        save_picture(grid(scenario, shown, at=at, note=note), path)
     else:
-        save_picture(still(scenario, shown, at=at[0]), path)
+        save_picture(still(scenario, shown, at=at[0], note=note), path)
 
 
-def still(scenario: Scenario, shown: Sequence[ShownRollout], *, at: float) -> Any:
+def still(scenario: Scenario, shown: Sequence[ShownRollout], *, at: float, note: str = "") -> Any:
     """A matplotlib figure of the moment `at` seconds from the start.
 
     Raises:
@@ -83,13 +85,13 @@ def still(scenario: Scenario, shown: Sequence[ShownRollout], *, at: float) -> An
         MissingExtraError: matplotlib is missing.
     """
     row = _sample_at(shown[0].log.time_us, at)
-    figure, axes, _ = _scene(scenario, shown, at)
+    figure, axes, _ = _scene(scenario, shown, at, note)
     draw_boxes(axes, shown, row, planner_styles(item.planner for item in shown))
     return figure
 
 
 def _scene(
-    scenario: Scenario, shown: Sequence[ShownRollout], at: float
+    scenario: Scenario, shown: Sequence[ShownRollout], at: float, note: str
 ) -> tuple[Any, Any, list[Mark]]:
     """Figure and axes with all that does not move, and the marks of violations."""
     extent = _extent_of(scenario, shown)
@@ -101,12 +103,15 @@ def _scene(
     marks = [mark for mark in found if mark]
     draw_scale(axes, extent)
     _heading(axes, scenario, at)
+    axes.set_xlabel(note, fontsize=SMALL)
     add_legend(figure, axes)
     spread_labels(figure, axes, marks)
     return figure, axes, marks
 
 
-def grid(scenario: Scenario, shown: Sequence[ShownRollout], *, at: Sequence[float]) -> Any:
+def grid(
+    scenario: Scenario, shown: Sequence[ShownRollout], *, at: Sequence[float], note: str = ""
+) -> Any:
     """A matplotlib figure with a row per rollout and a column per moment [s from the start].
 
     Raises:
@@ -129,7 +134,7 @@ def grid(scenario: Scenario, shown: Sequence[ShownRollout], *, at: Sequence[floa
                 axes.set_title(f"{time:g} s", fontsize=SMALL + 1)
         line[0].set_ylabel(_wrapped(caption(item), per_line), fontsize=SMALL - 1)
     draw_scale(panels_of[-1][0], extent)
-    figure.supxlabel(_KEY, fontsize=SMALL - 1)
+    figure.supxlabel("\n".join(filter(None, (_KEY, note))), fontsize=SMALL - 1)
     figure.suptitle(_words(scenario), fontsize=SMALL + 1)
     return figure
 
@@ -284,9 +289,9 @@ def _heading(axes: Any, scenario: Scenario, time: float) -> None:
     axes.set_title(f"{_words(scenario)}  {time:.1f} s", fontsize=SMALL + 1)
 
 
-def _film(path: Path, scenario: Scenario, shown: Sequence[ShownRollout]) -> None:
+def _film(path: Path, scenario: Scenario, shown: Sequence[ShownRollout], note: str) -> None:
     """All samples, one after the other; a violation is marked from its first moment on."""
-    figure, axes, marks = _scene(scenario, shown, 0.0)
+    figure, axes, marks = _scene(scenario, shown, 0.0, note)
     from matplotlib.animation import FFMpegWriter, PillowWriter
 
     writer: Any = PillowWriter(fps=_FPS)

@@ -141,7 +141,8 @@ def _draw_egos(axes: Any, egos: Egos) -> None:
     for number, (name, paths) in enumerate(egos.items()):
         path = np.concatenate(paths)
         x, y = path[:, 0], path[:, 1]
-        label = "egos, from dot to arrow" if not number else None
+        named = f", {_MAX_EGOS} of {len(egos)} named" if len(egos) > _MAX_EGOS else ""
+        label = f"egos, from dot to arrow{named}" if not number else None
         axes.plot(x, y, color=RECORDED, linewidth=1.3, zorder=4, label=label)
         if number < _MAX_EGOS:
             axes.plot(x[0], y[0], "o", color=RECORDED, markersize=4, zorder=5)

@@ -10,6 +10,8 @@ import typer
 from typer.testing import CliRunner
 
 from shiftsim.cli import app, with_settings
+from shiftsim.cli.convert import _failures
+from shiftsim.errors import listed
 from shiftsim.runs.config import RunConfig, make_config
 
 
@@ -79,3 +81,11 @@ def test_a_command_computes_in_one_thread_unless_told_otherwise(given, threads):
     told, running = done.stdout.splitlines()[-1].split()
     assert told == threads
     assert int(running) <= int(threads)
+
+
+def test_names_and_failures_beyond_the_first_are_counted():
+    assert listed([]) == ""
+    assert listed(["a", "b"]) == "a, b"
+    assert listed(list("abcdefghij")) == "a, b, c, d, e, f, g, h and 2 more"
+    lines = [*_failures({f"log{number:02d}": "torn" for number in range(23)})]
+    assert lines[-2:] == [" failed: log19: torn", " failed: 3 more, which --json lists"]

@@ -5,6 +5,7 @@ from pages import sections
 from typer.testing import CliRunner
 
 from shiftsim.cli import app, main
+from shiftsim.report.build import TABLES
 
 
 @pytest.fixture
@@ -44,7 +45,21 @@ def test_the_report_page_holds_tables_pictures_and_replays(call, clean_run, tmp_
     assert "All planners and noises" in page
     assert list(tmp_path.glob("*.png"))
     assert all((tmp_path / row["page"]).is_file() for row in rows)
-    assert len(rows) == 16
+    assert len(rows) == 24  # all seeds
+
+
+def test_a_report_compares_under_noise_too_and_names_its_tables(call, clean_run):
+    printed = call("report", clean_run.path)
+    assert "difference of closed-loop scores x 100, first minus second" in printed.output
+    assert "scenario by scenario, clean" in printed.output
+    assert "scenario by scenario, under noise" in printed.output
+
+    listed = call("report", "--list")
+    assert listed.exit_code == 0, listed.output
+    assert [line.split()[0] for line in listed.output.splitlines()] == list(TABLES)
+
+    empty = call("report", clean_run.path, "--table", "edits")
+    assert "no table edits" in empty.output
 
 
 def test_plot_writes_a_figure(call, clean_run, tmp_path):
@@ -54,6 +69,16 @@ def test_plot_writes_a_figure(call, clean_run, tmp_path):
 
     assert done.exit_code == 0, done.output
     assert (tmp_path / "a.svg").read_text("utf-8").startswith("<?xml")
+
+
+def test_a_figure_of_fewer_rollouts_says_so(call, clean_run, tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr("shiftsim.view.build.MAX_ROLLOUTS", 4)
+
+    done = call("plot", clean_run.path, "0001cafe", "-o", tmp_path / "a.svg")
+
+    assert "4 of 6 rollouts shown; --planner, --noise and --seed choose others" in done.output
+    assert "4 of 6 rollouts shown" in (tmp_path / "a.svg").read_text("utf-8")
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ def test_a_score_is_taken_apart_into_its_terms():
         metric("speed_limit_compliance", None, "weighted", 4.0),
     ]
     score = 0.5 * 5.0 * 0.8 / 7.0
-    assert why(score, rows) == f"{score:.4f} = 0.5 × (5·0.8 + 2·0) / 7"
+    assert why(score, rows) == f"{100.0 * score:.2f} = 0.5 × (5·80 + 2·0) / 7"
 
 
 def test_a_score_that_is_zero_without_a_multiplier_says_so():
@@ -47,7 +47,9 @@ def test_the_terms_of_every_real_score_give_that_score(clean_run):
         for task in select_tasks(clean_run, token):
             scores = {row["metric"]: row["score"] for row in task["metrics"] if row["role"]}
             assert closed_loop_score(scores) == pytest.approx(task["cls"], abs=1e-12)
-            assert task["why"].startswith(f"{task['cls']:.4f} = " if task["cls"] else "score 0")
+            assert task["why"].startswith(
+                f"{100.0 * task['cls']:.2f} = " if task["cls"] else "score 0"
+            )
 
 
 def test_every_metric_has_a_line_with_value_threshold_and_weight(clean_run):

@@ -17,6 +17,7 @@ from shiftsim.report.scores import (
     worst_rollouts,
 )
 from shiftsim.report.tables import FORMATS, render
+from shiftsim.report.words import severity, violations, worst_of
 
 
 def test_the_score_is_the_plain_mean_of_the_scenarios(clean_run):
@@ -99,6 +100,31 @@ def test_the_worst_scenarios_come_each_by_its_worst_rollout_and_with_a_reason(cl
     assert [row["cls"] for row in worst] == sorted(lowest.values())[:5]
     assert all(row["cls"] == lowest[row["token"]] for row in worst)
     assert all(row["reason"] for row in worst if row["cls"] < 1.0)
+
+
+def _worst_row(token, log, metric, value, **more):
+    row = {"metric": metric, "score": 0.0, "first_violation_s": 1.0, "first_violation_value": value}
+    (found,) = violations([row])
+    key = {"planner": "a", "noise": "none", "seed": 0, "token": token, "cls": 0.0, "log": log}
+    return {**key, "cause": found.reason, "severity": severity(found), **more}
+
+
+def test_the_worst_are_ranked_by_severity_and_one_per_recording_and_cause():
+    crash, off = "no_ego_at_fault_collisions", "drivable_area_compliance"
+    rows = [
+        _worst_row("a", "one", off, 0.5),
+        _worst_row("b", "two", off, 4.0),
+        _worst_row("c", "one", crash, 2.0),
+        _worst_row("d", "one", crash, 9.0),
+        _worst_row("e", "three", crash, 5.0),
+        _worst_row("f", "one", crash, 1.0),
+        _worst_row("g", "four", off, 9.0, cls=0.1),
+    ]
+
+    found = [(row["token"], others) for row, others in worst_of(rows, 10)]
+
+    assert found == [("d", 2), ("e", 0), ("b", 0), ("a", 0), ("g", 0)]
+    assert [row["token"] for row, _ in worst_of(rows, 1)] == ["d"]
 
 
 def test_the_summary_is_json_and_complete(clean_run):

@@ -135,6 +135,20 @@ def test_both_traffic_modes_of_two_runs_stand_in_one_table(tmp_path):
     assert cells(table, "R", "alpha")["made-up"] == "25.00"
 
 
+def test_val14_under_several_rules_has_a_column_for_each(tmp_path):
+    known = [KnownSet("val14", "Val14", "nuplan", 2, token_digest(("v0", "v1")))]
+    val14 = {"split": "val14", "tokens": ("v0", "v1"), "cities": "xx", "logs": "lm"}
+    runs = [write_run(tmp_path / "own")]
+    for rules, score in (("nuplan", 0.25), ("deepplan", 0.75)):
+        settings = val14 | {"thresholds": rules, "score": lambda *key, score=score: score}
+        runs.append(write_run(tmp_path / rules, **settings))
+
+    (table,) = semantic_shift(read_groups(runs, known))
+
+    columns = [i for i, name in enumerate(table.header) if name.startswith("Val14")]
+    assert [str(table.rows[0][i]) for i in columns] == ["25.00", "75.00"]
+
+
 def test_val14_stands_beside_the_own_scenarios(tmp_path):
     known = [KnownSet("val14", "Val14", "nuplan", 2, token_digest(("v0", "v1")))]
     runs = [
@@ -205,6 +219,7 @@ def test_planners_are_compared_on_complete_scores_only(tmp_path):
     # three recordings: all signs alike happens by chance in 2 of 8 patterns
     assert row["p"] == "0.2500"
     assert any("few recordings (3)" in note for note in table.notes)
+    assert any("not compared" in note and "gamma none NR" in note for note in table.notes)
 
 
 def test_scenario_types_are_rows(tmp_path):

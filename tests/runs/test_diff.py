@@ -118,7 +118,7 @@ def test_single_planners_are_paired_whatever_their_names(tmp_path):
     found = diff_runs(first, second, limit=3)
     assert found.worse == 4
     lines = diff_lines(found)
-    assert "old/new none  0.5000 → 0.2500" in lines[2]
+    assert "old/new none  50.00 → 25.00" in lines[2]
     assert lines[3] == "   rollouts are not stored"
     assert lines[-1] == " and 1 more (--limit)"
 
@@ -151,6 +151,35 @@ def test_the_quantity_that_differs_is_named(runs, toy, field, row, quantity):
     found = find_departure(*tables)
     assert (found.iteration, found.quantity) == (row, quantity)
     assert found.second - found.first == pytest.approx(step, rel=1e-4)
+
+
+def test_rounding_is_no_departure_and_the_largest_distance_is_told(runs):
+    def moved(table, row, by):
+        at = table.schema.get_field_index("y_m")
+        values = table["y_m"].to_numpy().copy()
+        values[row] += by
+        return table.set_column(at, "y_m", pa.array(values))
+
+    table = runs[0].rollout_rows(Task("coast", "none", 0, "0000cafe"))
+    rounded = moved(table, 2, 1e-9)
+    assert find_departure(table, rounded).iteration == 2
+    assert find_departure(table, rounded, tolerance=1e-6) is None
+    assert find_departure(table, moved(rounded, 5, 0.5), tolerance=1e-6).iteration == 5
+    assert find_departure(table, moved(rounded, 5, np.nan), tolerance=1e-6).iteration == 5
+
+    at = table.schema.get_field_index("heading_rad")
+    west = [
+        table.set_column(at, "heading_rad", pa.array([angle] * len(table)))
+        for angle in (np.pi, -np.pi + 1e-12)
+    ]
+    assert find_departure(*west, tolerance=1e-6) is None
+
+    change = diff_runs(*runs).changes[0]
+    assert change.largest[0] > 0.1
+    assert "largest distance of the egos" in "\n".join(diff_lines(diff_runs(*runs)))
+    lenient = diff_runs(*runs, tolerance=1e6).changes[0]
+    assert lenient.departure is None
+    assert lenient.note == "the rollouts are the same to 1e+06 m: they were scored differently"
 
 
 def test_a_shorter_rollout_differs_in_length(runs):

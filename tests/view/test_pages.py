@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from made_runs import write_run
 from pages import sections, unpack
 from stores import write_toy_store
 from worlds import cruise_scenario, standing_tracks
@@ -12,8 +13,17 @@ import shiftsim
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.planners.registry import load_planner
+from shiftsim.report.words import task_of
 from shiftsim.sim.loop import simulate
-from shiftsim.view.build import Choice, Gallery, list_page, page_name, worst_table, write_site
+from shiftsim.view.build import (
+    Choice,
+    Gallery,
+    galleries,
+    list_page,
+    page_name,
+    worst_table,
+    write_site,
+)
 from shiftsim.view.page import MAX_ROLLOUTS, embedded, fill, json_text, replay_page
 from shiftsim.view.scene import ShownRollout
 from shiftsim.view.still import save_figure
@@ -105,9 +115,11 @@ def test_the_list_escapes_what_it_shows():
 def test_the_worst_are_ten_in_words_and_without_markup_of_theirs():
     row = {"token": HOSTILE, "type": HOSTILE, "planner": HOSTILE, "noise": "ou-low", "seed": 3}
     row |= {"violated": {"NCR": 4.3, "PER": None}, "at": 4.3, "index": 1}
+    row |= {"log": "", "cause": "at-fault collision", "severity": (0.0, 0.0, -3.0)}
+    tokens = [f"{HOSTILE}{number}" for number in range(12)]
     rows = [
-        {**row, "cls": 1.0 - number / 100.0, "page": page_name(f"{HOSTILE}{number}")}
-        for number in range(12)
+        {**row, "token": token, "cls": 1.0 - number / 100.0, "page": page_name(token)}
+        for number, token in enumerate(tokens)
     ]
     rows += [{**rows[3], "cls": 0.975, "noise": "none"}]  # the better one of the same scenario
 
@@ -200,21 +212,77 @@ def gallery(clean_run, toy):
 
 
 class TestGallery:
-    def test_every_scenario_shows_each_planner_clean_and_with_the_first_seed(self, gallery):
+    def test_every_scenario_shows_each_planner_clean_and_with_every_seed(self, gallery):
         tasks = gallery.tasks(gallery.tokens[0])
 
         assert [(t.planner, t.noise, t.seed) for t in tasks] == [
             ("constant-velocity", "none", 0),
             ("constant-velocity", "ou-high", 0),
+            ("constant-velocity", "ou-high", 1),
             ("log-future", "none", 0),
             ("log-future", "ou-high", 0),
+            ("log-future", "ou-high", 1),
         ]
+        assert gallery.shown_words(gallery.tokens[0]) == ""
 
     def test_the_choice_narrows_planners_noises_and_seeds(self, clean_run, toy):
         choice = Choice(planners=("log-future",), noises=("ou-high",), seeds=(1,))
         gallery = Gallery([clean_run], open_store(toy), choice)
 
         assert [t.seed for t in gallery.tasks(gallery.tokens[0])] == [1]
+        words = "1 of 1 rollouts shown, only planner log-future, noise ou-high, seed 1"
+        assert gallery.shown_words(gallery.tokens[0]) == words
+
+    def test_what_exceeds_a_page_follows_on_others_the_lowest_scores_first(
+        self, clean_run, gallery, tmp_path, monkeypatch
+    ):
+        monkeypatch.setattr("shiftsim.view.build.MAX_ROLLOUTS", 4)
+        token = gallery.tokens[0]
+
+        write_site(tmp_path, [gallery], title="toy")
+
+        first, second = gallery.parts(token)
+        cls = {task_of(row): row["cls"] for row in clean_run.scores.to_pylist()}
+        assert max(cls[task] for task in first) <= min(cls[task] for task in second)
+        metas = [
+            json.loads(sections((tmp_path / "replay" / page_name(token, part)).read_text())["meta"])
+            for part in (0, 1)
+        ]
+        assert [meta["shown"] for meta in metas] == [
+            "4 of 6 rollouts shown",
+            "2 of 6 rollouts shown",
+        ]
+        assert metas[0]["parts"] == [["1–4", page_name(token)], ["5–6", page_name(token, 1)]]
+        rows = json.loads(sections((tmp_path / "index.html").read_text())["rows"])
+        assert {task_of(row) for row in rows} == set(cls)
+        for row in rows:  # each link leads to the page and the place of its rollout
+            page = json.loads(sections((tmp_path / row["page"]).read_text())["meta"])
+            assert page["rollouts"][row["index"]]["planner"] == row["planner"]
+            assert page["rollouts"][row["index"]]["seed"] == row["seed"]
+
+    def test_rollouts_that_failed_or_are_not_stored_are_listed_failures_first(self, tmp_path):
+        lost = [("beta", "none", 0, f"t{number}") for number in range(4)]
+        run = write_run(tmp_path / "run", planners=("alpha", "beta"), missing=lost)
+        (gallery,) = galleries([run], [None], Choice())
+
+        assert write_site(tmp_path / "site", [gallery], title="made") == 0
+
+        page = (tmp_path / "site" / "index.html").read_text()
+        rows = json.loads(sections(page)["rows"])
+        assert [row["failed"] for row in rows] == ["failed", ""] * 4
+        assert all(row["page"] is None for row in rows)
+        assert "4 of 8 rollouts failed; 4 rollouts have no replay" in page
+        assert gallery.counts(["t0"]) == (2, 1, 2)
+
+    def test_a_page_and_a_list_say_what_they_leave_out(self, clean_run, toy, tmp_path):
+        gallery = Gallery([clean_run], open_store(toy), Choice(seeds=(1,)))
+
+        write_site(tmp_path, [gallery], title="toy", limit=1)
+
+        page = (tmp_path / "index.html").read_text()
+        assert "16 of 24 rollouts listed: only seed 1" in page
+        assert "replays of 1 of 4 scenarios, the others with --limit 0" in page
+        assert "of 4 scenarios</h2>" in page  # the worst of all, not of those with a page
 
     def test_a_folder_of_pages_links_every_rollout(self, gallery, tmp_path):
         count = write_site(tmp_path, [gallery], title="toy")

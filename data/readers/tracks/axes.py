@@ -27,6 +27,8 @@ _REFERENCE = (-0.15, 0.45)  # of the length, of the point that turns without sli
 def check_headings(table: TrackTable, fit: Fit, out: Diagnostics) -> None:
     """Whether headings are the directions of motion."""
     rows = table.moving_rows(FAST)
+    if table.headings is not None:
+        rows = rows[np.isfinite(table.headings[rows])]
     if table.headings is None or not len(rows):
         return
     column = table.columns.found["heading"]
@@ -104,7 +106,7 @@ def check_velocities(table: TrackTable, fit: Fit, out: Diagnostics) -> None:
             f"the second looks mirrored: [columns] vy = '-{y}'": given * [1, -1],
             f"the first looks mirrored: [columns] vx = '-{x}'": given * [-1, 1],
         }
-        if table.headings is not None:
+        if table.headings is not None and np.isfinite(table.headings[rows]).all():
             cos, sin = unit_vectors(table.headings[rows]).T
             along, across = given.T
             in_map = np.column_stack([along * cos - across * sin, along * sin + across * cos])
@@ -135,10 +137,11 @@ def check_reference(table: TrackTable, out: Diagnostics) -> None:
     if table.headings is None or table.sizes is None or table.columns.reference:
         return
     number = len(table.track_ids)
-    fast = table.is_vehicle & (table.speed > FAST)
+    known = table.is_vehicle & np.isfinite(table.headings)
+    fast = known & (table.speed > FAST)
     rows = np.flatnonzero(fast)
     turned = np.bincount(table.track[rows], np.abs(_turns(table, rows)), number)
-    rows = np.flatnonzero(table.is_vehicle & (turned > _LEAST_TURN)[table.track])
+    rows = np.flatnonzero(known & (turned > _LEAST_TURN)[table.track])
     if not len(rows):
         return
     track, fast = table.track[rows], fast[rows]
@@ -174,4 +177,4 @@ def _turns(table: TrackTable, rows: IntArray) -> FloatArray:
     assert table.headings is not None
     before = np.maximum(rows - 1, 0)
     before = np.where(table.track[before] == table.track[rows], before, rows)
-    return wrap_angles(table.headings[rows] - table.headings[before])
+    return np.nan_to_num(wrap_angles(table.headings[rows] - table.headings[before]))

@@ -1,7 +1,8 @@
 """Which column of a file is what, and in which unit: recognised by name, or named in a TOML file.
 
 A column of ours has a name (`ROLES`), the names that others give it, and a quantity, whose unit the
-name may end in: `x_m`, `heading_deg`, `timestamp_ms`, `v [km/h]`.
+name may end in: `x_m`, `heading_deg`, `timestamp_ms`, `v [km/h]`. Formats that are known by their
+columns (`_LAYOUTS`) say what a TOML file would have to.
 """
 
 import re
@@ -11,12 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.data.readers.codes import KINDS, normalise_category
+from shiftsim.data.readers.codes import KINDS, SAME, normalise_category
 from shiftsim.errors import ConfigError, ConversionError, nearest, one_of
 
 # our name -> quantity, and names in other files, the surest first
 _ROLES = {
-    "time": ("time", "time timestamp timestampus t timesteptime globaltime seconds simtime"),
+    "time": (
+        "time",
+        "time timestamp timestampus t timesteptime globaltime seconds simtime localtime",
+    ),
     "frame": ("frame", "frame frameid row framenumber frameindex timestep step"),
     "id": (
         "",
@@ -24,10 +28,14 @@ _ROLES = {
     ),
     "kind": (
         "",
-        "kind category class agenttype objecttype objectclass vehicleclass vehicletype type label",
+        "kind category class agenttype objecttype objectclass vehicleclass vehicletype vclass type"
+        " label",
     ),
-    "x": ("position", "xcenter centerx x positionx posx translationx vehiclex utmx easting"),
-    "y": ("position", "ycenter centery y positiony posy translationy vehicley utmy northing"),
+    "x": ("position", "xcenter centerx x positionx posx translationx vehiclex localx utmx easting"),
+    "y": (
+        "position",
+        "ycenter centery y positiony posy translationy vehicley localy utmy northing",
+    ),
     "heading": ("heading", "heading yaw psi orientation hdg theta headingangle vehicleangle angle"),
     "length": ("size", "length vehiclelength len dimensionx l vlength"),
     "width": ("size", "width vehiclewidth dimensiony w vwidth"),
@@ -48,6 +56,37 @@ _USUAL = {"time": "s", "position": "m", "heading": "rad", "size": "m", "velocity
 _SPELLINGS = {"m/s": "mps", "km/h": "kmh", "kph": "kmh", "kmph": "kmh", "sec": "s", "msec": "ms"}
 _SPELLINGS |= {"µs": "us", "feet": "ft", "degrees": "deg", "degree": "deg", "radians": "rad"}
 _SPELLINGS |= {"cm/s": "cmps", "ft/s": "ftps", "meters": "m", "metres": "m"}
+# columns that a format is known by, and what it says beside their names, as in the TOML file
+_LAYOUTS: dict[str, tuple[str, dict[str, Any]]] = {
+    "SUMO FCD": (
+        "vehicleangle vehiclelane",
+        {"reference": "front", "units": {"heading": "compass"}},
+    ),
+    "NGSIM": (
+        "localx localy vlength",
+        {
+            "reference": "front",
+            "units": {"position": "ft", "size": "ft", "time": "ms", "velocity": "ftps"},
+            "kinds": {"1": "motorcycle", "2": "car", "3": "truck"},
+        },
+    ),
+    "highD": (  # positions are the upper left corner of the box, y points down
+        "precedingxvelocity width height",
+        {
+            "reference": "corner",
+            "columns": {"y": "-y", "vy": "-yVelocity", "length": "width", "width": "height"},
+        },
+    ),
+    "levelXdata": ("xcenter tracklifetime", {"units": {"heading": "deg"}}),
+    "Songdo": (
+        "orthox localx droneid",
+        {
+            "units": {"velocity": "kmh"},
+            "kinds": {"0": "car", "1": "bus", "2": "truck", "3": "motorcycle"},
+        },
+    ),
+}
+_SETTINGS = ("columns", "units", "kinds", "hz", "shift_m", "reference", "header")
 
 
 @dataclass(frozen=True)
@@ -63,6 +102,11 @@ class Column:
         """What values are multiplied by to become ours."""
         return self.sign * UNITS.get(_ROLES[role][0], {}).get(self.unit, 1.0)
 
+    @property
+    def words(self) -> str:
+        """Its name with a minus where the sign is turned, or what all rows have."""
+        return f"{'-' * (self.sign < 0)}{self.name}" if self.name else f"={self.constant}"
+
 
 @dataclass(frozen=True)
 class Columns:
@@ -72,7 +116,8 @@ class Columns:
     kinds: Mapping[str, str] = field(default_factory=dict)  # a known category by theirs
     hz: float | None = None  # frames per second, where time is given in frames
     shift: tuple[float, float] = (0.0, 0.0)  # added to x and y [m]
-    reference: str = ""  # `front`, `rear` or `center`, where the user gives it
+    reference: str = ""  # `front`, `rear`, `corner` or `center`, where it is known
+    layout: str = ""  # the format, where it is known
 
     def unit_factors(self, role: str) -> dict[str, float]:
         """By unit, what the values of a column are multiplied by if they are in that one."""
@@ -88,22 +133,25 @@ def recognise(names: Sequence[str], overrides: Mapping[str, Any], where: str) ->
         ConversionError: A column that is needed is missing, or there twice.
     """
     for key in overrides:
-        one_of("setting", key, ("columns", "units", "kinds", "hz", "shift_m", "reference"))
+        one_of("setting", key, _SETTINGS)
     by_name: dict[str, list[tuple[str, str]]] = {}
     for name in names:
         base, unit = _split_unit(name)
         by_name.setdefault(base, []).append((name, unit))
+    fitting_layouts = [n for n, (m, _) in _LAYOUTS.items() if all(w in by_name for w in m.split())]
+    layout = fitting_layouts[0] if fitting_layouts else ""
+    given = _LAYOUTS[layout][1] if layout else {}
+    usual = _USUAL | given.get("units", {})
     found = {}
     for role, (quantity, known) in _ROLES.items():
         for word in known.split():
             fitting = [(n, u) for n, u in by_name.get(word, []) if not u or u in UNITS[quantity]]
             if fitting:
                 name, unit = fitting[0]
-                found[role] = Column(name, unit or _USUAL.get(quantity, ""))
+                found[role] = Column(name, unit or usual.get(quantity, ""))
                 break
-    if "xcenter" in by_name and "tracklifetime" in by_name:  # levelXdata: no units in names
-        found = {r: replace(c, unit="deg") if r == "heading" else c for r, c in found.items()}
-    found |= _named_columns(overrides.get("columns", {}), found, names, where)
+    named = {r: n for r, n in given.get("columns", {}).items() if n.lstrip("-") in names}
+    found |= _named_columns(named | overrides.get("columns", {}), found, names, usual, where)
     found = {role: column for role, column in found.items() if column.name or column.constant}
     for quantity, unit in _table(overrides, "units").items():
         one_of("unit of", quantity, tuple(UNITS))
@@ -123,15 +171,15 @@ def recognise(names: Sequence[str], overrides: Mapping[str, Any], where: str) ->
     hz = overrides.get("hz", 1.0)
     if not isinstance(hz, int | float) or not 0.0 < hz < np.inf:
         raise ConfigError(f"hz is {hz!r}", "hz = 25, or --hz 25")
-    reference = overrides.get("reference", "")
+    reference = overrides.get("reference", given.get("reference", ""))
     if reference:
-        one_of("reference", reference, ("center", "front", "rear"))
-    kinds = {
-        normalise_category(k): normalise_category(v) for k, v in _table(overrides, "kinds").items()
-    }
+        one_of("reference", reference, ("center", "front", "rear", "corner"))
+    told = SAME | given.get("kinds", {}) | _table(overrides, "kinds")
+    kinds = {normalise_category(k): normalise_category(v) for k, v in told.items()}
     for known_kind in kinds.values():
         one_of("kind", known_kind, KINDS)
-    return Columns(found, kinds, overrides.get("hz"), (float(shift[0]), float(shift[1])), reference)
+    places = (float(shift[0]), float(shift[1]))
+    return Columns(found, kinds, overrides.get("hz"), places, reference, layout)
 
 
 def _split_unit(name: str) -> tuple[str, str]:
@@ -145,12 +193,16 @@ def _split_unit(name: str) -> tuple[str, str]:
 
 
 def _named_columns(
-    overrides: Mapping[str, str], found: Mapping[str, Column], names: Sequence[str], where: str
+    overrides: Mapping[str, str],
+    found: Mapping[str, Column],
+    names: Sequence[str],
+    units: Mapping[str, str],
+    where: str,
 ) -> dict[str, Column]:
     out = {}
     for role, text in overrides.items():
         one_of("column", role, ROLES)
-        usual = _USUAL.get(_ROLES[role][0], "")
+        usual = units.get(_ROLES[role][0], "")
         if text.startswith("="):
             out[role] = Column("", usual, constant=text[1:])
             continue
@@ -171,25 +223,23 @@ def _require_columns(found: Mapping[str, Column], names: Sequence[str], where: s
     lat = [
         name for name in names if _split_unit(name)[0] in ("lat", "latitude", "lon", "longitude")
     ]
-    for role in ("id", "x", "y", "kind"):
-        if role in found:
-            continue
-        hint = f"say which it is in a TOML file for --columns: [columns] {role} = 'NAME'"
-        if role in ("x", "y") and lat:
-            hint = (
-                f"{' and '.join(lat)} are degrees: project them to the metric frame of the map"
-                " (pyproj), and give x and y in metres"
-            )
-        if role == "kind":
-            hint += ", or kind = '=car' if all objects are cars"
-        raise ConversionError(
-            f"{where} has no column that is known as {role!r}; it has {', '.join(names)}", hint
-        )
+    missing = [role for role in ("id", "x", "y", "kind") if role not in found]
+    what = [f"no column that is known as {', '.join(map(repr, missing))}"] if missing else []
     if "time" not in found and "frame" not in found:
-        raise ConversionError(
-            f"{where} has neither a time nor a frame; it has {', '.join(names)}",
-            "say which column it is in a TOML file for --columns: [columns] time = 'NAME'",
+        what.append("neither a time nor a frame")
+        missing.append("time")
+    if not what:
+        return
+    lines = [f"{role} = 'NAME'" for role in missing]
+    hint = f"say which they are in a TOML file for --columns: [columns] {', '.join(lines)}"
+    if "kind" in missing:
+        hint += ", or kind = '=car' if all objects are cars"
+    if lat and {"x", "y"} & set(missing):
+        hint += (
+            f"; {' and '.join(lat)} are degrees: project them to the metric frame of the map"
+            " (pyproj), and give x and y in metres"
         )
+    raise ConversionError(f"{where} has {' and '.join(what)}; it has {', '.join(names)}", hint)
 
 
 def _table(overrides: Mapping[str, Any], key: str) -> dict[str, str]:

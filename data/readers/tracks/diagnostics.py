@@ -69,7 +69,7 @@ def _check_kinds(table: TrackTable, out: Diagnostics) -> bool:
     elif not table.is_vehicle.any():
         out.error(
             f"none of the {len(table.track_ids)} objects is a vehicle, so none can be the ego:"
-            f" kinds {', '.join(map(repr, table.categories))}",
+            f" kinds {', '.join(map(repr, used))}",
             "check the column of kinds, or map them: [kinds]",
         )
     return not out.errors
@@ -227,7 +227,7 @@ def _check_map(table: TrackTable, road: VectorMap, min_share: float, out: Diagno
     )
     if fit.best is not None:
         what += f"; {fit.best.share:.0%} {fit.best.words}"
-        names = (table.columns.found[axis].name for axis in "xy")
+        names = (table.columns.found[axis].words for axis in "xy")
         remedy = f"in a TOML file: {', and '.join(fit.best.remedies(*names))}"
     out.error(what, remedy)
     return fit
@@ -316,6 +316,7 @@ def _check_sizes(table: TrackTable, out: Diagnostics) -> None:
             names = [table.columns.found[role].name for role in ("width", "length")]
             remedy = "length and width look swapped: [columns] length = {!r}, width = {!r}"
             remedy = remedy.format(*names) + f", [units] size = {unit!r}" * (scale != 1.0)
+            remedy += "; where x and y are a corner of the box, reference = 'corner' too"
     if _is_usual(2.0 * length, 2.0 * width):
         remedy = "these look like halves (extents from the middle): write whole lengths and widths"
     out.error(

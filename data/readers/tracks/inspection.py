@@ -25,6 +25,7 @@ from shiftsim.data.readers.windows import ConversionConfig
 from shiftsim.data.store.map import read_map_file
 from shiftsim.data.store.tables import MANIFEST, map_file
 from shiftsim.errors import ConversionError
+from shiftsim.kernels import FloatArray
 from shiftsim.world.map import VectorMap
 
 
@@ -39,6 +40,7 @@ class Inspection(Reader):
     diagnostics: Diagnostics
     config: ConversionConfig
     egos: Sequence[str] | None = None  # ids of the egos; None for every vehicle that can be one
+    more: Sequence[Path] = ()  # files of the same recording
 
     def __post_init__(self) -> None:
         columns = asdict(self.table.columns) | {"hz": self.table.hz}
@@ -56,7 +58,7 @@ class Inspection(Reader):
 
     def files(self, recording: str) -> Sequence[Path]:
         """The table and the map."""
-        return [self.source, self.map_path]
+        return [self.source, *self.more, self.map_path]
 
     def read(self, recording: str) -> SourceRecording:
         """The recording."""
@@ -73,7 +75,7 @@ class Inspection(Reader):
             sizes=table.sizes,
             kind_of=KINDS,
         )
-        columns = {role: column.name for role, column in table.columns.found.items()}
+        columns = {role: column.words for role, column in table.columns.found.items()}
         return SourceRecording(
             samples,
             self.site,
@@ -85,7 +87,7 @@ class Inspection(Reader):
 
 
 def inspect_tracks(
-    tracks: Path,
+    tracks: Path | Sequence[Path],
     map_path: Path,
     *,
     city: str | None = None,
@@ -96,7 +98,7 @@ def inspect_tracks(
     """Read a file of tracks and its map, and find out whether they can be right.
 
     Args:
-        tracks: CSV or Parquet file, one row per object and time.
+        tracks: CSV or Parquet file, one row per object and time; several make one recording.
         map_path: OpenDRIVE file.
         city: Name of the map in the store; that of the file by default.
         overrides: Names, units and kinds (`columns.recognise`).
@@ -108,11 +110,45 @@ def inspect_tracks(
         ConfigError: An override does not fit the file.
     """
     config = config or ConversionConfig(ego_categories=EGO_CATEGORIES)
-    table = read_tracks(tracks, overrides=overrides, hz=hz)
+    files = [tracks] if isinstance(tracks, Path) else tracks
+    table = read_tracks(files, overrides=overrides, hz=hz)
     drive = read_opendrive(map_path)
     site = opendrive_site(drive, name=city or map_path.stem, country=config.country)
+    if table.origin and "shift_m" not in (overrides or {}):
+        table = _at_origin(table, site.road, table.origin)
     diagnostics = diagnose(table, site.road, config.min_drivable_share)
-    return Inspection(tracks, map_path, table, site, diagnostics, config)
+    _note_inputs(files, table, diagnostics)
+    return Inspection(files[0], map_path, table, site, diagnostics, config, more=files[1:])
+
+
+def _at_origin(table: TrackTable, road: VectorMap, origin: tuple[float, float]) -> TrackTable:
+    """Tracks moved by the origin of their frame, where that brings them nearer to the map."""
+    bounds, middle = road.edges.polygons.bounds, np.median(table.xy, axis=0)
+    low, high = bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)
+
+    def gap(place: FloatArray) -> float:
+        return float(np.hypot(*(place - np.clip(place, low, high))))
+
+    if gap(middle + origin) >= gap(middle):
+        return table
+    return replace(table, xy=table.xy + origin, columns=replace(table.columns, shift=origin))
+
+
+def _note_inputs(files: Sequence[Path], table: TrackTable, out: Diagnostics) -> None:
+    """What the user should know of a shift of their own, and of tables that are not read."""
+    shift, origin = table.columns.shift, table.origin
+    if any(shift) and shift != origin:
+        out.warn(
+            f"positions are shifted by shift_m = [{shift[0]}, {shift[1]}]; one that was found"
+            " by search is approximate: a lane beside looks the same",
+            "give the difference between the origins of map and tracks"
+            + (f"; recordingMeta says [{origin[0]}, {origin[1]}]" if origin else ""),
+        )
+    for path in files:
+        for ours, theirs in (("vehicle", "pedestrian"), ("pedestrian", "vehicle")):
+            other = path.with_name(path.name.replace(f"{ours}_tracks", f"{theirs}_tracks"))
+            if other not in files and other.is_file():
+                out.warn(f"{other.name} lies beside and is not read", "give both tables")
 
 
 def convert_tracks(

@@ -58,7 +58,9 @@ class Guess:
         out = []
         if self.axes:
             rows = [
-                f"{axis} = '{'-' if row.sum() < 0 else ''}{(x, y)[int(row[1] != 0)]}'"
+                f"{axis} = '{'-' if row.sum() < 0 else ''}{(x, y)[int(row[1] != 0)]}'".replace(
+                    "--", ""
+                )
                 for axis, row in zip("xy", _AXES[self.axes], strict=True)
             ]
             out.append(
@@ -69,8 +71,9 @@ class Guess:
             out.append(f"[units] position = {self.unit!r}")
         if self.shift.any():
             out.append(
-                f"shift_m = [{self.shift[0]:.1f}, {self.shift[1]:.1f}], or, exact, the difference"
-                " between the origins of map and tracks"
+                f"shift_m = [{self.shift[0]:.1f}, {self.shift[1]:.1f}] (approximate, found by"
+                " search: a lane beside looks the same), or, exact, the difference between the"
+                " origins of map and tracks"
             )
         return out
 

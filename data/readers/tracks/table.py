@@ -1,6 +1,9 @@
 """Tracks from CSV or Parquet: one row per object and time, in SI units afterwards."""
 
-from collections.abc import Mapping
+import io
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -8,11 +11,18 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute
 import pyarrow.csv as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from shiftsim.data.readers.build import dictionary_codes, index_ids
+from shiftsim.data.readers.build import (
+    dictionary_codes,
+    find_twice,
+    full_headings,
+    full_sizes,
+    index_ids,
+)
 from shiftsim.data.readers.codes import KINDS, normalise_category
 from shiftsim.data.readers.files import SourceFile
 from shiftsim.data.readers.motion import (
@@ -21,14 +31,15 @@ from shiftsim.data.readers.motion import (
     track_medians,
     unit_vectors,
 )
-from shiftsim.data.readers.tracks.columns import Columns, recognise
+from shiftsim.data.readers.tracks.columns import Column, Columns, recognise
 from shiftsim.errors import ConfigError, ConversionError
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.world.state import AgentKind
 
 _DELIMITERS = ",;\t|"
 _MAX_ROWS = 40_000  # that statistics look at
-_FIELDS = {"x": "position", "y": "position", "heading": "heading"}  # that nothing replaces
+_IN_US = Column("", "us")
+_FIELDS = {"x": "position", "y": "position", "heading": "heading"}
 
 
 @dataclass(frozen=True)
@@ -44,9 +55,10 @@ class TrackTable:
     category: IntArray  # (A,) index into `categories`
     categories: tuple[str, ...]  # normalised names
     xy: FloatArray  # (A, 2) [m]
-    headings: FloatArray | None  # (A,) [rad]
+    headings: FloatArray | None  # (A,) [rad], NaN where not given
     velocities: FloatArray | None  # (A, 2) [m/s]
     sizes: FloatArray | None  # (A, 2) length, width [m]
+    origin: tuple[float, float] | None = None  # of the positions, where a file beside tells it [m]
 
     @cached_property
     def time(self) -> FloatArray:
@@ -103,9 +115,12 @@ class TrackTable:
 
 
 def read_tracks(
-    path: Path, *, overrides: Mapping[str, Any] | None = None, hz: float | None = None
+    path: Path | Sequence[Path],
+    *,
+    overrides: Mapping[str, Any] | None = None,
+    hz: float | None = None,
 ) -> TrackTable:
-    """The rows of a CSV or Parquet file.
+    """The rows of a CSV or Parquet file, or of several that are one recording.
 
     Args:
         path: The file; `*Meta.csv` files of levelXdata beside it are read too.
@@ -116,7 +131,8 @@ def read_tracks(
         ConversionError: The file cannot be read, a column is missing or holds something else.
         ConfigError: An override does not fit the file.
     """
-    file = _TableFile(path, {**(overrides or {}), **({"hz": hz} if hz is not None else {})})
+    paths = [path] if isinstance(path, Path) else path
+    file = _TableFile(paths, {**(overrides or {}), **({"hz": hz} if hz is not None else {})})
     columns = file.columns_of
     time_us, rate = file.times()
     track_ids, track = index_ids(file.ids())
@@ -127,7 +143,8 @@ def read_tracks(
         """(A, number of roles) their values, or nothing where one is missing."""
         if not all(role in columns.found for role in roles):
             return None
-        return np.column_stack([file.values(role)[order] for role in roles])
+        values = np.column_stack([file.values(role)[order] for role in roles])
+        return None if np.isnan(values).all() else values
 
     xy, heading = stacked("x", "y"), stacked("heading")
     headings = None if heading is None else heading[:, 0]
@@ -137,16 +154,8 @@ def read_tracks(
     xy += columns.shift
     if speed is not None and headings is not None:
         velocity = speed * unit_vectors(headings)
-    if columns.reference in ("front", "rear"):
-        if headings is None or size is None:
-            raise ConfigError(
-                f"reference = {columns.reference!r} needs heading and length of the objects",
-                "name these columns",
-            )
-        back = -0.5 if columns.reference == "front" else 0.5
-        xy += back * size[:, :1] * unit_vectors(headings)
-    return TrackTable(
-        path.name.partition(".")[0],
+    table = TrackTable(
+        paths[0].name.partition(".")[0],
         columns,
         rate,
         time_us[order],
@@ -158,7 +167,24 @@ def read_tracks(
         headings,
         velocity,
         size,
+        file.origin,
     )
+    return replace(table, xy=_centers(table))
+
+
+def _centers(table: TrackTable) -> FloatArray:
+    """(A, 2) middles of the boxes, of whose positions the columns tell which point they are [m]."""
+    reference, found = table.columns.reference, table.columns.found
+    if reference in ("", "center") or find_twice(table.track_ids, table.track, table.time_us):
+        return table.xy
+    names = [table.categories[code] for code in table.category[table.ends[:-1]].tolist()]
+    kinds = np.array([KINDS.get(name, AgentKind.VEHICLE) for name in names], np.int64)
+    sizes = full_sizes(table.sizes, names, kinds, table.track, Counter())[table.track]
+    if reference == "corner":  # the one with the least numbers in the file
+        return table.xy + 0.5 * sizes * [found["x"].sign, found["y"].sign]
+    headings = full_headings(table.headings, table.derived, table.track, Counter())
+    back = -0.5 if reference == "front" else 0.5
+    return table.xy + back * sizes[:, :1] * unit_vectors(headings)
 
 
 class _TableFile(SourceFile):
@@ -166,13 +192,19 @@ class _TableFile(SourceFile):
 
     remedy = "repair the file, or name other columns with --columns"
 
-    def __init__(self, path: Path, overrides: dict[str, Any]) -> None:
-        super().__init__(path)
-        if not path.is_file():
-            what = "is no file" if path.exists() else "does not exist"
-            raise ConversionError(f"{path} {what}", "give a CSV or Parquet file")
+    def __init__(self, paths: Sequence[Path], overrides: dict[str, Any]) -> None:
+        tables = []
+        for path in paths:
+            super().__init__(path)
+            if not path.is_file():
+                what = "is no file" if path.exists() else "does not exist"
+                raise ConversionError(f"{path} {what}", "give a CSV or Parquet file")
+            tables.append(self._load(overrides.get("header")))
         self.kinds: dict[int, str] | None = None  # by id, from levelXdata's files
-        self.table = self._load()
+        self.origin: tuple[float, float] | None = None  # from the same [m]
+        if len(tables) > 1:
+            self.path = Path(" + ".join(map(str, paths)))
+        self.table = self._joined(tables)
         names = self.table.column_names
         if path.stem.endswith("_tracks"):  # levelXdata: kinds and rate are in files beside it
             self._read_beside(overrides, names)
@@ -180,8 +212,24 @@ class _TableFile(SourceFile):
         if not len(self.table):
             raise ConversionError(f"{path} has no rows", "export the tracks again")
 
-    def _load(self) -> pa.Table:
-        """All columns; of CSV, the first two lines tell the delimiter and the decimal point."""
+    def _joined(self, tables: list[pa.Table]) -> pa.Table:
+        """One table; what is a number in one and a text in another becomes a text."""
+        if len(tables) == 1:
+            return tables[0]
+        texts = {f.name for table in tables for f in table.schema if pa.types.is_string(f.type)}
+        try:
+            for number, table in enumerate(tables):
+                kinds = [f.with_type(pa.string()) if f.name in texts else f for f in table.schema]
+                tables[number] = table.cast(pa.schema(kinds))
+            return pa.concat_tables(tables, promote_options="permissive")
+        except (pa.ArrowException, ValueError) as error:
+            raise self.fault(f"not one table ({error})", "give each the same columns") from error
+
+    def _load(self, header: object) -> pa.Table:
+        """All columns; of CSV, the first two lines tell the delimiter and the decimal point.
+
+        `header` are the names of the columns where the file does not tell them.
+        """
         try:
             if self.path.suffix.lower() in (".parquet", ".pq"):
                 return pq.read_table(self.path, use_threads=False)
@@ -189,11 +237,21 @@ class _TableFile(SourceFile):
                 lines = stream.read(1 << 16).decode("utf-8-sig", "replace").splitlines()[:2]
             if not lines:
                 raise ConversionError(f"{self.path} is empty", "export the tracks again")
+            source: Path | io.BytesIO = self.path
             delimiter = max(_DELIMITERS, key=lines[0].count)
+            if delimiter not in lines[0] and len(lines[0].split()) > 1:  # any number of spaces
+                with pa.input_stream(str(self.path), compression="detect") as stream:
+                    rows = [b",".join(row.split()) for row in stream.read().splitlines()]
+                source, lines = io.BytesIO(b"\n".join(rows)), [rows[0].decode("utf-8", "replace")]
+            is_named = self._is_named(lines[0].split(delimiter), header)
             has_comma = delimiter != "," and "," in lines[-1] and "." not in lines[-1]
             return pc.read_csv(
-                self.path,
-                read_options=pc.ReadOptions(use_threads=False),
+                source,
+                read_options=pc.ReadOptions(
+                    use_threads=False,
+                    column_names=header,
+                    skip_rows=int(is_named and header is not None),
+                ),
                 parse_options=pc.ParseOptions(delimiter=delimiter),
                 convert_options=pc.ConvertOptions(decimal_point="," if has_comma else "."),
             )
@@ -202,16 +260,35 @@ class _TableFile(SourceFile):
                 f"not readable ({error})", "give CSV in UTF-8, or Parquet (.parquet)"
             ) from error
 
+    def _is_named(self, cells: list[str], header: object) -> bool:
+        """Whether the first line of a file are names, not numbers."""
+        numbers = [bool(re.fullmatch(r'[\s"]*[-+\d.,eE:]*\d[\s".]*', cell)) for cell in cells]
+        is_named = 2 * sum(numbers) < len(cells)
+        if header is None and not is_named:
+            raise self.fault(
+                f"the first line holds numbers: no header ({', '.join(cells[:4])[:60]} …)",
+                f"name all {len(cells)} columns in order in a TOML file for --columns:"
+                " header = ['id', 'frame', 'x', 'y', 'kind', …] (those not needed ''), or write"
+                " such names as the first line",
+            )
+        is_list = isinstance(header, list) and all(isinstance(name, str) for name in header)
+        if header is not None and (not is_list or len(header) != len(cells)):  # type: ignore[arg-type]
+            raise ConfigError(f"header is {header!r}", f"give a list of {len(cells)} names")
+        return is_named
+
     def _read_beside(self, overrides: dict[str, Any], names: list[str]) -> None:
-        """Rate and kinds from levelXdata's files; what the user gives goes first."""
+        """Origin, rate and kinds from levelXdata's files; what the user gives goes first."""
         stem = self.path.stem.removesuffix("tracks")
         rates, kinds = (
             self.path.with_name(f"{stem}{part}Meta.csv") for part in ("recording", "tracks")
         )
         file = rates
         try:
-            if rates.is_file() and "hz" not in overrides:
-                overrides["hz"] = float(pc.read_csv(rates).to_pydict()["frameRate"][0])
+            if rates.is_file():
+                meta = pc.read_csv(rates).to_pydict()
+                overrides.setdefault("hz", float(meta["frameRate"][0]))
+                if "xUtmOrigin" in meta:
+                    self.origin = float(meta["xUtmOrigin"][0]), float(meta["yUtmOrigin"][0])
             file = kinds
             has_kinds = {"class", "kind"} & {name.lower() for name in names}
             if kinds.is_file() and not has_kinds:
@@ -236,7 +313,7 @@ class _TableFile(SourceFile):
         except (pa.ArrowException, ValueError) as error:
             kind = self.table[column.name].type
             raise self.fault(f"column {column.name!r} is {kind}, need numbers") from error
-        needed = role in _FIELDS
+        needed = role in ("x", "y")
         bad = np.flatnonzero(~np.isfinite(values) if needed else np.isinf(values))
         if len(bad):
             raise self.fault(
@@ -245,8 +322,8 @@ class _TableFile(SourceFile):
                 f"leave these {'rows out of the file' if needed else 'values empty'}",
             )
         values *= column.factor(role)
-        if needed:
-            self.require(_FIELDS[role], values, f"column {column.name!r}")
+        if role in _FIELDS:
+            self.require(_FIELDS[role], values[np.isfinite(values)], f"column {column.name!r}")
         return np.pi / 2 - values if column.unit == "compass" else values
 
     def times(self) -> tuple[IntArray, float | None]:
@@ -267,10 +344,15 @@ class _TableFile(SourceFile):
             if pa.types.is_timestamp(values.type) or pa.types.is_duration(values.type):
                 column = replace(column, unit=values.type.unit)
                 values = values.cast(pa.int64())
+            elif pa.types.is_time(values.type):
+                values, column = values.cast(pa.time64("us")).cast(pa.int64()), _IN_US
+            elif pa.types.is_string(values.type):  # a clock: 09:00:00.033
+                dates = pa.compute.binary_join_element_wise("1970-01-01T", values, "")
+                values, column = dates.cast(pa.timestamp("us")).cast(pa.int64()), _IN_US
             stamps = _floats(values)
         except (pa.ArrowException, ValueError) as error:
             what = f"column {column.name!r} is {values.type}, need times"
-            hint = "give seconds, or dates and times such as 2024-05-01T13:02:03.040"
+            hint = "give seconds, 13:02:03.040, or dates with times: 2024-05-01T13:02:03.040"
             raise self.fault(what, hint) from error
         stamps *= 1e6 if is_frame else column.factor(role)
         stamps /= rate if is_frame and rate else 1.0
@@ -286,6 +368,12 @@ class _TableFile(SourceFile):
     def ids(self) -> pa.ChunkedArray:
         """Integers or texts."""
         name = self.columns_of.found["id"].name
+        cases = len(self.table["case_id"].unique()) if "case_id" in self.table.column_names else 1
+        self.require_that(
+            cases == 1,
+            f"column 'case_id' tells {cases} recordings apart, which share ids and times",
+            "write each into a file of its own",
+        )
         column = self.table[name]
         if empty := int(column.is_null(nan_is_null=True).to_numpy().sum()):
             raise self.fault(f"column {name!r} is empty in {empty} rows", "give objects ids")

@@ -163,7 +163,7 @@ def test_a_recording_becomes_scenarios_of_the_benchmark_s_form(tmp_path):
     assert scene.num_iterations == 150
     assert scene.iteration_rows[:2].tolist() == [60, 62]
     assert scene.mapping == (15.0, 0.0, 0.5)
-    assert scene.scenario_type == "deepplan"
+    assert scene.scenario_type == "unlabelled"
     assert scene.tracks.tokens == ("2",)
     assert scene.city == "town"
     assert scene.mission_goal[0] == pytest.approx(500_020 + 240 - 1.461, abs=1e-6)

@@ -369,6 +369,31 @@ def test_an_infinite_speed_or_size_is_no_missing_one(name, town, tmp_path):
     assert np.isnan(kept).sum() == 1
 
 
+def test_rows_without_a_heading_get_the_direction_of_motion(town, tmp_path):
+    columns, road = town
+    heading = columns["heading_rad"].copy()
+    heading[::3] = np.nan
+    path = write_tracks(tmp_path / "t.csv", columns, heading_rad=heading)
+    found = _diagnose(path, road)
+    assert not found.errors
+    assert found.figures["heading_error_rad"] < 0.05
+    wrong = write_tracks(tmp_path / "t.csv", columns, heading_rad=np.rad2deg(heading))
+    assert "'deg'" in _diagnose(wrong, road).errors[0].remedy
+
+
+def test_front_positions_need_neither_heading_nor_size(town, tmp_path):
+    columns, _ = town
+    ahead = _along(0.5)({**columns, "length_m": np.where(columns["kind"] == "truck", 12.0, 4.6)})
+    bare = dict.fromkeys(("heading_rad", "length_m", "width_m", "vx_mps", "vy_mps"))
+    path = write_tracks(tmp_path / "t.csv", columns, **ahead, **bare)
+    table = read_tracks(path, overrides={"reference": "front"})
+    order = np.lexsort((columns["time_s"], columns["track"]))
+    truth = np.column_stack([columns["x_m"], columns["y_m"]])[order]
+    used = np.isin(columns["kind"][order], ["car", "truck"]) & (table.speed > 4.0)
+    error = np.hypot(*(table.xy - truth)[used].T)
+    assert np.median(error) < 0.1
+
+
 def test_pedestrians_as_long_as_cars_are_named(town, tmp_path):
     columns, road = town
     length = np.maximum(columns["length_m"], 4.5)

@@ -281,7 +281,7 @@ def test_the_rows_that_have_a_size_tell_that_of_the_track(town):
     sizes["width_m"][1::4] = 0.0
     np.testing.assert_array_equal(_samples(town[0], **sizes).sizes, _samples(town[0]).sizes)
     sizes["length_m"][:] = np.nan
-    assert set(_samples(town[0], **sizes).sizes[:, 0].tolist()) == {4.6, 1.8, 0.7}
+    assert set(_samples(town[0], **sizes).sizes[:, 0].tolist()) == {4.6, 12.0, 1.8, 0.7}
 
 
 @pytest.mark.parametrize("beside", [True, False])
