@@ -90,7 +90,7 @@ def comfort_signals(time_us: IntArray, states: FloatArray) -> ComfortSignals:
     magnitude = np.sqrt(states[:, AX] ** 2 + states[:, AY] ** 2)
     smooth, jerk, yaw_rate, yaw_accel = filters_of(len(time_us))
     lon, lat, mag = (_filtered(v, smooth, 1.0) for v in (*center, magnitude))
-    heading = _unwrap(states[:, HEADING])
+    heading = unwrap(states[:, HEADING])
     return ComfortSignals(
         lon_accel=lon,
         lat_accel=lat,
@@ -179,7 +179,8 @@ def _percentiles_90(values: FloatArray) -> FloatArray:
     return found
 
 
-def _unwrap(angles: FloatArray) -> FloatArray:
+def unwrap(angles: FloatArray) -> FloatArray:
+    """Angles (K,) without turns of 2 pi between neighbours."""
     turns = np.cumsum(np.rint(np.diff(angles) / (2.0 * np.pi)))
     out = np.array(angles, np.float64)
     out[1:] -= 2.0 * np.pi * turns

@@ -85,7 +85,11 @@ def planner_factory(spec: str) -> Any:
                 )
             compat = importlib.import_module(adapter)
             compat.install()
-            return compat.factory(planner_factory(spec.removeprefix(prefix)))
+            inner = spec.removeprefix(prefix)
+            try:
+                return compat.factory(planner_factory(inner))
+            except MissingExtraError as error:
+                raise compat.with_all_missing(error, inner.rpartition(":")[0]) from error
     entry = PLANNERS.get(spec)
     if entry is None and spec.endswith(".py"):
         raise ConfigError(

@@ -34,7 +34,7 @@ NEIGHBOURS = {
     "train": ("env", "report.palette"),
 }
 LAZY = {"torch", "dask", "distributed", "matplotlib", "gymnasium"}
-MAY_IMPORT_TORCH = re.compile(r"planners/learned/(\w+/)?network|/(env|train)/")
+MAY_IMPORT_TORCH = re.compile(r"planners/learned/(\w+/)?network|/(env|train)/|shims/torch_modules")
 SOURCES = sorted(
     path
     for folder in ("shiftsim", "planners", "metrics", "data", "benchmarks")

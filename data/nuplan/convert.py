@@ -1,13 +1,22 @@
 """nuPlan logs and maps -> a scenario store."""
 
 import logging
+import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-from shiftsim.data.nuplan.filter import ScenarioFilter, read_filter
+from shiftsim.data.nuplan.filter import (
+    JUDGED,
+    KEY_OF,
+    LISTED,
+    THINNED,
+    ScenarioFilter,
+    read_filter,
+)
 from shiftsim.data.nuplan.log import Log, open_log
 from shiftsim.data.nuplan.sampling import is_taken, thin_out
 from shiftsim.data.nuplan.scenarios import (
@@ -21,6 +30,7 @@ from shiftsim.data.nuplan.scenarios import (
     read_span,
 )
 from shiftsim.data.recording import Window
+from shiftsim.data.store.tables import MANIFEST, SCENARIOS
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import ConversionError, DataError
 from shiftsim.world.map import VectorMap
@@ -42,6 +52,10 @@ class ConversionReport:
     failed: dict[str, str] = field(default_factory=dict)
     # counts of what the source got wrong and nuPlan tolerates, by `where: what`
     flaws: Counter[str] = field(default_factory=Counter)
+    # where the filter takes nothing: how many scenarios each of its keys left, and which types,
+    # maps and logs there are
+    left: dict[str, int] = field(default_factory=dict)
+    offers: dict[str, Counter[str]] = field(default_factory=dict)
 
 
 def convert_nuplan(
@@ -68,14 +82,17 @@ def convert_nuplan(
         progress: Called with logs done, number of logs, and the log's name.
 
     Returns:
-        What was converted, and what failed and why. One broken scenario stops no other.
+        What was converted, and what failed and why. One broken scenario stops no other. Where
+        nothing was, no new store is left.
 
     Raises:
         DataError: There are no logs or no maps, or the store cannot be written.
         ConfigError: The filter asks for something that is not supported.
     """
     chosen = _choice(tokens, types, filter_file)
-    files = _log_files(Path(logs), chosen)
+    every = _log_files(Path(logs))
+    files = [path for path in every if chosen.logs is None or path.stem in chosen.logs]
+    is_new, was_there = not (Path(store) / MANIFEST).exists(), Path(store).exists()
     with StoreWriter(store) as writer:
         conversion = _Conversion(chosen, mapping, find_maps(Path(maps)), writer)
         report = conversion.report
@@ -97,6 +114,14 @@ def convert_nuplan(
     unread = [path.name for path in files if path.stem in report.failed]
     for token in sorted((chosen.tokens or frozenset()) - conversion.found):
         report.failed[token] = _missing([path.name for path in files], unread)
+    if not (report.converted or report.unchanged):
+        if not report.failed:
+            _explain(every, conversion)
+        if is_new:
+            for name in (MANIFEST, SCENARIOS):
+                (Path(store) / name).unlink()
+            if not was_there:
+                shutil.rmtree(store)
     for flaw, count in report.flaws.items():
         _LOG.warning("%s (%d)", flaw, count)
     return report
@@ -115,6 +140,52 @@ def _thinned(
         except DataError as error:
             conversion.report.failed[path.stem] = _reason(error)
     return {(e.log_name, e.token) for e in thin_out(entries, conversion.chosen)}
+
+
+def _explain(files: Sequence[Path], conversion: "_Conversion") -> None:
+    """Note what logs offer, and how many scenarios are left by one key after the other."""
+    chosen, report, empty = conversion.chosen, conversion.report, ScenarioFilter()
+    fields = [name for name in KEY_OF if getattr(chosen, name) != getattr(empty, name)]
+    counts = Counter({"offered": 0, **{name: 0 for name in fields}})
+    offers = {what: Counter[str]() for what in ("types", "maps", "logs")}
+    entries: list[ScenarioEntry] = []
+    for path in files:
+        with open_log(path) as log:
+            kept, so_far = _asked_for(log, empty), empty
+            counts["offered"] += len(kept)
+            offers["types"].update(entry.scenario_type for entry in kept)
+            offers["maps"][log.map_name] += len(kept)
+            offers["logs"][log.name] += len(kept)
+            for name in (name for name in LISTED if name in fields):
+                so_far = replace(so_far, **{name: getattr(chosen, name)})
+                kept = _asked_for(log, so_far)
+                counts[name] += len(kept)
+            entries += kept
+    so_far = replace(empty, shuffle=chosen.shuffle)
+    taken = entries
+    for name in (name for name in THINNED if name in fields):
+        so_far = replace(so_far, **{name: getattr(chosen, name)})
+        taken = thin_out(entries, so_far)
+        counts[name] = len(taken)
+    tokens = {(entry.log_name, entry.token) for entry in taken}
+    for path in files if tokens else ():
+        with open_log(path) as log:
+            for entry in _asked_for(log, chosen):
+                if (log.name, entry.token) in tokens:
+                    window = cut_window(log, entry.token, conversion.mapping, entry.scenario_type)
+                    conversion.judge(log, window, counts)
+    unused = {"shuffle", "speed_noise"}
+    report.left = {KEY_OF.get(name, name): n for name, n in counts.items() if name not in unused}
+    report.offers = offers
+
+
+def _asked_for(log: Log, chosen: ScenarioFilter) -> list[ScenarioEntry]:
+    """The scenarios of a log that the lists of a filter name."""
+    for wanted, name in ((chosen.logs, log.name), (chosen.maps, log.map_name)):
+        if wanted is not None and name not in wanted:
+            return []
+    with_goals = chosen.remove_invalid_goals
+    return offered(log, chosen.tokens, chosen.types, remove_invalid_goals=with_goals)
 
 
 def _missing(names: Sequence[str], unread: Sequence[str]) -> str:
@@ -146,10 +217,8 @@ def _common(given: Iterable[str] | None, listed: frozenset[str] | None) -> froze
     return listed & frozenset(given)
 
 
-def _log_files(logs: Path, chosen: ScenarioFilter) -> list[Path]:
+def _log_files(logs: Path) -> list[Path]:
     files = [logs] if logs.is_file() else sorted(logs.rglob("*.db"))
-    if chosen.logs is not None:
-        files = [path for path in files if path.stem in chosen.logs]
     if not files:
         raise DataError(f"{logs}: there is no log (.db)", hint="give the folder with the logs")
     return files
@@ -190,11 +259,7 @@ class _Conversion:
 
     def offered(self, log: Log) -> list[ScenarioEntry]:
         """The scenarios of a log that are asked for."""
-        chosen = self.chosen
-        if chosen.maps is not None and log.map_name not in chosen.maps:
-            return []
-        with_goals = chosen.remove_invalid_goals
-        found = offered(log, chosen.tokens, chosen.types, remove_invalid_goals=with_goals)
+        found = _asked_for(log, self.chosen)
         self.found.update(entry.token for entry in found)
         return found
 
@@ -218,6 +283,16 @@ class _Conversion:
                 windows.append(window)
         for group in _parts(windows):
             self._write_part(log, group)
+
+    def judge(self, log: Log, window: Window, counts: Counter[str]) -> None:
+        """Count a scenario for every key that judges scenarios one by one and takes it."""
+        chosen, road = self.chosen, partial(self._map, log.map_name)
+        for name in JUDGED:
+            if getattr(chosen, name) is not None:
+                others: dict[str, Any] = {other: None for other in JUDGED if other != name}
+                if not is_taken(log, window, road, replace(chosen, **others)):
+                    return
+                counts[name] += 1
 
     def _is_stored(self, window: Window) -> bool:
         if window.token not in self.writer.tokens:

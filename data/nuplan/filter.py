@@ -173,6 +173,11 @@ _KEYS: dict[str, tuple[str, Callable[[Path, Mapping[str, Any], str], Any]]] = {
     "ego_route_radius": ("route_radius", _number),
     "shuffle": ("shuffle", _flag),
 }
+# fields in the order in which scenarios are left out: by lists, all together, one by one
+LISTED = ("logs", "maps", "tokens", "types", "remove_invalid_goals")
+THINNED = ("per_type", "limit", "min_gap_s")
+JUDGED = ("min_way", "start_speed", "stop_speed", "min_share", "route_radius")
+KEY_OF = {field: key for key, (field, _) in _KEYS.items()}  # key of a field
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # Any to the checker

@@ -69,6 +69,9 @@ class ScenarioStore:
     def __repr__(self) -> str:
         return f"<ScenarioStore {self.path.name}: {len(self)} scenarios in {len(self.cities)} maps>"
 
+    def __reduce__(self) -> Any:
+        return open_store, (self.source,)
+
     def __len__(self) -> int:
         return len(self.tokens)
 

@@ -70,12 +70,20 @@ def nuplan(
     lines = [
         *(f" tolerated: {flaw} ({count})" for flaw, count in report.flaws.items()),
         *_failures(report.failed),
+        *(f" left by {key}: {count}" for key, count in report.left.items()),
+        *(f" there are {what}: {_counted(found)}" for what, found in report.offers.items()),
         f" {plural(len(report.converted), 'scenario')} converted, "
         f"{len(report.unchanged)} unchanged, {len(failed)} failed → {folder}",
     ]
-    print_result(asdict(report), lines, as_json=as_json)
-    if failed:
+    print_result(vars(report), lines, as_json=as_json)
+    if failed or report.left:
         raise typer.Exit(cli.UNFINISHED)
+
+
+def _counted(counts: Counter[str]) -> str:
+    named = [f"{name} ({count})" for name, count in counts.most_common(MAX_NAMED)]
+    others = len(counts) - len(named)
+    return ", ".join(named) + (f", and {others} others" if others else "")
 
 
 def _token_list(text: str) -> list[str]:

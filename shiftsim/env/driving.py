@@ -99,6 +99,7 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
             ConfigError: A setting is unknown.
             DataError: The store is not there, or has no scenario.
         """
+        self._settings = {name: value for name, value in locals().items() if name != "self"}
         self._store: Any = _opened(store) if isinstance(store, str) else store
         self._tokens = tuple(self._store.tokens)
         if split:
@@ -130,6 +131,14 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         self._high = high.astype(np.float32)
         self.action_space = spaces.Box(-self._high, self._high)
         self._episode: Episode | None = None
+        self._begun: dict[str, Any] = {}  # token and noise seed of the episode
+        self._actions: list[Any] = []  # its actions so far
+
+    def __reduce__(self) -> Any:
+        """Copies drive the episode again: its arrays are views of one another."""
+        generator = {"_np_random": self._np_random, "_np_random_seed": self._np_random_seed}
+        state = {**generator, "spec": self.spec}
+        return _resume, (type(self), self._settings, self._begun, self._actions), state
 
     @property
     def episode(self) -> Episode:
@@ -159,6 +168,7 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         for name in options or {}:
             one_of("option of reset", name, drawn)
         chosen = drawn | (options or {})
+        self._begun, self._actions = chosen, []
         scenario = self._store.read(chosen["token"])
         setting = Setting(self._setting.noise, chosen["noise_seed"], self._setting.traffic)
         self._episode = episode = Episode(scenario, setting, np.zeros_like(self._high))
@@ -181,6 +191,7 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         episode.action = given = np.minimum(np.maximum(given, -self._high), self._high)
         ego = episode.log.ego[episode.iteration]
         episode.advance(command_of(given, ego) if self._is_command else _trajectory(given, ego))
+        self._actions.append(given)
         infraction, is_over = episode.infraction, episode.is_over
         info: dict[str, Any] = {"terms": episode.terms, "infraction": infraction}
         if is_over:
@@ -193,6 +204,18 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
     def render(self) -> np.ndarray | None:
         """(256, 256, 3) uint8: 128 m around the ego, which drives to the right."""
         return picture_of(self.episode) if self.render_mode == "rgb_array" else None
+
+
+def _resume(
+    kind: type[DrivingEnv], settings: dict[str, Any], begun: dict[str, Any], actions: list[Any]
+) -> DrivingEnv:
+    """An environment whose episode has come as far as another's."""
+    env = kind(**settings)
+    if begun:
+        env.reset(options=begun)
+        for action in actions:
+            env.step(action)
+    return env
 
 
 def _trajectory(action: NDArray[np.float32], ego: FloatArray) -> Trajectory:

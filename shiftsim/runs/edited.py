@@ -128,6 +128,7 @@ class EditedStore(ScenarioStore):
     ) -> None:
         """The edited scenarios of an open store; those `made` in a run, as `describe` gave them."""
         vars(self).update(vars(store))
+        self._parts = store, edits, made
         if made is None:
             self.edited = edits.expand(store, store.tokens)
         else:  # a bundle need not hold what other scenarios of the run are made of
@@ -143,6 +144,9 @@ class EditedStore(ScenarioStore):
                     hint="make the run again",
                 ) from error
         self.tokens = tuple(self.edited)
+
+    def __reduce__(self) -> Any:
+        return EditedStore, self._parts
 
     def __contains__(self, token: object) -> bool:
         return token in self.edited

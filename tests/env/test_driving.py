@@ -1,5 +1,7 @@
 """The environment: what Gymnasium demands, and that it drives as a run does."""
 
+import copy
+import pickle
 import subprocess
 import sys
 import warnings
@@ -272,3 +274,30 @@ def test_without_gymnasium_the_extra_is_named():
     code = "import sys; sys.modules['gymnasium'] = None; import shiftsim.env"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert "MissingExtraError: the environment needs gymnasium" in done.stderr
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+@pytest.mark.parametrize("opened", [False, True])
+def test_a_copy_in_mid_episode_goes_on_with_the_same_numbers(toy, duplicate, opened):
+    store = shiftsim.open_store(toy) if opened else str(toy)
+    env = DrivingEnv(store=store, noise="ou-high", traffic="reactive")
+    env.reset(seed=5, options={"token": TOKEN})
+    action = np.zeros(2, np.float32)
+    for action[:] in weave(8):
+        env.step(action)
+    twin = duplicate(env)
+    assert twin.episode.iteration == 8
+    twin.step(COAST)  # leaves the original as it is
+    assert env.episode.iteration == 8
+    twin = duplicate(env)
+    for action in weave(4):
+        (seen, *others), (seen_by_twin, *others_of_twin) = env.step(action), twin.step(action)
+        assert others_of_twin[:3] == others[:3]
+        np.testing.assert_array_equal(seen_by_twin, seen)
+    assert env.reset()[1] == twin.reset()[1]
+
+
+def test_a_copy_before_the_first_episode_has_none(toy):
+    twin = copy.deepcopy(DrivingEnv(store=str(toy)))
+    with pytest.raises(ConfigError, match="no episode is under way"):
+        twin.step(COAST)

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from shiftsim.compat.nuplan.finder import install as install
+from shiftsim.compat.nuplan.finder import with_all_missing as with_all_missing
 from shiftsim.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -49,6 +49,31 @@ def test_every_listed_module_can_be_imported():
         ("common.maps.abstract_map", "AbstractMap SemanticMapLayer MapObject"),
         ("common.maps.abstract_map_objects", "Lane LaneConnector StopLine Intersection"),
         ("common.maps.maps_datatypes", "TrafficLightStatusType LaneConnectorType"),
+        ("common.geometry.torch_geometry", "global_state_se2_tensor_to_local"),
+        ("common.maps.nuplan_map.utils", "get_distance_between_map_object_and_point"),
+        ("planning.metrics.utils.collision_utils", "CollisionType"),
+        ("planning.metrics.utils.expert_comparisons", "principal_value"),
+        ("planning.metrics.utils.state_extractors", "extract_ego_jerk approximate_derivatives"),
+        ("planning.scenario_builder.abstract_scenario", "AbstractScenario"),
+        (
+            "planning.simulation.observation.idm.utils",
+            "path_to_linestring is_agent_ahead is_agent_behind is_track_stopped"
+            " create_path_from_se2",
+        ),
+        ("planning.simulation.occupancy_map.abstract_occupancy_map", "Geometry OccupancyMap"),
+        ("planning.simulation.occupancy_map.strtree_occupancy_map", "STRTreeOccupancyMapFactory"),
+        ("planning.simulation.path.path", "AbstractPath"),
+        (
+            "planning.simulation.planner.ml_planner.transform_utils",
+            "transform_predictions_to_states _get_fixed_timesteps _se2_vel_acc_to_ego_state"
+            " _get_velocity_and_acceleration",
+        ),
+        ("planning.simulation.planner.utils.breadth_first_search", "BreadthFirstSearch"),
+        ("planning.training.modeling.torch_module_wrapper", "TorchModuleWrapper"),
+        (
+            "planning.training.preprocessing.features.trajectory_utils",
+            "convert_absolute_to_relative_poses",
+        ),
         ("planning.simulation.observation.observation_type", "CameraChannel Sensors"),
         ("planning.simulation.planner.planner_report", "PlannerReport MLPlannerReport"),
         ("planning.simulation.trajectory.trajectory_sampling", "TrajectorySampling"),
@@ -69,8 +94,8 @@ def test_a_class_is_the_same_wherever_it_is_imported_from():
 @pytest.mark.parametrize(
     "statement",
     [
-        "import nuplan.planning.training.modeling.torch_module_wrapper",
-        "from nuplan.planning.training.modeling import torch_module_wrapper",
+        "import nuplan.planning.training.modeling.lightning_module_wrapper",
+        "from nuplan.planning.training.modeling import lightning_module_wrapper",
         "from nuplan.common.maps.abstract_map import RasterMap",
         "import nuplan.common.maps.abstract_map.RasterMap",
     ],
@@ -155,11 +180,44 @@ def test_a_module_that_needs_more_of_the_devkit_says_so(tmp_path, monkeypatch):
         load_planner("nuplan:needy:Planner")
 
 
+def test_all_missing_names_are_told_at_once(tmp_path, monkeypatch):
+    (tmp_path / "wanting.py").write_text(
+        "import wanting_too\n"
+        "from nuplan.planning.script import builders\n"
+        "from nuplan.common.maps.abstract_map import RasterMap, AbstractMap\n"
+        "class Planner(wanting_too.Base): ...\n"
+    )
+    (tmp_path / "wanting_too.py").write_text(
+        "from nuplan.planning.training.callbacks.some import Callback as Base\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for _ in range(2):  # nothing of the search is left
+        with pytest.raises(MissingExtraError) as caught:
+            load_planner("nuplan:wanting:Planner")
+        assert "'wanting' needs 3 names that are not among shiftsim's shims" in str(caught.value)
+        names = (
+            "nuplan.common.maps.abstract_map.RasterMap, nuplan.planning.script.builders, "
+            "nuplan.planning.training.callbacks.some.Callback"
+        )
+        assert names in str(caught.value)
+        assert not {"wanting", "wanting_too", "nuplan.planning.script"} & set(sys.modules)
+
+
+def test_only_modules_that_need_torch_import_it(tmp_path):
+    code = (
+        "import sys\nfrom shiftsim.compat.nuplan import finder\nfinder.install()\n"
+        "for name in finder.MODULES:\n    'torch' in name or __import__(name)\n"
+        "print('torch' in sys.modules)\n"
+    )
+    assert _python(tmp_path, code).stdout.strip() == "False"
+
+
 def test_the_command_line_says_what_is_missing(toy, tmp_path):
-    (tmp_path / "needy.py").write_text("import nuplan.planning.training\n")
+    (tmp_path / "needy.py").write_text("import nuplan.planning.script\n")
     done = call(tmp_path, "run", "--planner", "nuplan:needy:Planner", "--store", str(toy))
     assert done.returncode == 1
-    assert "error: 'nuplan.planning.training' is not among" in done.stderr
+    assert "error: 'nuplan.planning.script' is not among" in done.stderr
     assert "hint: install nuplan-devkit itself" in done.stderr
     assert "Traceback" not in done.stderr
 

@@ -5,6 +5,7 @@ import pytest
 import shapely
 from worlds import straight_road
 
+from shiftsim.compat.nuplan.bridge import map_objects
 from shiftsim.compat.nuplan.bridge.map import BridgeMap
 from shiftsim.errors import MapError
 from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
@@ -48,6 +49,29 @@ def test_an_id_is_found_in_its_own_layer_only(road):
         road.get_map_object("1", SemanticMapLayer.BASELINE_PATHS)
     with pytest.raises(ValueError, match="DRIVABLE_AREA has no objects"):
         road.get_map_object("90", SemanticMapLayer.DRIVABLE_AREA)
+
+
+@pytest.mark.parametrize(
+    ("layer", "object_id", "name"),
+    [
+        ("LANE", "11", "NuPlanLane"),
+        ("LANE_CONNECTOR", "21", "NuPlanLaneConnector"),
+        ("ROADBLOCK", "1", "NuPlanRoadBlock"),
+        ("ROADBLOCK_CONNECTOR", "2", "NuPlanRoadBlockConnector"),
+        ("INTERSECTION", "9", "NuPlanIntersection"),
+    ],
+)
+def test_planners_tell_objects_by_the_names_of_their_classes(road, layer, object_id, name):
+    found = road.get_map_object(object_id, SemanticMapLayer[layer])
+    assert type(found).__name__ == name
+
+
+def test_lines_stop_lines_and_areas_have_the_names_of_nuplan_too(road):
+    lane = road.get_map_object("11", SemanticMapLayer.LANE)
+    assert type(lane.baseline_path).__name__ == "NuPlanPolylineMapObject"
+    kinds = {name: kind.__name__ for name, kind in map_objects.KINDS.items()}
+    assert kinds["stop_polygons"] == "NuPlanStopLine"
+    assert kinds["crosswalks"] == kinds["car_parks"] == "NuPlanPolygonMapObject"
 
 
 def test_lanes_know_their_roadblock_and_neighbours(road):
@@ -180,7 +204,7 @@ def test_what_a_map_lacks_is_said(road):
         _ = connector.left_boundary
     lane = road.get_map_object("11", SemanticMapLayer.LANE)
     assert lane.left_boundary.length == 200.0
-    with pytest.raises(NotImplementedError, match=r"BridgeLane\.parallel_edges"):
+    with pytest.raises(NotImplementedError, match=r"NuPlanLane\.parallel_edges"):
         _ = lane.parallel_edges
     with pytest.raises(NotImplementedError, match="raster"):
         road.get_raster_map([SemanticMapLayer.DRIVABLE_AREA])

@@ -40,6 +40,23 @@ def test_the_command_line_drives_a_planner_of_the_present_folder(toy, tmp_path):
     assert theirs == pytest.approx(_scores(tmp_path / "out", "constant-velocity"), abs=1e-9)
 
 
+@pytest.mark.parametrize(
+    "planner",
+    [
+        "nuplan_pdm_like:PdmLike",
+        pytest.param("nuplan_plantf_like:PlanTfLike", marks=pytest.mark.learned),
+    ],
+)
+def test_planners_with_the_imports_of_public_ones_drive(toy, tmp_path, planner):
+    module = planner.partition(":")[0]
+    shutil.copy(places.TESTS / f"{module}.py", tmp_path)
+    words = ("--planner", f"nuplan:{planner}", "--store", str(toy), "--workers", "1")
+    done = call(tmp_path, "run", *words, "--limit", "1", "--out", "out")
+    assert done.returncode == 0, done.stderr
+    (task,) = pq.read_table(tmp_path / "out/tasks.parquet").to_pylist()
+    assert (task["status"], task["error"]) == ("ok", "")
+
+
 @pytest.mark.thorough
 def test_the_command_line_checks_the_contract(toy, tmp_path):
     shutil.copy(PAGE, tmp_path / "mine.py")

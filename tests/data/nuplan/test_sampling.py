@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import places
 import pytest
+from commands import call
 from nuplan_logs import list_scenarios
 
 from shiftsim.data.nuplan.convert import convert_nuplan
@@ -238,3 +239,42 @@ def test_a_conversion_of_all_says_how_many_there_will_be_and_what_limits_them(tm
     caplog.clear()
     convert_nuplan(GOLDEN / "logs", MAPS, tmp_path / "one", tokens=[report.converted[0]])
     assert not [text for text in caplog.messages if "will be made" in text]
+
+
+@pytest.mark.parametrize(
+    ("text", "left"),
+    [
+        ("scenario_types: [starting_u_turn]\nnum_scenarios_per_type: 20", [0, 0]),
+        ("log_names: [another]\nmap_names: [sg-one-north]", [0, 0]),
+        ("scenario_types: [near_multiple_vehicles]\nego_displacement_minimum_m: 1000000", [1, 0]),
+    ],
+)
+def test_a_filter_that_takes_nothing_says_what_each_key_left(
+    log_path: Path, tmp_path: Path, text: str, left: list[int]
+) -> None:
+    (tmp_path / "filter.yaml").write_text(text + "\n")
+    store = tmp_path / "store"
+    report = convert_nuplan(log_path, MAPS, store, filter_file=tmp_path / "filter.yaml")
+    assert report.converted == [] == list(report.failed)
+    offered = report.left["offered"]
+    keys = [line.partition(":")[0] for line in text.splitlines()]
+    assert report.left == {"offered": offered} | dict(zip(keys, left, strict=True))
+    assert report.offers["types"]["near_multiple_vehicles"] == 1
+    assert report.offers["types"].total() == offered > 1
+    assert report.offers["logs"] == {"log": offered}
+    assert len(report.offers["maps"]) == 1
+    assert not store.exists()
+
+
+def test_the_command_line_ends_with_3_where_a_filter_takes_nothing(
+    log_path: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "none.yaml").write_text("scenario_types: [starting_u_turn]\n")
+    arguments = (str(log_path), str(MAPS), "--store", "new", "--filter", "none.yaml")
+    done = call(tmp_path, "convert", "nuplan", *arguments, "--json")
+    assert json.loads(done.stdout)["offers"]["logs"].keys() == {"log"}
+    done = call(tmp_path, "convert", "nuplan", *arguments)
+    assert done.returncode == 3
+    assert "left by scenario_types: 0" in done.stdout
+    assert "there are types: unknown (" in done.stdout
+    assert not (tmp_path / "new").exists()

@@ -13,7 +13,7 @@ import shapely
 
 from nuplan.common.maps.abstract_map import AbstractMap
 from nuplan.common.maps.maps_datatypes import SemanticMapLayer, StopLineType
-from shiftsim.compat.nuplan.bridge.map_objects import KINDS, BridgeLaneConnector
+from shiftsim.compat.nuplan.bridge.map_objects import CONNECTORS, KINDS
 from shiftsim.kernels import FloatArray
 from shiftsim.world.layers import Layer, nearest_of
 from shiftsim.world.map import VectorMap
@@ -76,10 +76,11 @@ class BridgeMap(AbstractMap):
         """Object number `index` of one of our layers, always the same one."""
         found = self._by_index.get((layer, index))
         if found is None:
-            kind: type[Any] = KINDS[layer]
-            if layer == "edges" and self.source.is_connector(index):
-                kind = BridgeLaneConnector
-            found = self._by_index[layer, index] = kind(self, getattr(self.source, layer), index)
+            first = {"edges": self.source.num_lanes, "blocks": self.source.num_roadblocks}
+            kinds = CONNECTORS if index >= first.get(layer, np.inf) else KINDS
+            found = self._by_index[layer, index] = kinds[layer](
+                self, getattr(self.source, layer), index
+            )
         return found
 
     def objects(self, layer: Any) -> list[Any]:

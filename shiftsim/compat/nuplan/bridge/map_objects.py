@@ -1,4 +1,7 @@
-"""Objects of a map, made when asked for; each one knows its map and its index there."""
+"""Objects of a map, made when asked for; each one knows its map and its index there.
+
+Their classes have nuPlan's names, by which planners tell them apart.
+"""
 
 from functools import cached_property
 from typing import Any
@@ -36,7 +39,7 @@ def _not_in_nuplan(name: str) -> Any:
     return property(refuse)
 
 
-class BridgePolyline(PolylineMapObject):
+class NuPlanPolylineMapObject(PolylineMapObject):
     """A line: baseline or boundary."""
 
     def __init__(self, line_id: str, xy: FloatArray) -> None:
@@ -129,11 +132,11 @@ def _linked(table: str, layer: str) -> Any:
 def _boundary(side: int, name: str) -> Any:
     """A property: the line on the left (0) or right (1) of an edge."""
 
-    def find(edge: _Mapped) -> BridgePolyline:
+    def find(edge: _Mapped) -> NuPlanPolylineMapObject:
         xy: FloatArray = getattr(edge._source, f"{name}_boundaries").at(edge._index)
         if len(xy) < 2:
             raise MapError(f"map {edge._map.map_name!r}: {edge.id!r} has no {name} boundary")
-        return BridgePolyline(edge._source.boundary_ids[edge._index][side], xy)
+        return NuPlanPolylineMapObject(edge._source.boundary_ids[edge._index][side], xy)
 
     return cached_property(find)
 
@@ -152,9 +155,9 @@ class _Edge(_Mapped):
     right_boundary = _boundary(1, "right")
 
     @cached_property
-    def baseline_path(self) -> BridgePolyline:
+    def baseline_path(self) -> NuPlanPolylineMapObject:
         """Its centre line."""
-        return BridgePolyline(self.id, self._source.baselines.at(self._index))
+        return NuPlanPolylineMapObject(self.id, self._source.baselines.at(self._index))
 
     @property
     def speed_limit_mps(self) -> float | None:
@@ -177,7 +180,7 @@ class _Edge(_Mapped):
         return bool(self._source.has_traffic_lights[self._index])
 
 
-class BridgeLane(_Edge, Lane):
+class NuPlanLane(_Edge, Lane):
     """A lane."""
 
     @property
@@ -204,7 +207,7 @@ class BridgeLane(_Edge, Lane):
         return left, right
 
 
-class BridgeLaneConnector(_Edge, LaneConnector):
+class NuPlanLaneConnector(_Edge, LaneConnector):
     """A lane across an intersection."""
 
     adjacent_edges = (None, None)
@@ -221,8 +224,8 @@ class BridgeLaneConnector(_Edge, LaneConnector):
     is_right_of = is_left_of
 
 
-class BridgeRoadBlock(_Mapped, RoadBlockGraphEdgeMapObject):
-    """A roadblock or a roadblock connector."""
+class _Block(_Mapped, RoadBlockGraphEdgeMapObject):
+    """What roadblocks and roadblock connectors share."""
 
     parallel_edges = _not_in_nuplan("parallel_edges")
     children_stop_lines = _not_in_nuplan("children_stop_lines")
@@ -239,7 +242,15 @@ class BridgeRoadBlock(_Mapped, RoadBlockGraphEdgeMapObject):
         return self._map.object("intersections", min(where)) if where else None
 
 
-class BridgeStopLine(_Mapped, StopLine):
+class NuPlanRoadBlock(_Block):
+    """A roadblock."""
+
+
+class NuPlanRoadBlockConnector(_Block):
+    """A roadblock connector."""
+
+
+class NuPlanStopLine(_Mapped, StopLine):
     """Where one stops."""
 
     intersection_from = _not_in_nuplan("intersection_from")
@@ -253,7 +264,7 @@ class BridgeStopLine(_Mapped, StopLine):
     stop_line_type = layer_type
 
 
-class BridgeIntersection(_Mapped, Intersection):
+class NuPlanIntersection(_Mapped, Intersection):
     """Where roads meet."""
 
     interior_edges = _not_in_nuplan("interior_edges")
@@ -263,17 +274,22 @@ class BridgeIntersection(_Mapped, Intersection):
     intersection_type = IntersectionType.DEFAULT
 
 
-class BridgeArea(_Mapped, PolygonMapObject):
+class NuPlanPolygonMapObject(_Mapped, PolygonMapObject):
     """A crosswalk, a walkway, a car park or a drivable area."""
 
 
-KINDS = {  # of the objects of a layer; lane connectors, the last of the edges, have their own
-    "edges": BridgeLane,
-    "blocks": BridgeRoadBlock,
-    "stop_polygons": BridgeStopLine,
-    "intersections": BridgeIntersection,
-    "crosswalks": BridgeArea,
-    "walkways": BridgeArea,
-    "car_parks": BridgeArea,
-    "drivable_areas": BridgeArea,
+KINDS: dict[str, type[Any]] = {  # of the objects of a layer
+    "edges": NuPlanLane,
+    "blocks": NuPlanRoadBlock,
+    "stop_polygons": NuPlanStopLine,
+    "intersections": NuPlanIntersection,
+    "crosswalks": NuPlanPolygonMapObject,
+    "walkways": NuPlanPolygonMapObject,
+    "car_parks": NuPlanPolygonMapObject,
+    "drivable_areas": NuPlanPolygonMapObject,
+}
+# of the last objects of a layer
+CONNECTORS: dict[str, type[Any]] = {
+    "edges": NuPlanLaneConnector,
+    "blocks": NuPlanRoadBlockConnector,
 }

@@ -15,6 +15,13 @@ from shiftsim.compat.nuplan.shims.objects import (
     SceneObjectMetadata,
     TrackedObjectType,
 )
+from shiftsim.compat.nuplan.shims.transforms import (
+    approximate_derivatives,
+    lateral_projection,
+    longitudinal_projection,
+    numpy_array_to_absolute_pose,
+)
+from shiftsim.kernels import FloatArray
 from shiftsim.sim.dynamics.bicycle import step_bicycle
 from shiftsim.world.state import NUM_STATE, STEERING, STEERING_RATE, YAW_ACCEL, YAW_RATE
 
@@ -305,3 +312,82 @@ class KinematicBicycleModel:
         return EgoState.build_from_rear_axle(
             pose, velocity, reached, steering, now, self._vehicle, True, *turn
         )
+
+
+# nuplan.planning.simulation.planner.ml_planner.transform_utils
+def _get_fixed_timesteps(
+    state: EgoState, future_horizon: float, step_interval: float
+) -> list[float]:
+    """Times of a plan [s]: one interval after a state, and so on to the horizon."""
+    steps = np.arange(0.0, future_horizon, step_interval) + step_interval
+    times: list[float] = (steps + state.time_point.time_s).tolist()
+    return times
+
+
+def _se2_vel_acc_to_ego_state(
+    state: StateSE2,
+    velocity: Sequence[float],
+    acceleration: Sequence[float],
+    timestamp: float,
+    vehicle: VehicleParameters,
+) -> EgoState:
+    """The state of a rear axle at a time [s]; it steers straight ahead."""
+    moving = StateVector2D(*velocity), StateVector2D(*acceleration)
+    return EgoState.build_from_rear_axle(
+        state, *moving, 0.0, TimePoint(int(timestamp * 1e6)), vehicle
+    )
+
+
+def _get_velocity_and_acceleration(
+    ego_poses: Sequence[StateSE2], ego_history: Sequence[EgoState], timesteps: list[float]
+) -> tuple[FloatArray, FloatArray]:
+    """(H, 2) velocities and accelerations along and across planned poses, from all positions."""
+    from scipy.interpolate import interp1d
+
+    def line(times: Any, values: FloatArray) -> Any:
+        return interp1d(times, values, axis=0, fill_value="extrapolate")
+
+    past = [state.time_point.time_s for state in ego_history]
+    driven = np.array([state.rear_axle.serialize() for state in ego_history])
+    planned = np.array([pose.serialize() for pose in ego_poses])
+    # as far apart as the samples of the history
+    times = np.arange(past[-1], timesteps[-1] + 1e-6, past[-1] - past[-2])
+    poses = line([past[-1], *timesteps], np.r_[driven[-1:], planned])(times)[1:]
+    every, xy = [*past, *times[1:]], np.r_[driven, poses][:, :2]
+    found = []
+    for order in (1, 2):
+        rates = approximate_derivatives(xy, every, deriv_order=order, axis=0)[len(past) :]
+        along = longitudinal_projection(rates, poses[:, 2])
+        # nuPlan rule 612: positive to the right, elsewhere to the left
+        across = -lateral_projection(rates, poses[:, 2])
+        found.append(line(times[1:], np.c_[along, across])(timesteps))
+    return found[0], found[1]
+
+
+def transform_predictions_to_states(
+    predicted_poses: FloatArray,
+    ego_history: Sequence[EgoState],
+    future_horizon: float,
+    step_interval: float,
+    include_ego_state: bool = True,
+) -> list[EgoState]:
+    """Ego states from (H, 3) poses in the frame of the present rear axle, the present one first."""
+    ego = ego_history[-1]
+    times = _get_fixed_timesteps(ego, future_horizon, step_interval)
+    poses = numpy_array_to_absolute_pose(ego.rear_axle, predicted_poses)
+    moving = _get_velocity_and_acceleration(poses, ego_history, times)
+    vehicle = ego.car_footprint.vehicle_parameters
+    states = [
+        _se2_vel_acc_to_ego_state(*row, vehicle) for row in zip(poses, *moving, times, strict=False)
+    ]
+    return [ego, *states] if include_ego_state else states
+
+
+# nuplan.planning.training.preprocessing.features.trajectory_utils
+def convert_absolute_to_relative_poses(
+    origin_absolute_state: StateSE2, absolute_states: Sequence[StateSE2]
+) -> Any:
+    """(N, 3) float32 poses in the frame of an origin."""
+    inverse = np.linalg.inv(origin_absolute_state.as_matrix())
+    moved = (StateSE2.from_matrix(inverse @ pose.as_matrix()) for pose in absolute_states)
+    return np.array([pose.serialize() for pose in moved], np.float32)

@@ -6,7 +6,7 @@ from typing import Any, TypeAlias
 
 import shapely
 
-from shiftsim.compat.nuplan.shims.geometry import Point2D
+from shiftsim.compat.nuplan.shims.geometry import Point2D, derived
 
 
 class SemanticMapLayer(IntEnum):
@@ -168,3 +168,133 @@ class Intersection(PolygonMapObject):
     def __init__(self, intersection_id: str, intersection_type: IntersectionType) -> None:
         super().__init__(intersection_id)
         self.intersection_type = intersection_type
+
+
+Geometry: TypeAlias = shapely.Polygon | shapely.LineString
+
+
+# nuplan.planning.simulation.occupancy_map
+class OccupancyMap:
+    """Geometries by id."""
+
+    def __init__(self, geom_map: dict[str, Geometry]) -> None:
+        self._geom_map = geom_map
+
+    size = derived(lambda self: len(self._geom_map), "How many there are.")
+
+    def __len__(self) -> int:
+        return len(self._geom_map)
+
+    def is_empty(self) -> bool:
+        """Whether there is none."""
+        return not self._geom_map
+
+    def contains(self, geometry_id: str) -> bool:
+        """Whether there is one of that id."""
+        return geometry_id in self._geom_map
+
+    def get(self, geometry_id: str) -> Geometry:
+        """The geometry of an id."""
+        return self._geom_map[geometry_id]
+
+    def insert(self, geometry_id: str, geometry: Geometry) -> None:
+        """Add one, or replace it."""
+        self._geom_map[geometry_id] = geometry
+
+    set = insert
+
+    def remove(self, geometry_ids: list[str]) -> None:
+        """Remove some; all must be there."""
+        for name in geometry_ids:
+            assert name in self._geom_map, f"the occupancy map has no geometry {name!r}"
+            del self._geom_map[name]
+
+    def get_all_ids(self) -> list[str]:
+        """All ids."""
+        return list(self._geom_map)
+
+    def get_all_geometries(self) -> list[Geometry]:
+        """All geometries."""
+        return list(self._geom_map.values())
+
+    def get_nearest_entry_to(self, geometry_id: str) -> tuple[str, Geometry, float]:
+        """Id, geometry and distance [m] of what is nearest to one of the geometries."""
+        assert self.contains(geometry_id), f"the occupancy map has no geometry {geometry_id!r}"
+        # nuPlan rule 610: what it leaves out is every id that is a part of the given one
+        names = [name for name in self._geom_map if name not in geometry_id]
+        geometry = self.get(geometry_id)
+        nearest = names[shapely.STRtree([self.get(name) for name in names]).nearest(geometry)]
+        return nearest, self.get(nearest), float(geometry.distance(self.get(nearest)))
+
+    def intersects(self, geometry: Geometry) -> "OccupancyMap":
+        """The part of the map that shares a point with a geometry."""
+        names = self.get_all_ids()
+        found = shapely.STRtree(self.get_all_geometries()).query(geometry, predicate="intersects")
+        return type(self)({names[index]: self.get(names[index]) for index in found.tolist()})
+
+
+class STRTreeOccupancyMap(OccupancyMap):
+    """The same."""
+
+
+class STRTreeOccupancyMapFactory:
+    """Makes occupancy maps."""
+
+    @staticmethod
+    def get_from_boxes(scene_objects: list[Any]) -> OccupancyMap:
+        """The boxes of objects, by the tokens of their tracks; objects without one are left out."""
+        boxes = ((item.track_token, item.box.geometry) for item in scene_objects)
+        return STRTreeOccupancyMap({token: box for token, box in boxes if token is not None})
+
+    @staticmethod
+    def get_from_geometry(
+        geometries: list[Geometry], geometry_ids: list[str] | None = None
+    ) -> OccupancyMap:
+        """Geometries by the ids given, or by their numbers."""
+        names = range(len(geometries)) if geometry_ids is None else geometry_ids
+        pairs = zip(names, geometries, strict=False)
+        return STRTreeOccupancyMap({str(name): geometry for name, geometry in pairs})
+
+
+# nuplan.planning.simulation.planner.utils.breadth_first_search
+class BreadthFirstSearch:
+    """Searches lane by lane for a roadblock, among lanes of given ids."""
+
+    def __init__(self, start_edge: Any, candidate_lane_edge_ids: list[str]) -> None:
+        self._start, self._candidates = start_edge, set(candidate_lane_edge_ids)
+
+    def search(self, target_roadblock: Any, target_depth: int) -> tuple[list[Any], bool]:
+        """Edges that lead to a roadblock, which is number `target_depth` of them, and True.
+
+        Where there are none: the way to the edge that was found last, and False.
+        """
+        parents: list[dict[str, Any]] = [{}, {self._start.id: None}]  # by depth, the start has 1
+        edge, depth, level = self._start, 1, [self._start]
+        for here in range(1, target_depth + 1):
+            parents.append({})
+            following = []
+            for current in level:
+                is_there = current.get_roadblock_id() == target_roadblock.id
+                if is_there and here == target_depth:
+                    return self._way(current, here, parents), True
+                for after in current.outgoing_edges:
+                    if after.id in self._candidates:
+                        following.append(after)
+                        parents[here + 1][after.id] = current
+                        edge, depth = after, here + 1
+            level = following
+        return self._way(edge, depth, parents), False
+
+    @staticmethod
+    def _way(edge: Any, depth: int, parents: list[dict[str, Any]]) -> list[Any]:
+        way = [edge]
+        while (edge := parents[depth][edge.id]) is not None:
+            way.append(edge)
+            depth -= 1
+        return way[::-1]
+
+
+# nuplan.common.maps.nuplan_map.utils
+def get_distance_between_map_object_and_point(point: Point2D, map_object: Any) -> float:
+    """Distance of a point from the area of an object, 0 inside [m]."""
+    return float(shapely.Point(point.x, point.y).distance(map_object.polygon))

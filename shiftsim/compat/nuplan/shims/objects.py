@@ -6,8 +6,15 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, TypeAlias
 
+import numpy as np
+import shapely
+
 from shiftsim.compat.nuplan.shims.boxes import OrientedBox
-from shiftsim.compat.nuplan.shims.geometry import StateSE2, StateVector2D, TimePoint, part
+from shiftsim.compat.nuplan.shims.geometry import Point2D, StateSE2, StateVector2D, TimePoint, part
+from shiftsim.compat.nuplan.shims.transforms import (
+    InterpolatedPath,
+    convert_se2_path_to_progress_path,
+)
 
 
 class TrackedObjectType(Enum):
@@ -273,3 +280,60 @@ class DetectionsTracks(Observation):
     """The objects that were perceived."""
 
     tracked_objects: TrackedObjects
+
+
+# nuplan.planning.simulation.observation.idm.utils
+def get_agent_relative_angle(ego_state: StateSE2, agent_state: StateSE2) -> float:
+    """Angle between the heading of a pose and the direction of another one, 0 … pi [rad]."""
+    way = np.array((agent_state.x - ego_state.x, agent_state.y - ego_state.y))
+    ahead = np.array((np.cos(ego_state.heading), np.sin(ego_state.heading)))
+    return float(np.arccos(ahead @ (way / np.linalg.norm(way))))
+
+
+def is_agent_ahead(ego_state: StateSE2, agent_state: StateSE2, angle_tolerance: float = 30) -> bool:
+    """Whether a pose lies ahead of another, within an angle [deg]."""
+    return get_agent_relative_angle(ego_state, agent_state) < np.deg2rad(angle_tolerance)
+
+
+def is_agent_behind(
+    ego_state: StateSE2, agent_state: StateSE2, angle_tolerance: float = 150
+) -> bool:
+    """Whether a pose lies behind another, beyond an angle [deg]."""
+    return get_agent_relative_angle(ego_state, agent_state) > np.deg2rad(angle_tolerance)
+
+
+def is_track_stopped(tracked_object: Any, stopped_speed_threshhold: float = 5e-2) -> bool:
+    """Whether an object stands: its speed is at most the threshold [m/s], or it is no agent."""
+    if not isinstance(tracked_object, Agent):
+        return True
+    return tracked_object.velocity.magnitude() <= stopped_speed_threshhold
+
+
+def path_to_linestring(path: Sequence[Point2D]) -> shapely.LineString:
+    """The line through points or poses."""
+    return shapely.LineString([(point.x, point.y) for point in path])
+
+
+def ego_path_to_se2(path: Sequence[Any]) -> list[StateSE2]:
+    """Poses of the centres of ego states."""
+    return [state.center for state in path]
+
+
+def ego_path_to_linestring(path: Sequence[Any]) -> shapely.LineString:
+    """The line through the centres of ego states."""
+    return path_to_linestring(ego_path_to_se2(path))
+
+
+def create_path_from_se2(states: list[StateSE2]) -> InterpolatedPath:
+    """The path through poses, of which repeated ones count once."""
+    path = convert_se2_path_to_progress_path(states)
+    # nuPlan rule 611: the last pose is always left out
+    steps = np.diff([pose.progress for pose in path])
+    return InterpolatedPath(
+        [pose for pose, step in zip(path, steps, strict=False) if not np.isclose(step, 0.0)]
+    )
+
+
+def create_path_from_ego_state(states: list[Any]) -> InterpolatedPath:
+    """`create_path_from_se2` of the centres of ego states."""
+    return create_path_from_se2(ego_path_to_se2(states))

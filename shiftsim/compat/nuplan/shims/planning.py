@@ -4,17 +4,17 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from shiftsim.compat.nuplan.shims.ego import EgoState, InterpolatableState, SplitState
-from shiftsim.compat.nuplan.shims.geometry import StateSE2, TimePoint, derived, part
+from shiftsim.compat.nuplan.shims.geometry import StateSE2, TimeDuration, TimePoint, derived, part
 from shiftsim.compat.nuplan.shims.map_types import AbstractMap, TrafficLightStatusData
-from shiftsim.compat.nuplan.shims.objects import Observation
+from shiftsim.compat.nuplan.shims.objects import DetectionsTracks, Observation
 from shiftsim.compat.nuplan.shims.transforms import AngularInterpolator
 
 _SAMPLING_TOLERANCE = 1e-10  # as in nuPlan
@@ -342,3 +342,80 @@ class AbstractPlanner(ABC):
         if clear_stats:
             self._compute_trajectory_runtimes = []
         return report
+
+
+# nuplan.planning.scenario_builder.abstract_scenario
+class AbstractScenario(ABC):
+    """A recorded scenario. For annotations and subclasses: planners are not given one."""
+
+    @abstractmethod
+    def get_number_of_iterations(self) -> int:
+        """How many iterations it has."""
+
+    @abstractmethod
+    def get_time_point(self, iteration: int) -> TimePoint:
+        """Moment of an iteration."""
+
+    @abstractmethod
+    def get_ego_state_at_iteration(self, iteration: int) -> EgoState:
+        """Where the recorded driver was."""
+
+    @abstractmethod
+    def get_tracked_objects_at_iteration(
+        self, iteration: int, future_trajectory_sampling: Any = None
+    ) -> DetectionsTracks:
+        """The objects there were."""
+
+    start_time = derived(lambda self: self.get_time_point(0), "Moment of iteration 0.")
+    end_time = derived(
+        lambda self: self.get_time_point(self.get_number_of_iterations() - 1),
+        "Moment of the last iteration.",
+    )
+    duration_s = derived(
+        lambda self: TimeDuration.from_s(self.end_time.time_s - self.start_time.time_s),
+        "How long it lasts.",
+    )
+    initial_ego_state = derived(
+        lambda self: self.get_ego_state_at_iteration(0), "The recorded driver at iteration 0."
+    )
+    initial_tracked_objects = derived(
+        lambda self: self.get_tracked_objects_at_iteration(0), "The objects at iteration 0."
+    )
+
+    def get_ego_trajectory_slice(self, start_idx: int, end_idx: int) -> Iterator[EgoState]:
+        """The recorded driver at iterations `start_idx` … `end_idx` - 1."""
+        return (self.get_ego_state_at_iteration(index) for index in range(start_idx, end_idx))
+
+    def get_expert_ego_trajectory(self) -> Iterator[EgoState]:
+        """The recorded driver at all iterations."""
+        return self.get_ego_trajectory_slice(0, self.get_number_of_iterations())
+
+
+# nuplan.planning.training
+FeaturesType: TypeAlias = dict[str, Any]
+TargetsType: TypeAlias = dict[str, Any]
+ScenarioListType: TypeAlias = list[Any]
+
+
+class AbstractModelFeature(ABC):  # noqa: B024  # a mere base
+    """What a network reads or writes."""
+
+
+class AbstractFeatureBuilder(ABC):  # noqa: B024  # a mere base
+    """Makes features."""
+
+
+class AbstractTargetBuilder(ABC):  # noqa: B024  # a mere base
+    """Makes what a network is to learn."""
+
+
+class EgoTrajectoryTargetBuilder(AbstractTargetBuilder):
+    """Names the trajectory of the ego as the target; shiftsim has no scenarios to train on."""
+
+    def __init__(self, future_trajectory_sampling: TrajectorySampling) -> None:
+        self._sampling = future_trajectory_sampling
+
+    @classmethod
+    def get_feature_unique_name(cls) -> str:
+        """Name of the target."""
+        return "trajectory"

@@ -1,12 +1,16 @@
 """Functions that move points and poses about, and measure between them."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
 
-from shiftsim.compat.nuplan.shims.geometry import Point2D, StateSE2, StateVector2D
-from shiftsim.kernels import FloatArray
+from shiftsim.compat.nuplan.shims.geometry import Point2D, ProgressStateSE2, StateSE2, StateVector2D
+from shiftsim.geometry.boxes import STOPPED_EGO, STOPPED_TRACK
+from shiftsim.kernels import FloatArray, IntArray
+from shiftsim.metrics.comfort import unwrap as phase_unwrap
 
 # nuplan.common.geometry.transform
 
@@ -154,3 +158,202 @@ class AngularInterpolator:
     def interpolate(self, sampled_state: Any) -> FloatArray:
         """Angles at one place or many."""
         return np.asarray(principal_value(self._angles(sampled_state)))
+
+
+# nuplan.planning.simulation.path
+class AbstractPath(ABC):
+    """Poses over the distance along a path [m]."""
+
+    @abstractmethod
+    def get_start_progress(self) -> float:
+        """Where it starts [m]."""
+
+    @abstractmethod
+    def get_end_progress(self) -> float:
+        """Where it ends [m]."""
+
+    @abstractmethod
+    def get_state_at_progress(self, progress: float) -> ProgressStateSE2:
+        """The pose at a distance."""
+
+    @abstractmethod
+    def get_state_at_progresses(self, progresses: list[float]) -> list[ProgressStateSE2]:
+        """The poses at distances."""
+
+    @abstractmethod
+    def get_sampled_path(self) -> list[ProgressStateSE2]:
+        """The poses it is made of."""
+
+
+class InterpolatedPath(AbstractPath):
+    """Linear between poses."""
+
+    def __init__(self, path: list[ProgressStateSE2]) -> None:
+        assert len(path) > 1, "a path needs at least two poses"
+        self._path = path
+        self._progress = [pose.progress for pose in path]
+        self._headings = AngularInterpolator(self._progress, [pose.heading for pose in path])
+
+    def get_start_progress(self) -> float:
+        """Where it starts [m]."""
+        return self._path[0].progress
+
+    def get_end_progress(self) -> float:
+        """Where it ends [m]."""
+        return self._path[-1].progress
+
+    def get_state_at_progress(self, progress: float) -> ProgressStateSE2:
+        """The pose at a distance within the path."""
+        return self.get_state_at_progresses([progress])[0]
+
+    def get_state_at_progresses(self, progresses: list[float]) -> list[ProgressStateSE2]:
+        """The poses at distances within the path."""
+        first, last = self.get_start_progress(), self.get_end_progress()
+        inside = first <= min(progresses) and max(progresses) <= last
+        assert inside, f"{progresses} m are not on the path, {first} … {last} m"
+        x, y = (
+            np.interp(progresses, self._progress, [getattr(pose, axis) for pose in self._path])
+            for axis in "xy"
+        )
+        rows = np.c_[progresses, x, y, self._headings.interpolate(progresses)]
+        return [ProgressStateSE2(*row) for row in rows.tolist()]
+
+    def get_sampled_path(self) -> list[ProgressStateSE2]:
+        """The poses it is made of."""
+        return self._path
+
+
+def calculate_progress(path: Sequence[Point2D]) -> list[float]:
+    """Distances along a path, 0 at its first point [m]."""
+    steps = np.linalg.norm(np.diff([(point.x, point.y) for point in path], axis=0), axis=1)
+    found: list[float] = np.cumsum(np.r_[0.0, steps]).tolist()
+    return found
+
+
+def convert_se2_path_to_progress_path(path: Sequence[StateSE2]) -> list[ProgressStateSE2]:
+    """Poses with their distances along the path."""
+    pairs = zip(calculate_progress(path), path, strict=True)
+    return [ProgressStateSE2(progress, *pose.serialize()) for progress, pose in pairs]
+
+
+# nuplan.planning.metrics.utils
+class CollisionType(IntEnum):
+    """Kinds of collisions."""
+
+    STOPPED_EGO_COLLISION, STOPPED_TRACK_COLLISION = STOPPED_EGO, STOPPED_TRACK
+    # numbered as in nuPlan, not as in shiftsim
+    ACTIVE_FRONT_COLLISION, ACTIVE_REAR_COLLISION, ACTIVE_LATERAL_COLLISION = 2, 3, 4
+
+
+def approximate_derivatives(
+    y: Any,
+    x: Any,
+    window_length: int = 5,
+    poly_order: int = 2,
+    deriv_order: int = 1,
+    axis: int = -1,
+) -> FloatArray:
+    """Derivatives by polynomials fitted to windows; the distances of x count as equal."""
+    from scipy.signal import savgol_filter  # takes long to import
+
+    window = min(window_length, len(x))
+    if poly_order >= window:
+        raise ValueError(f"a fit of degree {poly_order} needs more than {window} samples")
+    steps = np.diff(x)
+    if not (steps > 0).all():
+        raise RuntimeError("the abscissa does not increase")
+    order = {"polyorder": poly_order, "deriv": deriv_order}
+    found: FloatArray = savgol_filter(y, window, **order, delta=steps.mean(), axis=axis)
+    return found
+
+
+def extract_ego_time_point(ego_states: Sequence[Any]) -> IntArray:
+    """(K,) times [us]."""
+    return np.array([state.time_us for state in ego_states])
+
+
+def extract_ego_center(ego_states: Sequence[Any]) -> list[Point2D]:
+    """Positions of the centres."""
+    return [state.center.point for state in ego_states]
+
+
+def extract_ego_center_with_heading(ego_states: Sequence[Any]) -> list[StateSE2]:
+    """Poses of the centres."""
+    return [state.center for state in ego_states]
+
+
+def extract_ego_corners(ego_states: Sequence[Any]) -> list[list[Point2D]]:
+    """Corners of the footprints."""
+    return [state.car_footprint.all_corners() for state in ego_states]
+
+
+def extract_ego_heading(ego_states: Sequence[Any]) -> FloatArray:
+    """(K,) headings [rad]."""
+    return np.array([state.rear_axle.heading for state in ego_states])
+
+
+def extract_ego_velocity(ego_states: Sequence[Any]) -> FloatArray:
+    """(K,) speeds of the rear axle [m/s]."""
+    return np.array([state.dynamic_car_state.speed for state in ego_states])
+
+
+def extract_ego_acceleration(
+    ego_states: Sequence[Any],
+    acceleration_coordinate: str,
+    decimals: int = 8,
+    poly_order: int = 2,
+    window_length: int = 8,
+) -> FloatArray:
+    """(K,) smoothed acceleration [m/s^2]: `x`, `y` at the centre, `magnitude` at the rear axle."""
+    from scipy.signal import savgol_filter
+
+    motions = [state.dynamic_car_state for state in ego_states]
+    if acceleration_coordinate == "magnitude":
+        values = [motion.acceleration for motion in motions]
+    elif acceleration_coordinate in ("x", "y"):
+        values = [getattr(one.center_acceleration_2d, acceleration_coordinate) for one in motions]
+    else:
+        raise ValueError(f"acceleration_coordinate {acceleration_coordinate!r}: x, y or magnitude")
+    smooth = savgol_filter(values, min(window_length, len(values)), poly_order)
+    return np.round(smooth, decimals)
+
+
+def extract_ego_jerk(
+    ego_states: Sequence[Any],
+    acceleration_coordinate: str,
+    decimals: int = 8,
+    deriv_order: int = 1,
+    poly_order: int = 2,
+    window_length: int = 15,
+) -> FloatArray:
+    """(K,) derivative of the smoothed acceleration [m/s^3]."""
+    accel = extract_ego_acceleration(ego_states, acceleration_coordinate)
+    times = extract_ego_time_point(ego_states) / 1e6
+    jerk = approximate_derivatives(accel, times, window_length, poly_order, deriv_order)
+    return np.round(jerk, decimals)
+
+
+def extract_ego_yaw_rate(
+    ego_states: Sequence[Any],
+    deriv_order: int = 1,
+    poly_order: int = 2,
+    decimals: int = 8,
+    window_length: int = 15,
+) -> FloatArray:
+    """(K,) derivative of the heading [rad/s]; the window has 5 samples whatever is asked for."""
+    headings = phase_unwrap(extract_ego_heading(ego_states))
+    times = extract_ego_time_point(ego_states) / 1e6
+    order = {"poly_order": poly_order, "deriv_order": deriv_order}
+    return np.round(approximate_derivatives(headings, times, **order), decimals)
+
+
+def longitudinal_projection(state_vectors: FloatArray, headings: FloatArray) -> FloatArray:
+    """(K,) parts of vectors (K, 2) along headings (K,)."""
+    found: FloatArray = np.cos(headings) * state_vectors[:, 0]
+    return found + np.sin(headings) * state_vectors[:, 1]
+
+
+def lateral_projection(state_vectors: FloatArray, headings: FloatArray) -> FloatArray:
+    """(K,) parts of vectors (K, 2) to the left of headings (K,)."""
+    found: FloatArray = -np.sin(headings) * state_vectors[:, 0]
+    return found + np.cos(headings) * state_vectors[:, 1]
