@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from shiftsim.data.maps.builder import line_faults
 from shiftsim.data.readers.motion import MAX_SHARE, contradiction, fitted_velocities
 from shiftsim.data.store.check_map import MapCheck, Problem
 from shiftsim.data.store.reading import ScenarioStore
@@ -36,6 +37,7 @@ _FAST = 2.0  # m/s
 _MAX_TURNED = 0.5  # rad, median angle between heading and motion of a vehicle
 _LEAST_ROWS = 20  # of motion that say something of a heading
 _CHECK_UNITS = "check the unit and the axes of velocities and positions where they came from"
+_REPAIR_ROADS = "repair these roads in the source of the map, and convert it again"
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,10 @@ def survey_store(path: str | Path) -> CheckReport:
                 for what in _check_map(store.map(city))
             ]
             problems += maps[city].of_map()
+            problems += [
+                Problem(where, f"{what} ({count})", False, _REPAIR_ROADS, "lines")
+                for what, count in line_faults(store.map(city)).items()
+            ]
         except DataError as error:
             problems.append(Problem(where, error.message, remedy=error.hint, kind="map"))
     rows = []
