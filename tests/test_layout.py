@@ -25,10 +25,10 @@ BUDGETS = {
     "shiftsim/runs": 4_410,  # goal 3_300
     "planners": 4_390,  # goal 4_300
     "planners/learned": 5_070,  # goal 4_600
-    "data/maps": 3_510,  # goal 3_000
+    "data/maps": 3_810,  # goal 3_000
     "data": 5_410,  # goal 3_900
     "data/nuplan": 2_740,  # goal 2_400
-    "data/store": 2_430,  # goal 2_200
+    "data/store": 2_440,  # goal 2_200
     "data/synthetic": 2_610,  # goal 2_100
     "shiftsim/report": 2_750,  # goal 2_200
     "shiftsim/view": 2_100,  # goal 1_800

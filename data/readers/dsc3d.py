@@ -14,7 +14,7 @@ import numpy as np
 import pyproj
 
 from shiftsim.data.maps.builder import BuiltMap
-from shiftsim.data.maps.opendrive.map import build_road_map
+from shiftsim.data.maps.opendrive.map import build_road_map, require_lanes
 from shiftsim.data.maps.opendrive.reading import read_opendrive
 from shiftsim.data.maps.opendrive.records import OpenDrive
 from shiftsim.data.readers.annotations import Dsc3dFile, Site, read_recording
@@ -87,8 +87,7 @@ class Dsc3dReader:
             epsg=self.download.epsg,
             country=self.config.country,
         )
-        if road.num_lanes == 0:
-            raise ConversionError(f"{drive.source} has no drivable lane", "give a map with roads")
+        require_lanes(drive, report)
         return site_map(road, report.warnings)
 
     def recordings(self) -> Sequence[str]:

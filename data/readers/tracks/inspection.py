@@ -11,7 +11,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from shiftsim.data.maps.opendrive.map import build_road_map
+from shiftsim.data.maps.opendrive.map import build_road_map, require_lanes
 from shiftsim.data.maps.opendrive.reading import read_opendrive
 from shiftsim.data.readers.build import make_samples
 from shiftsim.data.readers.codes import KINDS
@@ -73,8 +73,7 @@ def inspect_tracks(
     pa.default_memory_pool().release_unused()
     drive = read_opendrive(map_path)
     road, report = build_road_map(drive, name=city or map_path.stem, country=config.country)
-    if road.num_lanes == 0:
-        raise ConversionError(f"{map_path} has no drivable lane", "give a map with roads")
+    require_lanes(drive, report)
     diagnostics = diagnose(table, road, config.min_drivable_share)
     return Inspection(tracks, map_path, table, road, dict(report.warnings), diagnostics)
 
