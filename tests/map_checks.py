@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 
+from shiftsim.data.maps.builder import line_faults
 from shiftsim.data.maps.opendrive.areas import linked_groups
 from shiftsim.data.polygons import shared_areas
 from shiftsim.kernels import FloatArray
@@ -60,6 +61,7 @@ def check_map(
         "lanes and connectors alternate": _links_alternate(road),
         "baseline ends meet": gaps <= END_GAP,
         "no heading jump at joints": turns < JOINT_TURN,
+        "lines do not turn back": line_faults(road) == {},
         "polygons are valid": all(p.is_valid and p.area > 0 for p in [*polygons, *blocks]),
         "lanes do not overlap": lane_overlap <= OVERLAP,
         "roadblocks do not overlap": block_overlap <= OVERLAP,

@@ -15,7 +15,7 @@ import shapely
 
 from shiftsim.data.maps.opendrive.areas import merge_closed
 from shiftsim.data.maps.opendrive.overlaps import subtract_overlaps
-from shiftsim.data.maps.opendrive.shapes import bend_ends, lane_polygon
+from shiftsim.data.maps.opendrive.shapes import bend_ends, corners, lane_polygon
 from shiftsim.data.maps.topology import Connector, Lane, LaneGraph, S
 from shiftsim.data.polygons import largest_part
 from shiftsim.kernels import FloatArray, IntArray
@@ -28,6 +28,7 @@ _Segment = TypeVar("_Segment", contravariant=True)
 _Spec = TypeVar("_Spec", EdgeSpec, BlockSpec, AreaSpec)
 Pairs: TypeAlias = set[tuple[int, int]]
 _CLOSING = 0.5  # m
+_KINK, _END_GAP = 0.8, 0.3  # rad, and m, beyond which a baseline cannot be driven
 _STRAIGHT_TURN, _U_TURN = np.deg2rad(30.0), np.deg2rad(150.0)
 
 
@@ -163,6 +164,7 @@ class MapBuilder(ABC, Generic[S]):
         return self._report(road)
 
     def _report(self, road: VectorMap) -> BuiltMap:
+        self.warnings.update(line_faults(road))
         stacked = {(self._lane_ids[i], self._lane_ids[j]) for i, j in self._stacked}
         stacked |= {(self._block_ids[a], self._block_ids[b]) for a, b in self._stacked_blocks()}
         runs = [lane.segments for lane in self.graph.lanes]
@@ -306,6 +308,24 @@ class MapBuilder(ABC, Generic[S]):
 
     def _merged(self, numbers: Sequence[int], radius: float) -> shapely.Polygon:
         return merge_closed([self._connectors[i].polygon for i in numbers], radius)
+
+
+def line_faults(road: VectorMap) -> dict[str, int]:
+    """What is wrong with the baselines of a map: count by kind."""
+    lines = [line[:, :2] for line in map(road.baselines.at, range(len(road.edges)))]
+    pairs = [(i, int(j)) for i in range(len(road.edges)) for j in road.outgoing.at(i)]
+    gaps = [float(np.hypot(*(lines[i][-1] - lines[j][0]))) for i, j in pairs]
+    joints = [np.concatenate([lines[i][-2:], lines[j][:2]]) for i, j in pairs]
+    kinks = sum(bool((corners(line)[1] > _KINK).any()) for line in lines)
+    bends = sum(bool((corners(joint)[1] > _KINK).any()) for joint in joints)
+    found = {
+        f"failed check: centre line that turns by more than {_KINK:g} rad at a point": kinks,
+        f"failed check: lanes that meet at an angle of more than {_KINK:g} rad": bends,
+        f"failed check: lanes that are linked over a gap of more than {_END_GAP:g} m": sum(
+            gap > _END_GAP for gap in gaps
+        ),
+    }
+    return {kind: number for kind, number in found.items() if number}
 
 
 def turn_type(line: FloatArray) -> int:

@@ -7,11 +7,10 @@ from typing import Any
 
 from shiftsim.data.maps.builder import BuiltMap
 from shiftsim.data.maps.lights import LightStates
-from shiftsim.data.maps.opendrive.map import build_road_map
+from shiftsim.data.maps.opendrive.map import build_road_map, require_lanes
 from shiftsim.data.maps.opendrive.records import OpenDrive
 from shiftsim.data.readers.samples import TrackSamples
 from shiftsim.data.readers.windows import ConversionConfig, Span
-from shiftsim.errors import ConversionError
 from shiftsim.world.map import VectorMap
 
 
@@ -84,8 +83,7 @@ def opendrive_site(drive: OpenDrive, *, name: str, **how: Any) -> BuiltMap:
         ConversionError: It has no lane that cars may use.
     """
     road, report = build_road_map(drive, name=name, **how)
-    if road.num_lanes == 0:
-        raise ConversionError(f"{drive.source} has no drivable lane", "give a map with roads")
+    require_lanes(drive, report)
     return site_map(road, report.warnings)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
+from shiftsim.data.maps.builder import line_faults
 from shiftsim.data.readers.motion import MAX_SHARE, contradiction, fitted_velocities
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.data.store.recordings import ego_span, ego_states
@@ -51,6 +52,7 @@ _MIN_OVERLAP = 0.5  # m^2, of two lanes; less is hardly ever met
 _REPAIR_LANES = "convert the map again, or repair the polygons of these lanes"
 _CORRECT_ROUTE = "correct the route in shiftsim inspect"
 _CHECK_UNITS = "check the unit and the axes of velocities and positions where they came from"
+_REPAIR_ROADS = "repair these roads in the source of the map, and convert it again"
 
 
 @dataclass(frozen=True)
@@ -128,6 +130,10 @@ def survey_store(path: str | Path) -> CheckReport:
             road = store.map(city)
             overlaps[city] = _find_overlaps(road)
             problems += _check_map(road, overlaps[city])
+            problems += [
+                Problem(where, f"{what} ({count})", False, _REPAIR_ROADS, "lines")
+                for what, count in line_faults(road).items()
+            ]
         except DataError as error:
             problems.append(Problem(where, error.message, remedy=error.hint, kind="map"))
     rows = []

@@ -20,15 +20,15 @@ _APPROACH = 100.0  # m before a junction within which a signal governs it
 _NEAR_END = 10.0  # m between a drawn stop line and the end of its lane
 _SIGNS = {"206": STOP, "R1-1": STOP, "205": YIELD, "R1-2": YIELD}  # by type
 _KMH, _MPH = SPEED_UNITS["km/h"], SPEED_UNITS["mph"]
-_TOWN = ("town", "townCollector", "townArterial", "townLocal", "townPrivate")
+TOWN = ("town", "townCollector", "townArterial", "townLocal", "townPrivate")
 _DEFAULTS_DE: dict[str, float | None] = {
-    **dict.fromkeys(_TOWN, 50 * _KMH),
+    **dict.fromkeys(TOWN, 50 * _KMH),
     "lowSpeed": 30 * _KMH,
     **dict.fromkeys(("pedestrian", "townPlayStreet"), 10 * _KMH),
     **dict.fromkeys(("rural", "townExpressway"), 100 * _KMH),
     "motorway": None,
 }
-_DEFAULTS_US = _DEFAULTS_DE | dict.fromkeys(_TOWN, 25 * _MPH) | {"motorway": 65 * _MPH}
+_DEFAULTS_US = _DEFAULTS_DE | dict.fromkeys(TOWN, 25 * _MPH) | {"motorway": 65 * _MPH}
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def speed_limits(
 def _limit_at(road: Road, piece: LaneSegment, s: float, country: str) -> float | None:
     section = road.sections[piece.key.section]
     own = [speed for speed in section.lanes[piece.key.lane].speeds if speed.s <= s - section.s]
-    if own:
+    if own and own[-1].limit is not None:  # else the limit of the road holds
         return own[-1].limit
     kinds = [kind for kind in road.types if kind.s <= s] or list(road.types[:1])
     if kinds and kinds[-1].speed is not None:
@@ -192,4 +192,4 @@ def _sign_value(signal: Signal) -> float | None:
         value = float((number - 50) * 10 if 51 <= number <= 63 else number)  # nuPlan rule 509
     if value is None or value <= 0:
         return None
-    return value * SPEED_UNITS.get(signal.unit, _MPH if is_us else _KMH)
+    return value * SPEED_UNITS.get(signal.unit.lower(), _MPH if is_us else _KMH)

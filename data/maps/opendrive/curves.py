@@ -91,6 +91,15 @@ def curve_length(record: Geometry) -> float:
     return float(_arc_table(record)[1][-1])
 
 
+def total_turn(record: Geometry) -> float:
+    """How far an arc or a spiral turns, to both sides together [rad]; 0 for other curves."""
+    if record.kind not in (ARC, SPIRAL):
+        return 0.0
+    a, b = record.coefficients[0], record.coefficients[-1]
+    mean = abs(a + b) / 2 if a * b >= 0 else (a * a + b * b) / (2 * abs(a - b))
+    return mean * record.length
+
+
 def length_error(record: Geometry) -> float:
     """By how much the true length of a paramPoly3 differs from its stated one, as a share.
 

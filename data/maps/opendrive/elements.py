@@ -13,7 +13,14 @@ from shiftsim.kernels import FloatArray
 from shiftsim.world.ranges import CHECK, OPENDRIVE
 
 CUBIC = ("a", "b", "c", "d")
+CRUMB = 1e-3  # m, absurd records that are shorter are rounding of an editor
+# elements that cost their road where a number of theirs is out of range
+_SHAPING = frozenset("arc spiral poly3 paramPoly3 width border laneOffset elevation".split())
 _LEADING_NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)")
+
+
+class AbsurdRecordError(ConversionError):
+    """A number of a geometry or a width is out of range: the road cannot be drawn."""
 
 
 @dataclass
@@ -23,6 +30,8 @@ class Reader:
     source: str  # name of the file
     place: str = "header"  # road or junction at hand, for messages
     warnings: Counter[str] = field(default_factory=Counter)  # count by kind
+    # how many lanes with a vendor's direction of travel have the one of right-hand traffic
+    told: Counter[bool] = field(default_factory=Counter)
 
     def error(self, what: str, hint: str) -> ConversionError:
         """An error that names file and place."""
@@ -50,7 +59,8 @@ class Reader:
         if may_be_any or allowed.low <= value <= allowed.high or not np.isfinite(value):
             return value
         what = f"{element.tag} (line {element.sourceline}) has {name}={text[:40]!r}"
-        raise self.error(f"{what}, not within {allowed}", CHECK)
+        error = self.error(f"{what}, not within {allowed}", CHECK)
+        raise AbsurdRecordError(error.message, CHECK) if element.tag in _SHAPING else error
 
     def _rescued(self, element: Any, name: str, text: str) -> float:
         found = _LEADING_NUMBER.match(text.replace(",", ".", 1))
@@ -71,9 +81,9 @@ class Reader:
         return value
 
     def integer(self, element: Any, name: str) -> int | None:
-        """An attribute as an integer; None where it is missing or not one."""
+        """An attribute as an integer, be it written `1.0`; None where it is missing or not one."""
         try:
-            return int(element.get(name))
+            return int(re.sub(r"\.0+\s*$", "", element.get(name)))
         except (TypeError, ValueError):
             return None
 
@@ -82,10 +92,14 @@ class Reader:
         found = [[self.integer(child, name) for name in names] for child in parent.findall(tag)]
         return tuple((a, b) for a, b in found if a is not None and b is not None)
 
-    def cubics(self, elements: list[Any], key: str) -> FloatArray:
-        """(n, 5) rows s, a, b, c, d by s; records with NaN or infinity are left out."""
+    def cubics(self, elements: list[Any], key: str, end: float = np.inf) -> FloatArray:
+        """(n, 5) rows s, a, b, c, d by s, the last up to `end`; what is not finite is left out."""
+        starts = [self.number(element, key) for element in elements]
         rows = np.array(
-            [[self.number(e, key), *(self.number(e, k) for k in CUBIC)] for e in elements],
+            [
+                [begin, *self._cubic(element, 0 <= stop - begin < CRUMB)]
+                for element, begin, stop in zip(elements, starts, [*starts[1:], end], strict=False)
+            ],
             np.float64,
         ).reshape(-1, 5)
         finite = np.isfinite(rows).all(axis=1)
@@ -96,6 +110,16 @@ class Reader:
             self.warn("records out of order")
             rows = rows[np.argsort(rows[:, 0], kind="stable")]
         return rows
+
+    def _cubic(self, element: Any, is_crumb: bool) -> list[float]:
+        """Coefficients of a cubic; of one that is absurd but shorter than 1 mm only the first."""
+        values = [self.number(element, k, may_be_any=is_crumb) for k in CUBIC]
+        allowed = [OPENDRIVE[f"{element.tag} {k}"] for k in CUBIC]
+        fits = [a.holds(v) or not np.isfinite(v) for a, v in zip(allowed, values, strict=True)]
+        if all(fits):
+            return values
+        self.warn("absurd record shorter than 1 mm, ignored")
+        return [values[0] if fits[0] else np.nan, 0, 0, 0]
 
 
 def read_object(element: Any, reader: Reader) -> RoadObject:

@@ -84,10 +84,11 @@ class _Builder:
 
     def build(self) -> Graph:
         narrow = self._collect_nodes()
-        for source, target in lane_links(self.od, self.warnings):
+        for source, target in lane_links(self.od, self.warnings, repair=True):
             if source in self.nodes and target in self.nodes:
                 self.topology.join(source, target)
         self._infer_links()
+        self._note_touching(self._infer_road_links())
         for key in sorted(narrow):
             self._link_through(key)
         self._drop_wide_gaps()
@@ -151,6 +152,55 @@ class _Builder:
                 inferred += 1
         if inferred:
             self.warnings["lane link missing between sections, inferred"] += inferred
+
+    def _infer_road_links(self) -> list[tuple[LaneKey, LaneKey]]:
+        """Links to a linked road that no lane tells of, where lanes touch.
+
+        Returns those of all lanes that end where another begins, but that nothing links.
+        """
+        loose = [key for key in self.nodes if not self.after[key]]
+        first = [key for key in self.nodes if not self._told(key, entry=True)]
+        if not loose or not first:
+            return []
+        starts = shapely.STRtree(shapely.points([self.ends[key][0].mean(axis=0) for key in first]))
+        places = shapely.points([self.ends[key][1].mean(axis=0) for key in loose])
+        touching = []
+        for i, j in starts.query(places, "dwithin", INFER_GAP).T.tolist():
+            source, target = loose[i], first[j]
+            turned = np.abs(self.ends[source][1] - self.ends[target][0]).max() >= INFER_GAP
+            if turned or source.road == target.road or self._told(source, entry=False):
+                continue
+            if target.road in self._linked(source, False) or source.road in self._linked(
+                target, True
+            ):
+                self.topology.join(source, target)
+                self.warnings["lane link missing between linked roads, inferred"] += 1
+            elif not self.before[target]:
+                touching.append((source, target))
+        return touching
+
+    def _note_touching(self, pairs: Sequence[tuple[LaneKey, LaneKey]]) -> None:
+        if pairs:
+            names = " and ".join(repr(key.road) for key in pairs[0])
+            what = f"lanes that touch end to end without a link, the first of roads {names}"
+            self.warnings[what] += len(pairs)
+
+    def _at_start(self, key: LaneKey, entry: bool) -> bool:
+        """Whether travel enters (or leaves) a lane at the start of its section."""
+        return self._is_forward(key) == entry
+
+    def _told(self, key: LaneKey, entry: bool) -> bool:
+        """Whether the file names a lane before (or after) this one, or it ends within its road."""
+        road, at_start = self.od.roads[key.road], self._at_start(key, entry)
+        lane = road.sections[key.section].lanes[key.lane]
+        last = 0 if at_start else len(road.sections) - 1
+        return key.section != last or bool(lane.predecessors if at_start else lane.successors)
+
+    def _linked(self, key: LaneKey, entry: bool) -> list[str]:
+        """The road that its road is linked to where travel enters (or leaves) a lane, if any."""
+        road = self.od.roads[key.road]
+        link = road.predecessor if self._at_start(key, entry) else road.successor
+        return [link.id] if link is not None and link.kind == "road" else []
 
     def _is_forward(self, key: LaneKey) -> bool:
         return runs_forward(self.od.roads[key.road], key.section, key.lane)

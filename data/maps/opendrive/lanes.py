@@ -4,7 +4,9 @@ Borders are distances t to the left of the reference line; lanes stack outward f
 centre line. Links are directed edges in the direction of travel.
 """
 
+import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, TypeAlias
 
@@ -15,6 +17,7 @@ from shiftsim.data.maps.opendrive.records import Connection, Lane, OpenDrive, Ro
 from shiftsim.kernels import FloatArray
 
 BEFORE_END = 1e-9  # m: the end of a section still belongs to it
+_TOUCHING, _APART = 0.5, 2.0  # m between linked lanes at the near end, and at the wrong one
 _MAX_OFFSET = 500.0  # m from the reference line, so that absurd polynomials stay harmless
 START, END = "start", "end"
 _Side: TypeAlias = tuple[Road, int, int, str]  # road, section, lane, and the end that touches
@@ -104,12 +107,15 @@ def runs_forward(road: Road, section: int, lane: int) -> bool:
     return ((lane < 0) != road.left_hand) != is_reversed
 
 
-def lane_links(od: OpenDrive, warnings: Counter[str]) -> list[tuple[LaneKey, LaneKey]]:
+def lane_links(
+    od: OpenDrive, warnings: Counter[str], *, repair: bool = False
+) -> list[tuple[LaneKey, LaneKey]]:
     """Directed edges between lanes of all types, in the direction of travel, sorted.
 
     Only what the file links, nothing inferred from geometry; links that lead nowhere are counted.
+    With `repair`, contact points that name the far end are put right.
     """
-    linker = _Linker(od, warnings)
+    linker = _Linker(od, warnings, repair)
     for road in od.roads.values():
         linker.link_sections(road)
         for end, link in ((START, road.predecessor), (END, road.successor)):
@@ -132,7 +138,9 @@ class _Linker:
 
     od: OpenDrive
     warnings: Counter[str]
+    repair: bool  # whether to put contact points right
     edges: set[tuple[LaneKey, LaneKey]] = field(default_factory=set)
+    middles: dict[tuple[str, str], dict[int, list[float]]] = field(default_factory=dict)
 
     def link_sections(self, road: Road) -> None:
         """Links between the sections of one road."""
@@ -152,10 +160,13 @@ class _Linker:
         if not road.sections or not other.sections:
             return
         contact = link.contact or nearer_end(road, end, other)
-        here, there = _end_section(road, end), _end_section(other, contact)
-        for number, lane in road.sections[here].lanes.items():
-            for target in lane.successors if end == END else lane.predecessors:
-                self._add((road, here, number, end), (other, there, target, contact))
+        here = _end_section(road, end)
+        lanes = road.sections[here].lanes.items()
+        pairs = [(i, j) for i, x in lanes for j in (x.successors if end == END else x.predecessors)]
+        _, contact = self._meeting(road, [end], other, contact, pairs)
+        there = _end_section(other, contact)
+        for number, target in pairs:
+            self._add((road, here, number, end), (other, there, target, contact))
 
     def link_connection(self, junction: str, connection: Connection) -> None:
         """Lane links of a junction."""
@@ -170,9 +181,51 @@ class _Linker:
         ends = [e for e, x in links if x and (x.kind, x.id) == ("junction", junction)]
         contact = connection.contact or nearer_end(incoming, (ends or [END])[0], connecting)
         end = ends[0] if len(ends) == 1 else nearer_end(connecting, contact, incoming)
+        both = ends if len(ends) == 1 else [end, START if end == END else END]
+        end, contact = self._meeting(incoming, both, connecting, contact, connection.lane_links)
         here, there = _end_section(incoming, end), _end_section(connecting, contact)
         for source, target in connection.lane_links:
             self._add((incoming, here, source, end), (connecting, there, target, contact))
+
+    def _meeting(
+        self,
+        road: Road,
+        ends: Sequence[str],  # of `road` that may be meant, the likely one first
+        other: Road,
+        contact: str,  # end of `other` that the file names
+        pairs: Sequence[tuple[int, int]],  # lanes of `road` and `other` that are linked
+    ) -> tuple[str, str]:
+        """The ends that meet: those of the file, or where they are far apart others that touch."""
+        if not self.repair:
+            return ends[0], contact
+        ways = [(end, at) for end in ends for at in (contact, START if contact == END else END)]
+        gaps = [
+            min((self._gap((road.id, end, a), (other.id, at, b)) for a, b in pairs), default=0.0)
+            for end, at in ways
+        ]
+        best = int(np.argmin(gaps))
+        if not (gaps[0] > _APART and gaps[best] < _TOUCHING):
+            return ways[0]
+        self.warnings["contact point that names the far end, the near end taken"] += 1
+        return ways[best]
+
+    def _gap(self, *sides: tuple[str, str, int]) -> float:
+        """Distance of two lanes (road, end, lane) there [m]; inf where one does not exist."""
+        one, other = (self._middles(road, end).get(lane) for road, end, lane in sides)
+        return np.inf if one is None or other is None else math.dist(one, other)
+
+    def _middles(self, name: str, end: str) -> dict[int, list[float]]:
+        """Middle of every lane of a road at one of its ends, x and y [m]."""
+        if (name, end) not in self.middles:
+            road = self.od.roads[name]
+            s = np.array([0.0 if end == START else road.length])
+            borders = section_borders(road, _end_section(road, end), s, repair=True)
+            pose = ReferenceLine(road.geometries).evaluate(s)
+            self.middles[name, end] = {
+                lane: pose.offset(0.5 * (inner + borders.outer[lane]))[0].tolist()
+                for lane, inner in borders.inner.items()
+            }
+        return self.middles[name, end]
 
     def _add(self, side: _Side, other: _Side) -> None:
         """A link of two lanes that touch, where traffic can pass (nuPlan rule 503)."""

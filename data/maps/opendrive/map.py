@@ -16,20 +16,21 @@ from shiftsim.data.maps.builder import (
     Pairs,
 )
 from shiftsim.data.maps.opendrive import areas, control, records
-from shiftsim.data.maps.opendrive.control import LIGHT, STOP, YIELD
-from shiftsim.data.maps.opendrive.curves import ReferenceLine, length_error
+from shiftsim.data.maps.opendrive.control import LIGHT, STOP, TOWN, YIELD
+from shiftsim.data.maps.opendrive.curves import ReferenceLine, length_error, total_turn
 from shiftsim.data.maps.opendrive.graph import (
     Connector,
     Graph,
     Lane,
     LaneSegment,
     build_lane_graph,
+    is_drivable,
 )
 from shiftsim.data.maps.opendrive.lanes import border_is_mirrored
 from shiftsim.data.maps.opendrive.overlaps import Levels, cut_crossings, overlapping
 from shiftsim.data.maps.opendrive.records import OpenDrive
 from shiftsim.data.maps.opendrive.shapes import Shapes, lane_polygon, widen
-from shiftsim.errors import MapError
+from shiftsim.errors import ConversionError, MapError
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.build import AreaSpec
 from shiftsim.world.map import VectorMap
@@ -38,6 +39,8 @@ from shiftsim.world.ranges import MAP_EXTENT, require
 STOP_KINDS = {LIGHT: 2, STOP: 1, YIELD: 4}  # kinds of stop polygons
 GAP_NOTED, GAP_SERIOUS = 0.01, 0.5  # m
 MAX_LENGTH_ERROR = 3.0  # as a share; a cubic that far from its stated length is nonsense
+MAX_TURN = 3 * np.pi  # rad in one geometry; no road winds further within its plane
+MAX_TOWN_SPEED = 45.0  # m/s; more than 162 km/h in a town is km/h without a unit
 MAX_LANE_LENGTH = 3e6  # m, of all lanes together
 
 
@@ -77,6 +80,32 @@ def build_road_map(
     return built.road, built
 
 
+def require_lanes(od: OpenDrive, built: BuiltMap) -> None:
+    """See that a map has lanes.
+
+    Raises:
+        ConversionError: It has none; the message says why.
+    """
+    if built.road.num_lanes:
+        return
+    reasons = Counter({kind: n for kind, n in built.warnings.items() if "road left out" in kind})
+    for found in od.roads.values():
+        for lane in (lane for section in found.sections for lane in section.lanes.values()):
+            if lane.type not in records.DRIVABLE:
+                reasons[f"lanes of type {lane.type!r}"] += 1
+            elif not is_drivable(lane):
+                reasons["lanes that are closed to cars"] += 1
+            elif not len(lane.widths) and not len(lane.borders):
+                reasons["lanes without width"] += 1
+            elif found.junction is not None:
+                reasons[f"lanes of roads with junction={found.junction!r}"] += 1
+            else:
+                reasons["lanes that are too short or too narrow"] += 1
+    why = ", ".join(f"{what} ({count})" for what, count in reasons.items()) or "it has no lanes"
+    hint = "give a map with roads for cars, each with widths, outside of junctions junction='-1'"
+    raise ConversionError(f"{od.source} has no drivable lane: {why}", hint)
+
+
 def _prepare(od: records.OpenDrive, warnings: Counter[str]) -> records.OpenDrive:
     """The file in the frame of its header, without roads that cannot be drawn; counts them.
 
@@ -84,17 +113,26 @@ def _prepare(od: records.OpenDrive, warnings: Counter[str]) -> records.OpenDrive
         MapError: The file has more road than one map can hold.
     """
     roads = {}
+    fast: list[str] = []  # roads of towns with limits that cannot be meant
     for name, road in od.roads.items():
+        road = replace(road, left_hand=road.left_hand or name in od.left_hand)
         errors = [length_error(geometry) for geometry in road.geometries]
         if max(errors) > MAX_LENGTH_ERROR:
             warnings["road left out: paramPoly3 far from its stated length"] += 1
             continue
+        if max(map(total_turn, road.geometries)) > MAX_TURN:
+            warnings["road left out: one geometry turns more than one and a half times"] += 1
+            continue
         wrong = sum(error > 0 for error in errors)
         if wrong:
             warnings["paramPoly3 that is not as long as it says, stretched"] += wrong
+        fast += [name] * _count_fast(road)
         _note_gaps(road, warnings)
         _note_lanes(road, warnings)
         roads[name] = _placed(road, od.offset) if od.offset else road
+    if fast:
+        what = f"speed limit above {MAX_TOWN_SPEED:g} m/s in a town, the first on road {fast[0]!r}"
+        warnings[f"{what}: is it in km/h?"] += len(fast)
     starts = [(g.x, g.y) for road in roads.values() for g in road.geometries]
     extent = np.ptp(starts, axis=0).max() if starts else 0.0
     require(MAP_EXTENT, "extent", extent, f"{od.source}: the roads'", error=MapError)
@@ -125,6 +163,14 @@ def _placed(road: records.Road, offset: tuple[float, float, float, float]) -> re
         for g in road.geometries
     )
     return replace(road, geometries=geometries)
+
+
+def _count_fast(road: records.Road) -> int:
+    """How many speed records of a road in a town are too high for any town."""
+    found = [kind.speed for kind in road.types if kind.type in TOWN]
+    lanes = [lane for section in road.sections for lane in section.lanes.values()]
+    found += [speed for lane in lanes for speed in lane.speeds] if found else []
+    return sum(speed is not None and (speed.limit or 0.0) > MAX_TOWN_SPEED for speed in found)
 
 
 def _note_gaps(road: records.Road, warnings: Counter[str]) -> None:

@@ -5,6 +5,7 @@ counted in `OpenDrive.warnings`, one count per kind; what cannot raises one erro
 road and element.
 """
 
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,14 @@ import numpy as np
 from lxml import etree
 
 from shiftsim.data.maps.opendrive import records
-from shiftsim.data.maps.opendrive.elements import CUBIC, Reader, read_object, read_signal
+from shiftsim.data.maps.opendrive.elements import (
+    CRUMB,
+    CUBIC,
+    AbsurdRecordError,
+    Reader,
+    read_object,
+    read_signal,
+)
 from shiftsim.data.maps.opendrive.records import OpenDrive, Road
 from shiftsim.data.xml_elements import xml_elements
 from shiftsim.errors import ConversionError
@@ -22,7 +30,7 @@ from shiftsim.world.ranges import OPENDRIVE
 MAX_BYTES = 200_000_000
 TINY_LENGTH = 1e-9  # m, shorter geometry records are skipped
 _PARAM_CUBIC = ("aU", "bU", "cU", "dU", "aV", "bV", "cV", "dV")
-_TOP_LEVEL = ("header", "road", "junction")
+_TOP_LEVEL = ("header", "road", "junction", "include")
 
 
 def read_opendrive(path: Path) -> OpenDrive:
@@ -52,6 +60,8 @@ def parse_opendrive(data: bytes, source: str) -> OpenDrive:
     roads: dict[str, Road] = {}
     seen: set[tuple[str, str]] = set()
     junctions: dict[str, records.Junction] = {}
+    absurd: list[str] = []  # what cost roads
+    without_rule: list[str] = []  # roads that do not say on which side traffic keeps
 
     def fault(what: str, remedy: str) -> ConversionError:
         return ConversionError(f"{source}: {what}", remedy or "give an .xodr file, exported again")
@@ -64,17 +74,36 @@ def parse_opendrive(data: bytes, source: str) -> OpenDrive:
             reader.place = "header"
             header = _read_header(element, reader)
             continue
+        for _ in element.iter("include"):
+            reader.warn("include of another file, not read")
+        if element.tag == "include":
+            continue
         reader.place = f"{element.tag} {name!r}"
         if (element.tag, name) in seen:
             raise reader.error("its id occurs twice", f"give every {element.tag} its own id")
         seen.add((element.tag, name))
         if element.tag == "road":
-            road = _read_road(element, name, reader)
+            try:
+                road = _read_road(element, name, reader)
+            except AbsurdRecordError as error:
+                absurd.append(error.message.partition(", ")[2])
+                continue
             if road is not None:
                 roads[name] = road
+                if element.get("rule") is None:
+                    without_rule.append(name)
         else:
             junctions[name] = _read_junction(element, name, reader)
-    return OpenDrive(source, *header, roads, junctions, dict(reader.warnings))
+    left_hand = frozenset[str]()
+    if absurd:
+        reader.warnings[f"road left out, the first for {absurd[0]}"] += len(absurd)
+    if reader.told[False] and not reader.told[True]:
+        reader.warnings["left-hand traffic, told only by vendor data"] += len(without_rule)
+        left_hand = frozenset(without_rule)
+    elif reader.told[False]:
+        what = "lane whose vendor data contradict right-hand traffic, as others do not"
+        reader.warnings[what] += reader.told[False]
+    return OpenDrive(source, *header, roads, junctions, dict(reader.warnings), left_hand)
 
 
 def _strip_junk(data: bytes, reader: Reader) -> bytes:
@@ -108,8 +137,11 @@ def _read_road(element: Any, name: str, reader: Reader) -> Road | None:
     offsets = [] if lanes is None else lanes.findall("laneOffset")
     geometries = _read_plan_view(element.find("planView"), reader)
     stated = reader.number(element, "length", np.nan)
-    found = () if lanes is None else lanes.iter("laneSection")
-    sections = [_read_section(e, reader) for e in found]
+    found = [] if lanes is None else list(lanes.iter("laneSection"))
+    ends = [*(reader.finite(e, "s") for e in found[1:]), stated]
+    sections = [_read_section(e, end, reader) for e, end in zip(found, ends, strict=False)]
+    if element.get("rule") is None:
+        _note_directions(found, reader)
     if geometries is None:
         return None
     end = geometries[-1].s + geometries[-1].length
@@ -132,8 +164,8 @@ def _read_road(element: Any, name: str, reader: Reader) -> Road | None:
         junction=None if junction == "-1" else junction,
         left_hand=element.get("rule") == "LHT",
         geometries=geometries,
-        offsets=reader.cubics(offsets, "s"),
-        elevation=reader.cubics(element.findall("elevationProfile/elevation"), "s"),
+        offsets=reader.cubics(offsets, "s", stated),
+        elevation=reader.cubics(element.findall("elevationProfile/elevation"), "s", stated),
         sections=tuple(sorted(sections, key=lambda section: section.s)),
         predecessor=_read_link(link, "predecessor"),
         successor=_read_link(link, "successor"),
@@ -160,7 +192,11 @@ def _read_plan_view(element: Any, reader: Reader) -> tuple[records.Geometry, ...
         if kind == records.PARAM_POLY3 and not any(k in shape.keys() for k in _PARAM_CUBIC):
             reader.warn("road left out: paramPoly3 without coefficients")
             return None
-        coefficients, p_end = _read_shape(shape, length, reader)
+        is_crumb = TINY_LENGTH <= length < CRUMB
+        coefficients, p_end = _read_shape(shape, length, reader, may_be_any=is_crumb)
+        if is_crumb and not _is_sane(shape, coefficients):
+            reader.warn("absurd geometry shorter than 1 mm, taken as a line")
+            kind, coefficients = records.LINE, ()
         if not np.isfinite([s, x, y, heading, length, *coefficients]).all():
             reader.warn("road left out: geometry is not finite")
             return None
@@ -182,16 +218,41 @@ def _read_plan_view(element: Any, reader: Reader) -> tuple[records.Geometry, ...
     return tuple(sorted(geometries, key=lambda record: record.s))
 
 
-def _read_shape(shape: Any, length: float, reader: Reader) -> tuple[tuple[float, ...], float]:
+_COEFFICIENTS = {
+    records.ARC: ("curvature",),
+    records.SPIRAL: ("curvStart", "curvEnd"),
+    records.POLY3: CUBIC,
+    records.PARAM_POLY3: _PARAM_CUBIC,
+}
+
+
+def _read_shape(
+    shape: Any, length: float, reader: Reader, *, may_be_any: bool
+) -> tuple[tuple[float, ...], float]:
     if shape is None or shape.tag == records.LINE:
         return (), 0.0
-    names = {
-        records.ARC: ("curvature",),
-        records.SPIRAL: ("curvStart", "curvEnd"),
-        records.POLY3: CUBIC,
-    }
-    values = tuple(reader.number(shape, k) for k in names.get(shape.tag, _PARAM_CUBIC))
+    names = _COEFFICIENTS[shape.tag]
+    values = tuple(reader.number(shape, k, may_be_any=may_be_any) for k in names)
     return values, length if shape.get("pRange") == "arcLength" else 1.0
+
+
+def _is_sane(shape: Any, values: Sequence[float]) -> bool:
+    """Whether the coefficients of a shape are within their ranges, or not finite."""
+    if not values:
+        return True
+    allowed = [OPENDRIVE[f"{shape.tag} {key}"] for key in _COEFFICIENTS[shape.tag]]
+    return all(a.holds(v) or not np.isfinite(v) for a, v in zip(allowed, values, strict=True))
+
+
+def _note_directions(sections: list[Any], reader: Reader) -> None:
+    """Count lanes whose vendor data tell the direction of right-hand traffic, and the other."""
+    for lane in (lane for section in sections for lane in section.iter("lane")):
+        number, word = (
+            reader.integer(lane, "id"),
+            next((e.get("travelDir") for e in lane.iter("vectorLane")), None),
+        )
+        if number and word in ("forward", "backward") and lane.get("type") in records.DRIVABLE:
+            reader.told[(word == "forward") == (number < 0)] += 1
 
 
 def _read_link(link: Any, name: str) -> records.RoadLink | None:
@@ -220,7 +281,7 @@ def _read_types(elements: list[Any], reader: Reader) -> tuple[records.RoadType, 
 
 
 def _read_speed(element: Any, reader: Reader) -> records.Speed:
-    unit = element.get("unit", "")
+    unit = element.get("unit", "").lower().replace(" ", "")
     begin = reader.finite(element, "sOffset")
     text = element.get("max", "undefined")
     if text in ("no limit", "undefined"):
@@ -233,8 +294,9 @@ def _read_speed(element: Any, reader: Reader) -> records.Speed:
     return records.Speed(begin, limit)
 
 
-def _read_section(element: Any, reader: Reader) -> records.LaneSection:
+def _read_section(element: Any, end: float, reader: Reader) -> records.LaneSection:
     lanes: dict[int, records.Lane] = {}
+    length = end - reader.finite(element, "s")
     for child in element.iter("lane"):
         number = reader.integer(child, "id")
         if number is None:
@@ -247,7 +309,7 @@ def _read_section(element: Any, reader: Reader) -> records.LaneSection:
         if number in lanes:
             reader.warn("lane id twice in a section, the first holds")
             continue
-        lanes[number] = _read_lane(child, number, reader)
+        lanes[number] = _read_lane(child, number, length, reader)
     numbers = sorted(lanes)
     steps = [b - a - (a < 0 < b) for a, b in pairwise(numbers)]
     nearest = [min((abs(n) for n in numbers if n * sign > 0), default=1) for sign in (-1, 1)]
@@ -256,7 +318,7 @@ def _read_section(element: Any, reader: Reader) -> records.LaneSection:
     return records.LaneSection(max(reader.finite(element, "s"), 0.0), lanes)
 
 
-def _read_lane(element: Any, number: int, reader: Reader) -> records.Lane:
+def _read_lane(element: Any, number: int, length: float, reader: Reader) -> records.Lane:
     link = element.find("link")
     widths, borders = element.findall("width"), element.findall("border")
     kind = element.get("type", "")
@@ -265,8 +327,8 @@ def _read_lane(element: Any, number: int, reader: Reader) -> records.Lane:
     lane = records.Lane(
         id=number,
         type=kind or "none",
-        widths=reader.cubics(widths, "sOffset"),
-        borders=reader.cubics(borders, "sOffset"),
+        widths=reader.cubics(widths, "sOffset", length),
+        borders=reader.cubics(borders, "sOffset", length),
         predecessors=_lane_ids(link, "predecessor", reader),
         successors=_lane_ids(link, "successor", reader),
         speeds=tuple(

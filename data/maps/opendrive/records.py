@@ -6,6 +6,7 @@ from shiftsim.kernels import FloatArray
 
 SHAPES = LINE, ARC, SPIRAL, POLY3, PARAM_POLY3 = "line", "arc", "spiral", "poly3", "paramPoly3"
 SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704}  # m/s
+SPEED_UNITS |= {"kmh": 1 / 3.6, "kph": 1 / 3.6, "mi/h": 0.44704, "mps": 1.0}  # as some write them
 
 # Types of lanes by what they are used for.
 DRIVABLE = frozenset(
@@ -195,3 +196,4 @@ class OpenDrive:
     roads: dict[str, Road]  # by id, in the order of the file
     junctions: dict[str, Junction]  # by id, in the order of the file
     warnings: dict[str, int]  # what was repaired or left out: count by kind
+    left_hand: frozenset[str] = frozenset()  # roads whose traffic keeps left by vendor data alone

@@ -18,7 +18,7 @@ from shiftsim.data.maps.opendrive.graph import LaneSegment
 from shiftsim.data.maps.opendrive.lanes import BEFORE_END, LaneKey, section_borders
 from shiftsim.data.maps.opendrive.records import OpenDrive, Road
 from shiftsim.data.polygons import largest_part
-from shiftsim.kernels import FloatArray
+from shiftsim.kernels import FloatArray, IntArray
 
 CHORD_ERROR = 0.05  # m
 BASELINE_STEP = 0.25  # m, nuPlan rule 510: PLUTO takes every fourth vertex as 1 m
@@ -31,6 +31,7 @@ _STEP = 0.01  # m, beyond which a jump of the middle of a lane is spread
 _CORNER, _MIN_STRETCH = 0.3, 0.7  # rad, and m between corners, to be kept as vertices
 _KINK, _BEND = 0.1, 5.0  # rad, and m, of ends that are bent into the direction of a neighbour
 _BLEND = 10.0  # m over which a jump between pieces is spread
+_FOLD, _ROUNDING = 2.0, 2.0  # rad of turn where a line runs back, and m about a corner made round
 _NARROW = 2.5  # m, nuPlan rule 511: connectors below it are widened
 
 
@@ -112,7 +113,7 @@ class Shapes:
             shifts[0] = (start - firsts[0][0], shifts[0][1])
         if end is not None:
             shifts[-1] = (shifts[-1][0], end - firsts[-1][1])
-        return divide(np.concatenate(list(map(self._shifted, pieces, shifts))))
+        return divide(unfold(np.concatenate(list(map(self._shifted, pieces, shifts)))))
 
     def _without_steps(self, piece: LaneSegment) -> list[LaneSegment]:
         """The piece, cut where the middle of the lane jumps."""
@@ -158,14 +159,47 @@ def points_at(line: FloatArray, along: FloatArray, at: FloatArray) -> FloatArray
     return np.stack([np.interp(at, along, values) for values in line.T], axis=1)
 
 
-def divide(dense: FloatArray) -> FloatArray:
-    """A line through dense points with a vertex about every 0.25 m; sharp corners stay vertices."""
-    steps, arc = np.diff(dense, axis=0), arc_lengths(dense)
+def unfold(line: FloatArray) -> FloatArray:
+    """A line (K, 2) without the parts that run backwards, as on the inner side of a tight arc.
+
+    Where the line crosses itself about such a part, that loop is cut off and the corner made round;
+    where it does not, the line stays as it is.
+    """
+    arc, (at, turns) = arc_lengths(line), corners(line)
+    for begin, end in pairwise(at[turns > _FOLD].tolist()):
+        before, after = shapely.LineString(line[: begin + 1]), shapely.LineString(line[end:])
+        meet = shapely.get_coordinates(shapely.intersection(before, after))
+        if arc[end] - arc[begin] < _STEP or not len(meet):
+            continue
+        enter = shapely.line_locate_point(before, shapely.points(meet)).max()
+        place = shapely.get_coordinates(shapely.line_interpolate_point(before, enter))
+        leave = arc[end] + shapely.line_locate_point(after, shapely.points(place))[0]
+        r = min(_ROUNDING, enter, arc[-1] - leave)
+        ends = points_at(line, arc, np.array([enter - r, leave + r]))
+        t = np.linspace(0.0, 1.0, 33)[:, None]
+        bend = (1 - t) ** 2 * ends[0] + 2 * t * (1 - t) * place + t**2 * ends[1]
+        head, tail = line[arc < enter - r], line[arc > leave + r]
+        return unfold(np.concatenate([head, bend, tail]))
+    return line
+
+
+def corners(line: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Vertices of a line (K, 2) between its first and last, and by how much it turns there [rad].
+
+    Vertices that coincide with the one before are left out.
+    """
+    steps = np.diff(line, axis=0)
     moving = np.flatnonzero(np.hypot(*steps.T) > 1e-6)
     headings = np.arctan2(steps[moving, 1], steps[moving, 0])
-    turns = np.abs((np.diff(headings) + np.pi) % (2 * np.pi) - np.pi)
+    turns: FloatArray = np.abs((np.diff(headings) + np.pi) % (2 * np.pi) - np.pi)
+    return moving[1:], turns
+
+
+def divide(dense: FloatArray) -> FloatArray:
+    """A line through dense points with a vertex about every 0.25 m; sharp corners stay vertices."""
+    arc, (at, turns) = arc_lengths(dense), corners(dense)
     stops = [0.0]
-    for corner in arc[moving[1:][turns > _CORNER]]:
+    for corner in arc[at[turns > _CORNER]]:
         if min(corner - stops[-1], arc[-1] - corner) > _MIN_STRETCH:
             stops.append(float(corner))
     parts = [

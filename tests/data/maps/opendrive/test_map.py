@@ -344,3 +344,23 @@ def test_absurd_widths_neither_fail_nor_fill_the_memory():
     od.roads["1"].sections[0].lanes[-1].widths[:, 1:] = 1e308  # no file can say so
     built, _ = build_road_map(od, name="absurd")
     assert np.isfinite(built.baselines.xy).all()
+
+
+@pytest.mark.parametrize(
+    ("shape", "length", "kept"),
+    [
+        ('<arc curvature="1"/>', 9.4, True),
+        ('<arc curvature="1"/>', 60, False),
+        ('<arc curvature="-0.05"/>', 200, False),
+        ('<spiral curvStart="0" curvEnd="0.1"/>', 180, True),
+        ('<spiral curvStart="-0.1" curvEnd="0.1"/>', 180, True),
+        ('<spiral curvStart="0" curvEnd="1"/>', 60, False),
+    ],
+)
+def test_a_geometry_of_several_turns_costs_its_road(shape: str, length: float, kept: bool):
+    plan, far = geometry(shape, length=length), road("2", plan=geometry("<line/>", x=1000))
+    drive = parse(road(plan=plan, sections=section(lane(-1)), length=length), far)
+    built, report = build_road_map(drive, name="turns")
+    assert built.num_lanes == 2 + kept
+    what = "road left out: one geometry turns more than one and a half times"
+    assert report.warnings.get(what, 0) == (0 if kept else 1)

@@ -255,12 +255,7 @@ def test_damaged_files_give_records_or_one_clear_error(data: st.DataObject):
 @pytest.mark.parametrize(
     ("part", "message"),
     [
-        (
-            road(plan=geometry('<arc curvature="1e6"/>')),
-            "arc .* curvature='1e6', not within -100 …",
-        ),
         (road("1").replace('length="100" junction', 'length="1e9" junction'), "road .* length="),
-        (road(sections=section(lane(-1, width=1e5))), "width .* a='100000.0'"),
         (road(inner='<type s="0"><speed max="1e9"/></type>'), "speed .* max='1e9'"),
         (road(inner='<objects><object s="0" t="nan"/></objects>'), "object .* t=nan"),
     ],
@@ -268,3 +263,31 @@ def test_damaged_files_give_records_or_one_clear_error(data: st.DataObject):
 def test_a_number_outside_of_its_range_names_road_element_and_value(part: str, message: str):
     error = refused(document(part))
     assert re.search(f"road '1': {message}", str(error))
+
+
+@pytest.mark.parametrize(
+    ("part", "what"),
+    [
+        (
+            road(plan=geometry('<arc curvature="1e6"/>')),
+            "arc .* curvature='1e6', not within -100 …",
+        ),
+        (road(sections=section(lane(-1, width=1e5))), "width .* a='100000.0', not within"),
+    ],
+)
+def test_an_absurd_record_costs_its_road_and_is_named(part: str, what: str):
+    od = parse(part, road("2"))
+    assert list(od.roads) == ["2"]
+    ((kind, count),) = od.warnings.items()
+    assert count == 1
+    assert re.search(f"road left out, the first for road '1': {what}", kind)
+
+
+def test_an_absurd_record_shorter_than_a_millimetre_costs_nothing():
+    crumb = '<width sOffset="99.9999" a="3.5" b="1e7" c="0" d="0"/>'
+    od = parse(road(sections=section(lane(-1, inner=crumb))))
+    assert od.roads["1"].sections[0].lanes[-1].widths[1].tolist() == [99.9999, 3.5, 0, 0, 0]
+    assert od.warnings == {"absurd record shorter than 1 mm, ignored": 1}
+    plan = [geometry("<line/>"), geometry('<spiral curvEnd="1e5"/>', s=100, x=100, length=5e-4)]
+    od = parse(road(plan=plan, length=100.0005))
+    assert [found.kind for found in od.roads["1"].geometries] == ["line", "line"]
