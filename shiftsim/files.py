@@ -192,8 +192,9 @@ def import_named(module: str) -> ModuleType:
     name, folder = (module, Path.cwd()) if not module.endswith(".py") else _module_of(Path(module))
     if not name.startswith("shiftsim.") and str(folder) not in sys.path:
         finder = UserFolder(str(folder), name.partition(".")[0])
-        if finder not in sys.meta_path:
-            sys.meta_path.append(finder)
+        others = [found for found in sys.meta_path if found != finder]
+        first = sum(not isinstance(found, UserFolder) for found in others)
+        sys.meta_path[:] = [*others[:first], finder, *others[first:]]  # the last one named first
     try:
         found = import_module(name)
     except ImportError:

@@ -161,7 +161,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
             )
     named, found = manifest["config"]["planners"], manifest["determining"]["planners"]
     if not all(isinstance(name, str) for name in named) or not all(
-        isinstance(about, dict) for about in found.values()
+        isinstance(about, (dict, str)) for about in found.values()
     ):
         what = f"{str(path)!r} cannot be read: its planners are no names with what they are"
         raise DataError(what, hint="make the run again")

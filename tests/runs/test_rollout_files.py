@@ -33,7 +33,8 @@ TRACK_WIDTHS = {"poses": 3, "velocities": 2, "sizes": 2}
 MANIFEST = {
     "format": FORMAT_VERSION,
     "state": "finished",
-    **{"split": "s", "store": "s", "config": {"planners": []}, "counts": {}},
+    **{"split": "s", "store": "s", "config": {"planners": [], "noise": [], "seeds": []}},
+    "counts": {"ok": 0, "expected": 0},
     "determining": {
         **{"store": "", "planners": {}, "traffic": "", "controller": ""},
         "metric_version": "",
