@@ -192,10 +192,11 @@ def import_named(module: str) -> ModuleType:
     name, folder = (module, Path.cwd()) if not module.endswith(".py") else _module_of(Path(module))
     if not name.startswith("shiftsim.") and str(folder) not in sys.path:
         finder = UserFolder(str(folder), name.partition(".")[0])
-        finder = next((found for found in user_folders() if found == finder), finder)
-        others = [found for found in sys.meta_path if found != finder]
-        first = sum(not isinstance(found, UserFolder) for found in others)
-        sys.meta_path[:] = [*others[:first], finder, *others[first:]]  # the last one named first
+        folders = user_folders()
+        libraries = [found for found in sys.meta_path if found not in folders]
+        if finder in folders:  # it knows what it has found
+            finder = folders.pop(folders.index(finder))
+        sys.meta_path[:] = [*libraries, finder, *folders]  # the folder named last comes first
     try:
         found = import_module(name)
     except ImportError:

@@ -151,16 +151,16 @@ def _explain(files: Sequence[Path], conversion: "_Conversion") -> None:
     entries: list[ScenarioEntry] = []
     for path in files:
         with open_log(path) as log:
-            kept, so_far = _asked_for(log, empty), empty
-            counts["offered"] += len(kept)
-            offers["types"].update(entry.scenario_type for entry in kept)
-            offers["maps"][log.map_name] += len(kept)
-            offers["logs"][log.name] += len(kept)
+            found, so_far = _asked_for(log, empty), empty
+            counts["offered"] += len(found)
+            offers["types"].update(entry.scenario_type for entry in found)
+            offers["maps"][log.map_name] += len(found)
+            offers["logs"][log.name] += len(found)
             for name in (name for name in LISTED if name in fields):
                 so_far = replace(so_far, **{name: getattr(chosen, name)})
-                kept = _asked_for(log, so_far)
-                counts[name] += len(kept)
-            entries += kept
+                found = _asked_for(log, so_far)
+                counts[name] += len(found)
+            entries += found
     so_far = replace(empty, shuffle=chosen.shuffle)
     taken = entries
     for name in (name for name in THINNED if name in fields):

@@ -1,5 +1,6 @@
 """What a source of recordings offers to the converter, and what it hands over of each."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,7 +33,7 @@ class SourceRecording:
     details: Mapping[str, Any] = field(default_factory=dict)  # for the report, JSON values only
 
 
-class Reader:
+class Reader(ABC):
     """A source of recordings. It must pickle.
 
     Attributes:
@@ -47,25 +48,25 @@ class Reader:
     site: BuiltMap | None
     settings: Mapping[str, Any]
 
+    @abstractmethod
     def recordings(self) -> Sequence[str]:
         """Names of the recordings, in the order in which they are reported.
 
         Raises:
             ConversionError: There is none.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def files(self, recording: str) -> Sequence[Path]:
         """The files that a recording is read from."""
-        raise NotImplementedError
 
+    @abstractmethod
     def read(self, recording: str) -> SourceRecording:
         """One recording.
 
         Raises:
             DataError: A file is missing or broken, or contradicts itself.
         """
-        raise NotImplementedError
 
     def summarise(self, entries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         """What the report says of all recordings, from the entry of each, details included.

@@ -35,9 +35,9 @@ class RemoteFiles:
         self.url = url.rstrip("/")
         try:
             # Google's client would go on trying for a quarter of an hour
-            limit = f"{'&' if '?' in self.url else '?'}retry_limit_seconds={_PATIENCE}"
-            is_endless = self.url.startswith(("gs:", "gcs:")) and "retry_limit" not in self.url
-            given = self.url + limit * is_endless
+            given = self.url
+            if given.startswith(("gs:", "gcs:")) and "retry_limit" not in given:
+                given += f"{'&' if '?' in given else '?'}retry_limit_seconds={_PATIENCE}"
             self._remote, self._root = fs.FileSystem.from_uri(given)
         except (pa.ArrowException, OSError, ValueError) as error:
             hint = "give a URL such as s3://bucket/folder"

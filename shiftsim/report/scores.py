@@ -25,12 +25,12 @@ from shiftsim.report.groups import (
 from shiftsim.report.tables import Cell, Number, Table, text
 from shiftsim.report.words import (
     Violation,
-    gravest,
     rows_by_task,
     severity,
     task_of,
     violations,
     worst_of,
+    worst_violation,
 )
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
@@ -176,7 +176,7 @@ def worst_rollouts(run: Run, count: int = 10) -> list[dict[str, Any]]:
     rows = []
     for row in scores.to_pylist():
         task = task_of(row)
-        cause = gravest(violations(metrics.get(task, [])))
+        cause = worst_violation(violations(metrics.get(task, [])))
         known = {"cause": cause.reason, "severity": severity(cause)} if cause else _NO_CAUSE
         reason = "" if cause is None else _in_words(cause)
         rows.append(row | known | {"log": row["log_name"], "reason": reason})

@@ -112,7 +112,7 @@ def violations(rows: Iterable[Mapping[str, Any]]) -> list[Violation]:
 
 
 def severity(one: Violation) -> tuple[float, float, float]:
-    """What violations are ordered by, the gravest first: kind, then Δv, distance or other value."""
+    """What violations are ordered by, the worst first: kind, then Δv, distance or other value."""
     value, kind = one.row["first_violation_value"], float(list(REASONS).index(one.row["metric"]))
     amount = abs(value) if value is not None and np.isfinite(value) else 0.0
     if one.row["metric"] == "time_to_collision_within_bound":
@@ -120,13 +120,18 @@ def severity(one: Violation) -> tuple[float, float, float]:
     return (0.0, kind, -amount) if one.is_multiplier else (1.0, one.row["score"], -amount)
 
 
-def gravest(found: Iterable[Violation]) -> Violation | None:
-    """The cause of a score: the first multiplier in the order of metrics, else the lowest score."""
+def worst_violation(found: Iterable[Violation]) -> Violation | None:
+    """What cost most: the first multiplier in the order of metrics, else the lowest score."""
     return min(found, key=severity, default=None)
 
 
+def worst_moment(found: Iterable[Violation]) -> Violation | None:
+    """What cost most of those that have a moment."""
+    return worst_violation(one for one in found if one.time is not None)
+
+
 def worst_of(rows: Iterable[Mapping[str, Any]], count: int) -> list[tuple[Mapping[str, Any], int]]:
-    """The worst scenarios, each by its worst rollout, by score and by the gravity of its cause.
+    """The worst scenarios, each by its worst rollout, by score and by the severity of its cause.
 
     At most one per recording and cause; with each, how many other scenarios are like it. Rows hold
     a task, `cls`, `cause`, its `severity`, and `log`, the recording.
@@ -142,9 +147,3 @@ def worst_of(rows: Iterable[Mapping[str, Any]], count: int) -> list[tuple[Mappin
         key = (row["log"], row["cause"]) if is_same else (row["token"],)
         alike.setdefault(key, []).append(row)
     return [(same[0], len(same) - 1) for same in list(alike.values())[:count]]
-
-
-def worst_violation(found: Iterable[Violation]) -> Violation | None:
-    """The one that cost most and has a moment: the first of a multiplier, else the first."""
-    known = [one for one in found if one.time is not None]
-    return next((one for one in known if one.is_multiplier), known[0] if known else None)

@@ -11,10 +11,10 @@ from shiftsim.files import safe_join, write_text
 from shiftsim.metrics import SHORT_NAMES
 from shiftsim.report.words import (
     REASONS,
-    gravest,
     rows_by_task,
     severity,
     violations,
+    worst_moment,
     worst_of,
     worst_violation,
 )
@@ -221,7 +221,7 @@ class Gallery:
         run, key = self._runs[task]
         (end,) = self._ends[run.path][key]
         found = violations(metrics)
-        worst, cause = worst_violation(found), gravest(found)
+        worst, cause = worst_moment(found), worst_violation(found)
         failed = "" if end["status"] == "ok" else f"{end['status']}: {end['error'] or ''}"
         return {
             "token": task.token,

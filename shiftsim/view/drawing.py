@@ -12,7 +12,7 @@ import numpy as np
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.kernels import FloatArray
 from shiftsim.report.palette import AGENTS, ALARM, OTHER_AGENT, RECORDED, Style, dashes
-from shiftsim.report.words import violation_words, violations, worst_violation
+from shiftsim.report.words import violation_words, violations, worst_moment
 from shiftsim.sim.log import SimulationLog
 from shiftsim.view.scene import ShownRollout, map_lines
 from shiftsim.world.map import VectorMap
@@ -90,7 +90,7 @@ def caption(item: ShownRollout) -> str:
     """Planner, noise, score, and what cost most of it, as "… at-fault collision (NCR) at 4.3 s"."""
     name = item.planner if item.noise == "none" else f"{item.planner}, {item.noise}"
     score = "" if item.cls is None else f": score {100.0 * item.cls:.0f}"
-    worst = worst_violation(violations(item.metrics))
+    worst = worst_moment(violations(item.metrics))
     if worst is None:
         return f"{name}{score}"
     what, comma, more = violation_words(worst.row, item.log.tracks).partition(",")
@@ -109,7 +109,7 @@ def draw_violation(
     axes: Any, item: ShownRollout, style: Style, *, in_short: bool = False
 ) -> Mark | None:
     """A burst where the worst violation began, and what it was; `in_short` without numbers."""
-    worst = worst_violation(violations(item.metrics))
+    worst = worst_moment(violations(item.metrics))
     if worst is None or worst.time is None:
         return None
     time_us = item.log.time_us

@@ -18,6 +18,7 @@ from shiftsim.data.readers.tracks.axes import (
 from shiftsim.data.readers.tracks.findings import FAST, Diagnostics
 from shiftsim.data.readers.tracks.map_fit import MIN_ALONG, Fit, fit_map
 from shiftsim.data.readers.tracks.table import TrackTable
+from shiftsim.errors import listed
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AgentKind
 
@@ -62,7 +63,7 @@ def _check_kinds(table: TrackTable, out: Diagnostics) -> bool:
     used = [table.categories[code] for code in np.unique(table.category).tolist()]
     if unknown := [name[:40] for name in used if name not in KINDS]:
         out.error(
-            f"kinds {', '.join(map(repr, unknown[:8]))} are unknown",
+            f"kinds {listed([*map(repr, unknown)])} are unknown",
             f"say what they are in a TOML file for --columns: [kinds] {unknown[0]!r} = 'car';"
             f" known are {', '.join(sorted(KINDS))}",
         )

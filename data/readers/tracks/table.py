@@ -271,8 +271,9 @@ class _TableFile(SourceFile):
                 " header = ['id', 'frame', 'x', 'y', 'kind', …] (those not needed ''), or write"
                 " such names as the first line",
             )
-        is_list = isinstance(header, list) and all(isinstance(name, str) for name in header)
-        if header is not None and (not is_list or len(header) != len(cells)):  # type: ignore[arg-type]
+        names = header if isinstance(header, list) else []
+        fits = len(names) == len(cells) and all(isinstance(name, str) for name in names)
+        if header is not None and not fits:
             raise ConfigError(f"header is {header!r}", f"give a list of {len(cells)} names")
         return is_named
 
