@@ -77,7 +77,7 @@ def draw_paths(axes: Any, shown: Sequence[ShownRollout], styles: Mapping[str, St
         every = (min(10 + number * _EVERY // len(shown), len(ego) - 1), _EVERY)
         look = {"linewidth": 1.8, "linestyle": dashes(item.noise), "markevery": every}
         look |= style.marks(item.noise, 5.5)
-        axes.plot(ego[:, 0], ego[:, 1], zorder=6, label=caption(item), **look)
+        axes.plot(ego[:, 0], ego[:, 1], zorder=6, label=caption(item, shown), **look)
 
 
 def draw_recorded(axes: Any, log: SimulationLog) -> None:
@@ -86,9 +86,14 @@ def draw_recorded(axes: Any, log: SimulationLog) -> None:
     axes.plot(log.expert_ego[:, 0], log.expert_ego[:, 1], label="recorded driver", **dotted)
 
 
-def caption(item: ShownRollout) -> str:
-    """Planner, noise, score, and what cost most of it, as "… at-fault collision (NCR) at 4.3 s"."""
+def caption(item: ShownRollout, shown: Sequence[ShownRollout]) -> str:
+    """Planner, noise, score, and what cost most of it, as "… at-fault collision (NCR) at 4.3 s".
+
+    The seed is named where several of them are shown.
+    """
     name = item.planner if item.noise == "none" else f"{item.planner}, {item.noise}"
+    alike = [one for one in shown if (one.planner, one.noise) == (item.planner, item.noise)]
+    name += f", seed {item.seed}" if len({one.seed for one in alike}) > 1 else ""
     score = "" if item.cls is None else f": score {100.0 * item.cls:.0f}"
     worst = worst_moment(violations(item.metrics))
     if worst is None:

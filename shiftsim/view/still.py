@@ -132,7 +132,7 @@ def grid(
             draw_violation(axes, item, styles[item.planner], in_short=True)
             if item is shown[0]:
                 axes.set_title(f"{time:g} s", fontsize=SMALL + 1)
-        line[0].set_ylabel(_wrapped(caption(item), per_line), fontsize=SMALL - 1)
+        line[0].set_ylabel(_wrapped(caption(item, shown), per_line), fontsize=SMALL - 1)
     draw_scale(panels_of[-1][0], extent)
     figure.supxlabel("\n".join(filter(None, (_KEY, note))), fontsize=SMALL - 1)
     figure.suptitle(_words(scenario), fontsize=SMALL + 1)

@@ -62,6 +62,16 @@ def test_a_still_says_planner_noise_score_and_metric_in_words(scenario, shown):
     assert plain.count(said(scenario, SAID)) == 3
 
 
+def test_a_still_of_several_seeds_names_them(scenario, shown):
+    noisy = [one for one in shown if one.noise != "none"][:1]
+    several = [*noisy, replace(noisy[0], seed=2)]
+    words = " ".join(
+        " ".join(text for text, _ in written(still(scenario, several, at=1.0))).split()
+    )
+    assert f"{noisy[0].planner}, ou-high, seed 0:" in words
+    assert f"{noisy[0].planner}, ou-high, seed 2:" in words
+
+
 def test_no_words_of_a_picture_cover_others_or_are_cut_off(scenario, shown):
     for figure in (
         still(scenario, shown, at=1.0),
