@@ -105,7 +105,7 @@ def test_the_list_begins_with_the_worst_and_leads_to_what_went_wrong(page, folde
     scores = [float(row.split()[0]) for row in found]
     assert scores == sorted(scores)
     assert 1 <= len(found) <= 10
-    # the farthest off the road of those that score 0; the clean one leaves it at 3.1 s, by less
+    # of those that score 0 the farthest off the road: 0.38 m, before one of 0.36 m at 3.1 s
     assert "drivable area 2.4\u00a0s" in found[0]
     page.browser.find_element("css selector", "#worst a").click()
     page.wait("document.documentElement.dataset.ready && location.hash.startsWith('#t=')")
