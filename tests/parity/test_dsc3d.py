@@ -26,9 +26,7 @@ from shiftsim.data.maps.opendrive.lanes import LaneKey
 from shiftsim.data.maps.opendrive.map import build_road_map
 from shiftsim.data.maps.opendrive.reading import read_opendrive
 from shiftsim.data.readers.annotations import (
-    POSITION as PLACE,
-)
-from shiftsim.data.readers.annotations import (
+    POSITION,
     ROTATION,
     Site,
     read_recording,
@@ -59,7 +57,7 @@ pytestmark = [pytest.mark.golden, pytest.mark.reference("dsc3d_synthetic")]
 sample = pytest.mark.reference("dsc3d_sample")
 
 ATOL = 1e-9
-POSITION = 2e-2  # m: README of the scripted recordings
+POSITION_ATOL = 2e-2  # m: README of the scripted recordings
 MIN_SAMPLES = 10  # of a lane; shorter pieces at the ends of a lane sequence may be missing
 CONFIG = ConversionConfig()  # as by default
 DERIVED = "derived columns of annotations.parquet: acceleration and angular velocity"
@@ -111,7 +109,7 @@ def test_sample(folder: Path, cases: Cases) -> None:
     recording, lanes = read_recording(site, site.recordings[0]), Lanes(find_map(site), site)
     raw = read_file(site.folder / "annotations" / recording.name / "annotations.parquet", cases)
     raw = raw.at(np.lexsort((raw["frame_id"], raw["track_id"])))
-    bottom = np.column_stack([raw[name] for name in PLACE]).astype(np.float64)
+    bottom = np.column_stack([raw[name] for name in POSITION]).astype(np.float64)
     keys = [lanes.keys_at(x, y) for x, y in (bottom[:, :2] + lanes.offset).tolist()]
     rows = read_file(folder / "expected_rows.parquet", cases)
     compare_rows(rows, site, recording, keys, bottom, raw)
@@ -130,7 +128,8 @@ def compare_rows(
     utm = bottom[:, :2] + site.offset[:2]
     lanes = [key[0] if len(key) == 1 else LaneKey("", 0, 0) for key in keys]
     lon, lat = pyproj.Transformer.from_crs(site.epsg, 4326, always_xy=True).transform(*utm.T)
-    angles, up = rotation_angles(np.column_stack([raw[name] for name in ROTATION]))
+    rotation = np.column_stack([raw[name] for name in ROTATION]).astype(np.float64)
+    angles, up = rotation_angles(rotation)
     _, pitch, roll = angles.T
     x, y = recording.xy.T
     height = recording.sizes[recording.track, 2]
@@ -298,7 +297,7 @@ def compare_converted(
             poses.match(key, {"yaw": centers[:, 2]}, quantity="20 Hz", angles={"yaw"})
             xy = np.column_stack([poses[key]["x_local"], poses[key]["y_local"]])
             error = np.linalg.norm(centers[:, :2] - lanes.offset - xy, axis=1)
-            cases.compare("20 Hz position", where, error, 0.0 * error, atol=POSITION)
+            cases.compare("20 Hz position", where, error, 0.0 * error, atol=POSITION_ATOL)
         first = int(window.iteration_rows[0]) - window.first_row
         given = repr([tuple(lane) for lane in lanes_from.get(key, ())])
         passed = [repr([tuple(lane) for lane in way]) for way in lanes.sequences(centers[first:])]

@@ -78,7 +78,7 @@ def test_tracks_of_argoverse_are_those_of_the_file(folder, stores, expected):
     assert samples.start_us == facts["tracks"]["first_timestamp_us"]
     assert samples.duration == pytest.approx(facts["tracks"]["duration_s"], abs=1e-6)
     ego = samples.track == samples.track_ids.tolist().index("AV")
-    poses = np.column_stack([samples.centers[ego, :2], samples.headings[ego]])
+    poses = np.column_stack([samples.xy[ego], samples.headings[ego]])
     np.testing.assert_allclose(poses[0], facts["ego_AV"]["first_pose"], atol=1e-3)
     np.testing.assert_allclose(poses[-1], facts["ego_AV"]["last_pose"], atol=1e-3)
     way = np.hypot(*np.diff(poses[:, :2], axis=0).T).sum()
@@ -114,7 +114,7 @@ def test_tracks_of_commonroad_are_those_of_the_file(folder, expected):
     for number, name in enumerate(samples.track_ids.tolist()):
         one, rows = facts["obstacles"]["by_id"][name], samples.track == number
         assert rows.sum() == one["states"]
-        way = np.hypot(*np.diff(samples.centers[rows, :2], axis=0).T).sum()
+        way = np.hypot(*np.diff(samples.xy[rows], axis=0).T).sum()
         assert way == pytest.approx(one["path_m"], abs=1e-3)
     limits = scene.map.road.speed_limits
     assert sorted({round(v, 4) for v in limits.tolist()}) == [11.176, 15.6464]
