@@ -135,7 +135,7 @@ def ending(folder: Path, result: TaskResult, count: int) -> float:
     determining: dict[str, object] = {"store": "", "traffic": "", "controller": "", "planners": {}}
     manifest = {
         **{"format": FORMAT_VERSION, "state": "finished", "split": "", "store": "", "counts": {}},
-        "config": {"planners": []},
+        "config": {"planners": [PLANNER], "noise": [NOISE], "seeds": [0]},
         "determining": determining | {"metric_version": "", "thresholds": {"name": ""}},
     }
     writer = RunWriter(folder, manifest)
