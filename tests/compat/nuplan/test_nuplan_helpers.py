@@ -68,6 +68,8 @@ def test_the_nearest_geometry_is_found_and_parts_of_its_id_are_left_out():
     found.insert("go", shapely.box(1.5, 0.0, 2.0, 1.0))  # nuPlan rule 610
     assert found.get_nearest_entry_to("ego")[0] == "a"
     assert found.intersects(shapely.LineString([(2.0, 0.5), (5.0, 0.5)])).size == 2
+    tree, names = found._build_strtree()  # public planners look for loops of routes with it
+    assert [names[index] for index in tree.query(shapely.box(9.5, 0.0, 9.6, 1.0))] == ["b"]
     found.remove(["a", "go"])
     assert (len(found), found.size, found.is_empty()) == (2, 2, False)
     assert not found.contains("a")

@@ -221,16 +221,21 @@ class OccupancyMap:
         """Id, geometry and distance [m] of what is nearest to one of the geometries."""
         assert self.contains(geometry_id), f"the occupancy map has no geometry {geometry_id!r}"
         # nuPlan rule 610: what it leaves out is every id that is a part of the given one
-        names = [name for name in self._geom_map if name not in geometry_id]
+        others = {name: item for name, item in self._geom_map.items() if name not in geometry_id}
         geometry = self.get(geometry_id)
-        nearest = names[shapely.STRtree([self.get(name) for name in names]).nearest(geometry)]
+        tree, names = type(self)(others)._build_strtree()
+        nearest = names[tree.nearest(geometry)]
         return nearest, self.get(nearest), float(geometry.distance(self.get(nearest)))
 
     def intersects(self, geometry: Geometry) -> "OccupancyMap":
         """The part of the map that shares a point with a geometry."""
-        names = self.get_all_ids()
-        found = shapely.STRtree(self.get_all_geometries()).query(geometry, predicate="intersects")
-        return type(self)({names[index]: self.get(names[index]) for index in found.tolist()})
+        tree, names = self._build_strtree()
+        found = [names[index] for index in tree.query(geometry, predicate="intersects")]
+        return type(self)({name: self.get(name) for name in found})
+
+    def _build_strtree(self) -> tuple[shapely.STRtree, dict[int, str]]:
+        """Index of the geometries, and their ids by number; public planners call it."""
+        return shapely.STRtree(self.get_all_geometries()), dict(enumerate(self._geom_map))
 
 
 class STRTreeOccupancyMap(OccupancyMap):
