@@ -42,6 +42,7 @@ KINDS = {
     "dsc3d_sample": ["expected_rows.parquet", "data"],
     "dsc3d_synthetic": ["expected_ego_20hz.parquet|*/expected_ego_20hz.parquet"],
     "opendrive": ["*.refline.parquet"],
+    "open_loop": ["openloop_plans.parquet"],
     "scenario_edits": ["tokens.json", "build.json", "traffic.json"],
     "nuplan_experiment": [
         "|".join(
