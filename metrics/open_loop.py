@@ -13,6 +13,7 @@ import numpy as np
 from shiftsim.errors import DataError
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.metrics.result import MetricPart, MetricRow, Statistic
+from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import center_poses
 
 EVERY = 10  # iterations between plans that are compared
@@ -55,12 +56,38 @@ class OpenLoopResult:
     farthest: FloatArray  # (3, F) largest distance within each horizon [m]
 
 
+def recording(scenario: Scenario) -> Poses:
+    """What the plans of a scenario are compared with: its tenth iterations, and 8 s behind."""
+    rows, second = scenario.iteration_rows, scenario.row_step * EVERY
+    last = int(rows[:-1][::EVERY][-1])
+    ahead = last + second * np.arange(1, HORIZONS[-1] + 1)
+    # nuPlan rule 732: iterations and what follows the last plan may have a sample in common
+    rows = np.concatenate([rows[::EVERY], ahead[ahead < len(scenario.time_us)]])
+    return Poses(scenario.time_us[rows], scenario.ego[rows, :3])
+
+
+def metric_rows(plans: Sequence[Poses], scenario: Scenario) -> list[MetricRow]:
+    """Rows of the plans of a scenario whose 8 s were recorded; the last one counts them.
+
+    nuPlan scores all plans or none: where the count is below its bound, the score is not nuPlan's.
+
+    Raises:
+        DataError: A plan, or the recording behind the first of them, is too short.
+    """
+    expert = recording(scenario)
+    count = max(1, min(len(plans), len(expert.time_us) - HORIZONS[-1]))
+    result = open_loop(plans[:count], expert, scenario.token)
+    total = MetricRow("open_loop_score", result.score, result.score, "ratio", None, None)
+    frames = MetricRow("open_loop_plans", None, count, "count", len(plans), None)
+    return [total, *(part.row for part in result.parts), frames]
+
+
 def open_loop(plans: Sequence[Poses], expert: Poses, token: str = "") -> OpenLoopResult:
     """Compare plans, made a second apart, with the recording.
 
     Args:
-        plans: The plan of every tenth iteration.
-        expert: Recorded poses at these iterations, and at 1 to 8 s after the last of them.
+        plans: The plan of every tenth iteration but the last, which no planner is asked at.
+        expert: Recorded poses, as by `recording`.
         token: Scenario that an error names.
 
     Raises:

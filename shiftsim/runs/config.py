@@ -124,6 +124,7 @@ class RunConfig:
     isolate: bool = _setting(False, "Every planner in a process of its own.")
     planner_python: str = _setting("", "Interpreter for isolated planners of your own.")
     strict: bool = _setting(False, "Fail where a planner falls back.")
+    open_loop: bool = _setting(False, "Also nuPlan's open-loop scores of every planner.")
     out: str = _setting("", "Run folder. [runs/<id>]")
     workers: int = _setting(0, "Worker processes. [auto]", parse=parse_workers)
     timeout: float = _setting(0.0, "Seconds that one scenario may take; a hung one is killed.")

@@ -19,14 +19,20 @@ import pyarrow as pa
 from shiftsim.data.store.reading import ScenarioStore, open_store
 from shiftsim.errors import ConfigError, ShiftsimError, readable
 from shiftsim.files import place_of
-from shiftsim.metrics import METRIC_VERSION, SHORT_NAMES, MetricRow, compute_metrics
+from shiftsim.metrics import METRIC_VERSION, SHORT_NAMES, MetricRow, compute_metrics, open_loop
 from shiftsim.planners.registry import RunPlanner
 from shiftsim.runs.config import RunConfig
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.rollouts.columns import encode_rows, rollout_rows
 from shiftsim.runs.tables import FAILED, OK, TABLES, TaskResult
 from shiftsim.sim.log import SimulationLog
-from shiftsim.sim.loop import Rollout, Setting, drive, simulate_together
+from shiftsim.sim.loop import (
+    Rollout,
+    Setting,
+    drive,
+    plans_on_recording,
+    simulate_together,
+)
 from shiftsim.sim.noise import NoiseModel, is_standard
 from shiftsim.sim.planner import Planner
 from shiftsim.sim.traffic import BatchTraffic, Traffic, make_traffic
@@ -147,6 +153,10 @@ class TaskRunner:
         seconds["planning_ms_p95"] = float(np.percentile(per_step, 95))
         with _timed(seconds, "metrics_seconds"):
             scores, metrics = score_rollout(scenario, log, self.config)
+        if self.config.open_loop and rollout.planner is not None:
+            profile = {name: scores[name] for name in ("thresholds", "metric_version")}
+            rows = self._open_loop(task, scenario)
+            metrics += [_metric_row(row, int(log.time_us[0]), profile) for row in rows]
         keep, encoded = self.config.save_rollouts, b""
         if keep == "all" or (keep == "failed" and scores["cls"] == 0.0):
             # pedestrians of an edit wait for the ego
@@ -162,6 +172,17 @@ class TaskRunner:
             rollout=encoded,
             warning=rollout.warning,
         )
+
+    def _open_loop(self, task: Task, scenario: Scenario) -> list[MetricRow]:
+        """Scores of the plans that a fresh planner makes along the recording."""
+        planner = self._planner(task)
+        assert planner is not None
+        try:
+            plans = plans_on_recording(scenario, planner, open_loop.EVERY, self._setting(task))
+        finally:
+            self._release(task, planner)
+        poses = [open_loop.Poses(plan.time_us, plan.states[:, :3]) for plan in plans]
+        return open_loop.metric_rows(poses, scenario)
 
     def _setting(self, task: Task) -> Setting:
         return Setting(

@@ -265,6 +265,29 @@ def simulate(
     return log
 
 
+def plans_on_recording(
+    scenario: Scenario, planner: Planner, every: int, setting: Setting = DEFAULT
+) -> list[Trajectory]:
+    """The plans of every n-th iteration, in log time, where the ego drives as it was recorded.
+
+    Raises:
+        PlannerError: The planner failed, or returns commands.
+    """
+    rollout, plans = Rollout(scenario, planner, setting, controller="log-playback"), []
+    while not rollout.done:
+        observation = rollout.observe()
+        plan = planner.plan(observation)
+        rollout.advance(plan)
+        if observation.iteration % every == 0:
+            if not isinstance(plan, Trajectory):
+                raise PlannerError(
+                    "open loop compares trajectories, and the planner returns commands",
+                    hint="return a shiftsim.Trajectory",
+                )
+            plans.append(plan.starting_at(observation.time_us))
+    return plans
+
+
 def drive(rollout: Rollout) -> SimulationLog:
     """Drive a fresh rollout to its end; errors are those of `simulate`."""
     planner = rollout.planner

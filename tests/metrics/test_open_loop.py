@@ -1,0 +1,92 @@
+"""Open-loop scores of plans that are known to be right, shifted, turned, or too short."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import shiftsim
+from shiftsim.errors import DataError, PlannerError
+from shiftsim.metrics.open_loop import EVERY, Poses, metric_rows, open_loop, recording
+from shiftsim.sim.loop import plans_on_recording
+from shiftsim.world.state import Command
+
+FRAMES, SECONDS = 4, 8
+SPEED, EAST = 10.0, 0.0
+
+
+def drive(start_s: float, seconds: float, step_s: float = 0.5) -> Poses:
+    """Straight on with 10 m/s."""
+    times = start_s + np.arange(0.0, seconds + 1e-9, step_s)
+    poses = np.stack([SPEED * times, np.zeros_like(times), np.full_like(times, EAST)], axis=1)
+    return Poses(np.rint(times * 1e6).astype(np.int64), poses)
+
+
+EXPERT = drive(0.0, FRAMES - 1 + SECONDS, 1.0)
+
+
+def plans(aside: float = 0.0, turn: float = 0.0, seconds: float = SECONDS) -> list[Poses]:
+    """Plans along the recording, beside it, or turned on the spot."""
+    out = []
+    for frame in range(FRAMES):
+        times, poses = drive(frame, seconds)
+        out.append(Poses(times, poses + np.array([0.0, aside, turn])))
+    return out
+
+
+@given(st.floats(0.0, 20.0))
+def test_a_plan_beside_the_recording_is_off_by_its_distance(aside):
+    result = open_loop(plans(aside), EXPERT)
+    scores = {part.row.metric: part.row for part in result.parts}
+    for name in ("average", "final"):
+        row = scores[f"planner_expert_{name}_l2_error_within_bound"]
+        assert row.value == pytest.approx(aside, abs=1e-9)
+        assert row.score == pytest.approx(max(0.0, 1.0 - aside / 8.0), abs=1e-9)
+    # within 3, 5 and 8 s a plan may be off by 6, 8 and 16 m
+    assert scores["planner_miss_rate_within_bound"].score == float(aside <= 6.0)
+    expected = 0.0 if aside > 6.0 else (2.0 * (1.0 - aside / 8.0) + 4.0) / 6.0
+    assert result.score == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_full_turn_is_no_error_of_heading():
+    assert open_loop(plans(turn=2.0 * np.pi), EXPERT).score == pytest.approx(1.0)
+    result = open_loop(plans(turn=0.4), EXPERT)
+    assert result.errors["FHE"] == pytest.approx(0.4)
+
+
+def test_the_end_of_a_plan_stands_for_the_eighth_second():
+    result = open_loop(plans(aside=1.0, seconds=7.5), EXPERT)  # nuPlan rule 730
+    assert result.errors["FDE"][2] == pytest.approx(1.0)
+    with pytest.raises(DataError, match=r"covers 6\.5 s"):
+        open_loop(plans(seconds=6.5), EXPERT)
+    with pytest.raises(DataError, match="the recording ends 1 s before the plan"):
+        open_loop([*plans(), drive(FRAMES, SECONDS)], EXPERT, "token")
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return shiftsim.open_store("demo")["01f13e"]
+
+
+def test_the_recorded_future_has_the_full_score(scenario):
+    planner = shiftsim.load_planner("log-future")
+    made = plans_on_recording(scenario, planner, EVERY)
+    poses = [Poses(plan.time_us, plan.states[:, :3]) for plan in made]
+    rows = {row.metric: row for row in metric_rows(poses, scenario)}
+    assert rows["open_loop_score"].score == pytest.approx(1.0, abs=1e-9)
+    counted = rows["open_loop_plans"]
+    # the last plan that is compared is made 8 s before the end of the recording
+    behind = (scenario.time_us[-1] - recording(scenario).time_us[: len(made)]) * 1e-6
+    assert (counted.value, counted.threshold) == (np.count_nonzero(behind >= 8.0), len(made))
+
+
+def test_commands_are_no_plans(scenario):
+    class Coast:
+        def reset(self, scene):
+            pass
+
+        def plan(self, observation):
+            return Command(0.0, 0.0)
+
+    with pytest.raises(PlannerError, match="returns commands"):
+        plans_on_recording(scenario, Coast(), EVERY)
