@@ -28,6 +28,8 @@ METRICS = {
     "planner_expert_final_heading_error_within_bound": ("FHE", "radian", 0.8, 2.0),
     "planner_expert_average_heading_error_within_bound": ("AHE", "radian", 0.8, 2.0),
 }
+TOTAL, COUNT = "open_loop_score", "open_loop_plans"
+NAMES = (TOTAL, *METRICS, MISS, COUNT)
 
 
 class Poses(NamedTuple):
@@ -77,8 +79,8 @@ def metric_rows(plans: Sequence[Poses], scenario: Scenario) -> list[MetricRow]:
     expert = recording(scenario)
     count = max(1, min(len(plans), len(expert.time_us) - HORIZONS[-1]))
     result = open_loop(plans[:count], expert, scenario.token)
-    total = MetricRow("open_loop_score", result.score, result.score, "ratio", None, None)
-    frames = MetricRow("open_loop_plans", None, count, "count", len(plans), None)
+    total = MetricRow(TOTAL, result.score, result.score, "ratio", None, None)
+    frames = MetricRow(COUNT, None, count, "count", len(plans), None)
     return [total, *(part.row for part in result.parts), frames]
 
 

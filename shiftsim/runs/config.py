@@ -163,6 +163,11 @@ class RunConfig:
         """Whether what is finished is kept."""
         return self.resume or self.retry_failed
 
+    @property
+    def added_metrics(self) -> list[str]:
+        """What is measured beside nuPlan's closed-loop metrics."""
+        return sorted([*self.metrics, *(["open-loop"] if self.open_loop else [])])
+
     def to_dict(self) -> dict[str, Any]:
         """The settings as JSON or TOML values."""
         out = {item.name: getattr(self, item.name) for item in fields(self)}
@@ -207,7 +212,14 @@ def make_config(values: Mapping[str, Any], *, where: str = "run") -> RunConfig:
         ConfigError: A name is unknown, or a value is wrong.
     """
     known = {item.name for item in fields(RunConfig)}
-    plain: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in values.items()}
+    plain: dict[str, Any] = {
+        name: tuple(value)
+        if isinstance(value, list)
+        else os.fspath(value)
+        if isinstance(value, os.PathLike)
+        else value
+        for name, value in values.items()
+    }
     try:
         for name in values:
             one_of("setting", name, known)

@@ -9,6 +9,7 @@ from typing import Any
 
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
+from shiftsim.metrics.open_loop import NAMES as OPEN_LOOP
 from shiftsim.runs.config import RunConfig, default_workers, make_config, parse_shard
 from shiftsim.runs.edited import make_edits
 from shiftsim.runs.execute import OnProgress, Progress, record, results_of
@@ -112,6 +113,12 @@ class Rescorer:
         edits = self._run.manifest.get("edits")
         edit_set = make_edits(edits, self._run.path.name) if edits else None
         self._scenarios = ScenarioReader(store, edit_set)
+        self._open_loop: dict[Task, list[dict[str, Any]]] = {}  # no threshold changes it
+        if config.open_loop:
+            for row in self._run.metrics.to_pylist():
+                if row["metric"] in OPEN_LOOP:
+                    task = Task(*(row.pop(name) for name in Task._fields))
+                    self._open_loop.setdefault(task, []).append(row)
 
     def __call__(self, batch: Batch) -> list[TaskResult]:
         """The results of tasks."""
@@ -121,6 +128,8 @@ class Rescorer:
         scenario = self._scenarios.read(task.token)
         log = self._run.rollout(task, scenario)
         scores, metrics = score_rollout(scenario, log, self.config)
+        profile = {"thresholds": self.config.thresholds}
+        metrics += [row | profile for row in self._open_loop.get(task, [])]
         return TaskResult(task, OK, scenario.scenario_type, scores=scores, metrics=metrics)
 
 
@@ -147,14 +156,14 @@ def rescore(
         load_metric(metric)
     found = open_run_store(run, store)
     here, simulated = code_digest(), run.manifest["determining"].get("code", "")
+    values = run.manifest["config"] | {"thresholds": thresholds, "metrics": list(metrics)}
+    config = make_config(values, where=str(run.path / "manifest.json"))
     fingerprint = run.manifest["determining"] | {
         "thresholds": asdict(thresholds_of(thresholds)),
-        "metrics": sorted(metrics),
+        "metrics": config.added_metrics,
         "metric_version": METRIC_VERSION,
         "code": here if here == simulated else f"{simulated}, scored by {here}",
     }
-    values = run.manifest["config"] | {"thresholds": thresholds, "metrics": list(metrics)}
-    config = make_config(values, where=str(run.path / "manifest.json"))
     target = Path(out) if out else RUNS / run_name(config, run.manifest["split"], fingerprint)
     check_target(target, fingerprint)
     statuses = dict(zip(run.rollout_places, run.tasks["status"].to_pylist(), strict=True))

@@ -332,7 +332,7 @@ def _fingerprint(
         "traffic": config.traffic,
         "controller": config.controller,
         "thresholds": thresholds,
-        "metrics": sorted(config.metrics),
+        "metrics": config.added_metrics,
         "strict": config.strict,
     }
     plain: dict[str, Any] = json.loads(json.dumps(fields, sort_keys=True, default=str))

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 import shiftsim
 from shiftsim.errors import DataError, PlannerError
-from shiftsim.metrics.open_loop import EVERY, Poses, metric_rows, open_loop, recording
+from shiftsim.metrics.open_loop import EVERY, NAMES, Poses, metric_rows, open_loop, recording
+from shiftsim.runs.derive import rescore
 from shiftsim.sim.loop import plans_on_recording
 from shiftsim.world.state import Command
 
@@ -90,3 +91,20 @@ def test_commands_are_no_plans(scenario):
 
     with pytest.raises(PlannerError, match="returns commands"):
         plans_on_recording(scenario, Coast(), EVERY)
+
+
+def test_a_run_with_open_loop_keeps_its_rows_when_it_is_scored_again(tmp_path):
+    """The rows of closed loop are those of a run without."""
+    runs = [
+        shiftsim.run("idm", limit=1, workers=1, out=tmp_path / name, open_loop=name == "open")
+        for name in ("closed", "open")
+    ]
+    again = rescore(runs[1], thresholds="deepplan", out=str(tmp_path / "again"))
+    without, rows, scored_again = (run.metrics.to_pylist() for run in (*runs, again))
+    added = [row for row in rows if row["metric"] in NAMES]
+    assert {row["metric"] for row in added} == {*NAMES}
+    assert [row for row in rows if row not in added] == without
+    assert runs[0].scores.equals(runs[1].scores)
+    kept = [row for row in scored_again if row["metric"] in NAMES]
+    assert kept == [row | {"thresholds": "deepplan"} for row in added]
+    assert runs[0].manifest["determining"] != runs[1].manifest["determining"]
