@@ -65,7 +65,7 @@ _EGO_TOKEN = "ego_token"
 _OVERLOOKED = frozenset(  # all its parts
     _EGO_TOKEN[i:j] for i in range(len(_EGO_TOKEN)) for j in range(i, len(_EGO_TOKEN) + 1)
 )
-_DONE, _TIED = -1, -2  # instead of an object to decide
+_TIED = -1  # instead of an object to decide
 
 
 def route_blocks(road: VectorMap, route: tuple[str, ...], token: str) -> list[int]:
@@ -221,7 +221,7 @@ class Idm:
             step, lead = _roll_on(
                 step, path.driven, objects, policy, centers, motion, apart, known, footprint
             )
-            if lead == _DONE:
+            if step == STEPS:
                 break
             unsure = np.flatnonzero(known[step] == UNDECIDED) if lead == _TIED else [lead]
             if len(unsure):
@@ -318,7 +318,8 @@ def _roll_on(
     """Fill the rows behind `first` until the end, or until it is open what the lead is.
 
     Returns:
-        The row, and the UNDECIDED object to decide, _TIED where several are touched, or _DONE.
+        The row, and the UNDECIDED object to decide, or _TIED where several are touched. The last
+        row has nothing to decide.
     """
     length, half_width, count = policy.length, 0.5 * policy.width, len(objects.speeds)
     xy, ptr = objects.xy, objects.ptr
@@ -374,4 +375,4 @@ def _roll_on(
         x, y, heading = pose_at(path, motion[step + 1, 0])
         centers[step + 1, 0], centers[step + 1, 1] = x, y
         centers[step + 1, 2] = wrap_angle(heading)
-    return STEPS, _DONE
+    return STEPS, _TIED

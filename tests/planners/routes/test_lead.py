@@ -35,6 +35,11 @@ def test_the_gap_to_the_lead_is_the_distance_between_the_polygons(rng):
     found, gap = find_lead(footprint, objects, np.where(truth > 3.0, HIT, CLEAR))
     assert found == np.flatnonzero(truth > 3.0)[truth[truth > 3.0].argmin()]
     assert gap == pytest.approx(truth[truth > 3.0].min(), abs=1e-12)
+    apart = np.flatnonzero(truth > 0.0)
+    for few in (rng.choice(apart, size=5, replace=False) for _ in range(500)):
+        occupancy = np.full(500, CLEAR)
+        occupancy[few] = HIT
+        assert find_lead(footprint, objects, occupancy)[0] == few[truth[few].argmin()]
 
 
 def test_of_two_objects_that_are_touched_the_lower_one_leads_whatever_their_order():
