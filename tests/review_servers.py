@@ -3,13 +3,13 @@
 from contextlib import contextmanager
 from threading import Thread
 
-from shiftsim.view.review import ReviewServer, ReviewService
+from shiftsim.view.review import ReviewService, review_server
 
 
 @contextmanager
 def reviewing(store):
     """The server of the page of a store, while it answers."""
-    with ReviewServer(ReviewService(store, "me")) as running:
+    with review_server(ReviewService(store, "me")) as running:
         thread = Thread(target=running.serve_forever, daemon=True)
         thread.start()
         yield running

@@ -99,7 +99,7 @@ def read_reviews(store: Path) -> Reviews:
         return Reviews()
     out: dict[str, Review] = {}
     for where, values in read_json_lines(path):
-        review = _review(values, where)
+        review = parse_review(values, where)
         if review.token in out:
             what = f"{where}: scenario {review.token!r} is reviewed twice"
             raise DataError(what, hint="keep one of the lines")
@@ -107,7 +107,12 @@ def read_reviews(store: Path) -> Reviews:
     return Reviews(out.values())
 
 
-def _review(values: Any, where: str) -> Review:
+def parse_review(values: Any, where: str) -> Review:
+    """A review from JSON values, which are somewhere.
+
+    Raises:
+        DataError: They are none.
+    """
     names = [item.name for item in fields(Review)]
     if not isinstance(values, dict) or set(values) - set(names) or "token" not in values:
         raise DataError(f"{where}: not a review", hint=f"its fields are {', '.join(names)}")

@@ -117,12 +117,12 @@ def inspect(
 ) -> None:
     """Review scenarios in the browser: accept, reject, comment, correct the route."""
     from shiftsim.data.store.tables import REVIEW
-    from shiftsim.view.review import ReviewServer, ReviewService
+    from shiftsim.view.review import ReviewService, review_server
 
     if "://" in store:  # where the source's own review would take the place of what is decided
         raise ConfigError(f"store {store!r} is behind a URL", "review a copy of its folder")
     path = shiftsim.open_store(store).path
-    with ReviewServer(ReviewService(path, reviewer), port) as server:
+    with review_server(ReviewService(path, reviewer), port) as server:
         echo(f"review     {server.address}")
         echo(f"kept in    {path / REVIEW}")
         echo("stop with Ctrl-C; what was decided is on disk")

@@ -2,11 +2,12 @@
 
 import html
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from shiftsim.errors import ConfigError, DataError, beginning
+from shiftsim.errors import ConfigError, DataError, ShiftsimError, beginning
 from shiftsim.files import safe_join, write_text
 from shiftsim.metrics import SHORT_NAMES
 from shiftsim.report.words import (
@@ -20,7 +21,7 @@ from shiftsim.report.words import (
 )
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
-from shiftsim.view.page import MAX_ROLLOUTS, POLICY, Page, data_element, framed, replay_page
+from shiftsim.view.page import MAX_ROLLOUTS, Page, framed, replay_page
 from shiftsim.view.scene import ShownRollout
 
 _ENDS = [*Task._fields, "status", "error", "scenario_type"]
@@ -40,16 +41,25 @@ class Choice:
         parts = zip(("planner", "noise", "seed"), vars(self).values(), strict=True)
         return ", ".join(f"{n} {' or '.join(map(str, v))}" for n, v in parts if v) or "any planner"
 
-    def of(self, tasks: Sequence[Task]) -> list[Task]:
-        """The tasks chosen among those of one scenario, by planner, noise and seed."""
-        return [
-            task
-            for task in sorted(tasks)
-            # a planner's name may end in the remark that tells runs apart
-            if (not self.planners or task.planner.partition(" (")[0] in self.planners)
+    def __contains__(self, task: Task) -> bool:
+        # a planner's name may end in the remark that tells runs apart
+        return (
+            (not self.planners or task.planner.partition(" (")[0] in self.planners)
             and (not self.noises or task.noise in self.noises)
             and (not self.seeds or task.seed in self.seeds or task.noise == "none")
-        ]
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Rollout:
+    """What the tables of a run say of a rollout."""
+
+    run: Run
+    key: Task  # in the run, whose planners have no remark
+    is_drawable: bool  # whether it is stored, and its scenario can be read
+    end: Mapping[str, Any]  # its row of `tasks.parquet`
+    score: Mapping[str, Any]  # its row of `scores.parquet`; empty where it failed
+    metrics: Sequence[Mapping[str, Any]]  # its rows of `metrics.parquet`
 
 
 class Gallery:
@@ -65,38 +75,46 @@ class Gallery:
         Raises:
             DataError: A run was made with another store.
         """
-        self.store = store
-        self.choice = choice or Choice()
-        self._runs: dict[Task, tuple[Run, Task]] = {}
-        self._stored: set[Task] = set()
+        self.store, self.choice = store, choice or Choice()
+        self._rollouts: dict[Task, _Rollout] = {}
         for run, name in zip(runs, _names(runs), strict=True):
             if store is not None and run.manifest["determining"]["store"] != store.hash:
                 raise DataError(
                     f"run {run.path.name!r} was made with another store than {str(store.path)!r}",
                     hint="name the store that its manifest.json names",
                 )
-            for task, place in run.rollout_places.items():
-                planner = f"{task.planner} ({name})" if name else task.planner
-                key = task._replace(planner=planner)
-                self._runs[key] = (run, task)
-                if place is not None and store is not None:
-                    self._stored.add(key)
-        self._scores = {run.path: rows_by_task(run.scores) for run in runs}
-        self._ends = {run.path: rows_by_task(run.tasks.select(_ENDS)) for run in runs}
-        self._metrics = {run.path: rows_by_task(run.metrics) for run in runs}
-        self._tokens: dict[str, list[Task]] = {}
-        for task in self._runs:
-            self._tokens.setdefault(task.token, []).append(task)
+            scores, metrics = rows_by_task(run.scores), rows_by_task(run.metrics)
+            ends = rows_by_task(run.tasks.select(_ENDS))
+            for key, place in run.rollout_places.items():
+                planner = f"{key.planner} ({name})" if name else key.planner
+                (end,), (score,) = ends[key], scores.get(key, [{}])
+                self._rollouts[key._replace(planner=planner)] = _Rollout(
+                    run,
+                    key,
+                    store is not None and place is not None,
+                    end,
+                    score,
+                    metrics.get(key, []),
+                )
+        self._all: dict[str, list[Task]] = {}  # by scenario: failures first, then the lowest score
+        for task in sorted(self._rollouts, key=self._place):
+            self._all.setdefault(task.token, []).append(task)
+
+    def _place(self, task: Task) -> tuple[float, Task]:
+        """Where a rollout stands: failures first, then the lowest score."""
+        return float(self._rollouts[task].score.get("cls", -1.0)), task
+
+    def _chosen(self, token: str) -> list[Task]:
+        """The rollouts of the choice of one scenario."""
+        return [task for task in self._all.get(token, []) if task in self.choice]
 
     @property
     def listed(self) -> list[str]:
         """Scenarios with rollouts of the choice: failures first, then the lowest score."""
         lowest = {
-            token: min(map(self._place, chosen))
-            for token, tasks in self._tokens.items()
-            if (chosen := self.choice.of(tasks))
+            token: self._place(tasks[0])[0] for token in self._all if (tasks := self._chosen(token))
         }
-        return sorted(lowest, key=lambda token: (lowest[token][0], token))
+        return sorted(lowest, key=lambda token: (lowest[token], token))
 
     @property
     def tokens(self) -> list[str]:
@@ -105,22 +123,17 @@ class Gallery:
 
     def counts(self, tokens: Iterable[str]) -> tuple[int, int, int]:
         """Rollouts of some scenarios, and how many of them failed and are only listed."""
-        tasks = [task for token in tokens for task in self.choice.of(self._tokens.get(token, []))]
-        failed = sum(self._place(task)[0] < 0.0 for task in tasks)
-        return len(tasks), failed, sum(task not in self._stored for task in tasks)
+        found = [self._rollouts[task] for token in tokens for task in self._chosen(token)]
+        failed = sum(not one.score for one in found)
+        return len(found), failed, sum(not one.is_drawable for one in found)
 
     def __len__(self) -> int:
         """All rollouts, whatever the choice."""
-        return len(self._runs)
-
-    def _place(self, task: Task) -> tuple[float, Task]:
-        """Where a rollout stands: failures first, then the lowest score."""
-        return float(self._results(task)[0].get("cls", -1.0)), task
+        return len(self._rollouts)
 
     def parts(self, token: str) -> list[list[Task]]:
         """The rollouts that can be drawn, page by page, the lowest scores on the first."""
-        chosen = self.choice.of(self._tokens.get(token, []))
-        drawn = sorted((task for task in chosen if task in self._stored), key=self._place)
+        drawn = [task for task in self._chosen(token) if self._rollouts[task].is_drawable]
         starts = range(0, len(drawn), MAX_ROLLOUTS)
         return [sorted(drawn[start : start + MAX_ROLLOUTS]) for start in starts]
 
@@ -134,19 +147,13 @@ class Gallery:
         words = ", ".join([f"{here} of {total} rollouts shown", *more])
         return words if here < total or more else ""
 
-    def _results(self, task: Task) -> tuple[Mapping[str, Any], list[dict[str, Any]]]:
-        """The rows of a rollout in `scores.parquet` and `metrics.parquet`; empty where none."""
-        run, key = self._runs[task]
-        (score,) = self._scores[run.path].get(key, [{}])
-        return score, self._metrics[run.path].get(key, [])
-
     def find(self, text: str) -> str:
         """A scenario by its token or an unambiguous beginning of it.
 
         Raises:
             ConfigError: There is none, or there are several.
         """
-        return beginning("what is stored", "scenario", text, self._tokens)
+        return beginning("what is stored", "scenario", text, self._all)
 
     def tasks(self, token: str, part: int = 0) -> list[Task]:
         """The rollouts that a page of a scenario shows, the first page or another.
@@ -156,8 +163,8 @@ class Gallery:
         """
         found = self.parts(token)
         if not found:
-            stored = (task for task in self._tokens.get(token, []) if task in self._stored)
-            there = zip(*stored, strict=True)
+            tasks = self._all.get(token, [])
+            there = zip(*sorted(t for t in tasks if self._rollouts[t].is_drawable), strict=True)
             names = zip(("planners", "noise", "seeds"), there, strict=False)
             available = (f"{n}: {', '.join(map(str, dict.fromkeys(v)))}" for n, v in names)
             raise ConfigError(
@@ -170,12 +177,10 @@ class Gallery:
         """The rollouts of a page with what is known of them."""
         out = []
         for task in self.tasks(token, part):
-            run, key = self._runs[task]
-            score, metrics = self._results(task)
-            log = run.rollout(key, scenario)
-            out.append(
-                ShownRollout(task.planner, task.noise, task.seed, log, score.get("cls"), metrics)
-            )
+            one = self._rollouts[task]
+            log = one.run.rollout(one.key, scenario)
+            cls = one.score.get("cls")
+            out.append(ShownRollout(task.planner, task.noise, task.seed, log, cls, one.metrics))
         return out
 
     def pages(self, token: str, *, back: str = "") -> dict[str, Page]:
@@ -185,23 +190,24 @@ class Gallery:
             ConfigError: There are none.
         """
         self.tasks(token)
-        scenario, parts = self.store.read(token), self.parts(token)
-        names = [page_name(token, part) for part in range(len(parts))]
-        ends = [sum(map(len, parts[: part + 1])) for part in range(len(parts))]
-        words = [f"{end - len(one) + 1}–{end}" for end, one in zip(ends, parts, strict=True)]
-        links = list(zip(words, names, strict=True)) if len(names) > 1 else []
+        scenario, links, first = self.store.read(token), [], 1
+        for part, tasks in enumerate(self.parts(token)):
+            links.append((f"{first}–{first + len(tasks) - 1}", page_name(token, part)))
+            first += len(tasks)
         out = {}
-        for part, name in enumerate(names):
-            more = {"shown": self.shown_words(token, part), "parts": links, "part": part}
-            shown = self.shown(token, scenario, part)
-            out[name] = replay_page(scenario, shown, back=back, more=more)
+        for part, (_, name) in enumerate(links):
+            more = {"parts": links if len(links) > 1 else [], "part": part}
+            more |= {"shown": self.shown_words(token, part)}
+            out[name] = replay_page(
+                scenario, self.shown(token, scenario, part), back=back, more=more
+            )
         return out
 
     def page(self, token: str) -> Page:
         """The first replay of one scenario as HTML, alone."""
         scenario = self.store.read(token)
-        more = {"shown": self.shown_words(token)} if self.parts(token) else {}
-        return replay_page(scenario, self.shown(token, scenario), more=more)
+        shown = self.shown(token, scenario)
+        return replay_page(scenario, shown, more={"shown": self.shown_words(token)})
 
     def rows(self, token: str, *, with_pages: bool = True) -> list[dict[str, Any]]:
         """Rows of the scenario list: labels, scores and violated metrics of every rollout."""
@@ -211,32 +217,37 @@ class Gallery:
             for part, tasks in enumerate(parts)
             for index, task in enumerate(tasks)
         }
-        chosen = sorted(self.choice.of(self._tokens[token]), key=self._place)
-        cities = (self._results(task)[0].get("city") for task in chosen)
-        city = next(filter(None, cities), "")
-        return [{**self._row(task), "city": city, **where.get(task, _NO_PAGE)} for task in chosen]
+        about = self._about(token)
+        rows = ((task, self._row(task)) for task in self._chosen(token))
+        return [{**about, **row, **where.get(task, _NO_PAGE)} for task, row in rows]
+
+    def _about(self, token: str) -> dict[str, str]:
+        """Type and city of a scenario; of one that never finished as its store has them."""
+        found = [self._rollouts[task] for task in self._all[token]]
+        kind = next(filter(None, (one.end["scenario_type"] for one in found)), "")
+        city = next(filter(None, (one.score.get("city") for one in found)), "")
+        if not (kind and city) and self.store is not None:
+            with suppress(ShiftsimError, OSError):  # why it failed may be that it cannot be read
+                scenario = self.store.read(token)
+                kind, city = kind or scenario.scenario_type, city or scenario.city
+        return {"type": kind, "city": city}
 
     def _row(self, task: Task) -> dict[str, Any]:
-        score, metrics = self._results(task)
-        run, key = self._runs[task]
-        (end,) = self._ends[run.path][key]
-        found = violations(metrics)
+        one = self._rollouts[task]
+        found = violations(one.metrics)
         worst, cause = worst_moment(found), worst_violation(found)
-        failed = "" if end["status"] == "ok" else f"{end['status']}: {end['error'] or ''}"
-        return {
-            "token": task.token,
-            "type": end["scenario_type"] or "",
-            "log": score.get("log_name") or "",
-            "planner": task.planner,
-            "noise": task.noise,
-            "seed": task.seed,
-            "cls": score.get("cls"),
-            "failed": failed.removesuffix(": "),
+        status, error, kind = (one.end[name] for name in ("status", "error", "scenario_type"))
+        row = {
+            **task._asdict(),
+            "log": one.score.get("log_name") or "",
+            "cls": one.score.get("cls"),
+            "failed": "" if status == "ok" else f"{status}: {error}" if error else status,
             "cause": cause.reason if cause else "",
             "severity": severity(cause) if cause else (),
             "violated": {one.short: one.time for one in found},
             "at": worst and worst.time,
         }
+        return row | ({"type": kind} if kind else {})
 
 
 def page_name(token: str, part: int = 0) -> str:
@@ -250,20 +261,13 @@ def page_name(token: str, part: int = 0) -> str:
     return f"{safe}.{part + 1}.html" if part else f"{safe}.html"
 
 
-def list_page(title: str, rows: Sequence[Mapping[str, Any]], *, above: str = "") -> str:
+def list_page(title: str, rows: Sequence[Mapping[str, Any]], *, above: str = "") -> Page:
     """The page that lists rows of `Gallery.rows`, sortable and filterable.
 
     `above` is HTML between heading and list; the caller escapes what comes from data.
     """
-    return framed(
-        "list.html",
-        title=title,
-        meta=POLICY.format(images="'self' data:"),
-        styles=["list.css"],
-        scripts=["list.js"],
-        above=above,
-        data=data_element("rows", list(rows)) + data_element("metrics", _WRONG),
-    )
+    data = {"rows": list(rows), "metrics": _WRONG}
+    return framed("list", title=title, images="'self' data:", data=data, above=above)
 
 
 def write_site(
@@ -335,16 +339,13 @@ def worst_table(rows: Sequence[Mapping[str, Any]], count: int = 10) -> str:
         if row["page"] is not None:
             at = "" if row["at"] is None else f"t={row['at']:.2f}&amp;"
             link = f'<a href="{row["page"]}#{at}focus={row["index"] + 1}">{link}</a>'
-        score = f"{100.0 * row['cls']:.2f}"
         noise = row["noise"] if row["noise"] == "none" else f"{row['noise']}, seed {row['seed']}"
-        times = [
-            (_WRONG[short], row["violated"][short]) for short in _WRONG if short in row["violated"]
-        ]
+        times = [(_WRONG[s], row["violated"][s]) for s in _WRONG if s in row["violated"]]
         wrong = ", ".join(w if time is None else f"{w} {time:.1f}\u00a0s" for w, time in times)
         texts = map(html.escape, (row["type"], row["planner"], noise))
-        alike = str(others) if others else ""
-        inner = "".join(f"<td>{cell}</td>" for cell in (link, *texts, wrong, alike))
-        lines.append(f'<tr><td class="number">{score}</td>{inner}</tr>')
+        cells = (link, *texts, wrong, str(others or ""))
+        score = f'<td class="number">{100.0 * row["cls"]:.2f}</td>'
+        lines.append(f"<tr>{score}{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
     names = ("scenario", "type", "planner", "noise", "what went wrong, first time", "alike")
     heads = "".join(f"<th>{name}</th>" for name in names)
     title = f"The worst {len(lines)} of {len({row['token'] for row in rows})} scenarios"

@@ -60,7 +60,7 @@ function scenario(row, ended) {
   if (row.replay === null || ended) return row.token;
   const link = document.createElement("a");
   const at = row.at === null ? "" : `#t=${row.at.toFixed(2)}`;
-  link.href = `/replay/${row.replay}?token=${encodeURIComponent(key)}${at}`;
+  link.href = `/replay?id=${row.replay}&token=${encodeURIComponent(key)}${at}`;
   link.target = "_blank";
   link.textContent = row.token;
   return link;
@@ -115,7 +115,7 @@ function show(state) {
 let silent = 0;
 async function ask() {
   try {
-    const answer = await fetch("/state", { headers: { "X-Shiftsim-Token": key } });
+    const answer = await fetch("/api/state", { headers: { "X-Shiftsim-Token": key } });
     const state = await answer.json();
     if (!answer.ok) throw new Error(state.error);
     silent = 0;

@@ -5,58 +5,29 @@ a thread answers the page, which asks twice a second. Nothing is read from disk 
 opened, and nothing is added to what the workers do.
 """
 
-import json
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from http import HTTPStatus
 from threading import Event, Lock, Thread
 from time import monotonic
 from types import TracebackType
-from typing import Any, NamedTuple
-from urllib.parse import parse_qs
+from typing import Any
 
 import numpy as np
 
-from shiftsim.errors import ShiftsimError
 from shiftsim.report.palette import planner_styles
 from shiftsim.report.words import violations
 from shiftsim.runs.execute import Progress
 from shiftsim.runs.rollouts import complete_rollout
 from shiftsim.runs.rollouts.columns import decode_rows
 from shiftsim.runs.tables import OK, TaskResult
-from shiftsim.view.local import TOKEN_HEADER, LocalHandler, LocalServer
 from shiftsim.view.page import framed, replay_page
 from shiftsim.view.scene import ShownRollout
+from shiftsim.view.serving import LocalServer
 from shiftsim.world.scenario import Scenario
 
 _WORST, _FAILURES = 20, 50  # that the page lists
 _Z95 = 1.96  # of the normal distribution
 _PATIENCE = 2.0  # s that the end of a run waits for the page to see it
-
-Read = Callable[[str], Scenario]
-
-
-class _Group(NamedTuple):
-    """What has one score of its own."""
-
-    planner: str
-    noise: str
-    traffic: str
-
-
-def _statistics(scores: Mapping[str, list[float]]) -> dict[str, Any]:
-    """Mean and 95 % interval x 100 of scores by recording, whose scenarios are not independent.
-
-    There is no interval of fewer than two recordings.
-    """
-    totals = np.array([sum(values) for values in scores.values()])
-    counts = np.array([len(values) for values in scores.values()])
-    mean, clusters = totals.sum() / counts.sum(), len(scores)
-    half = None
-    if clusters > 1:
-        squares = float(np.square(totals - counts * mean).sum())
-        half = 100.0 * _Z95 * (squares * clusters / (clusters - 1)) ** 0.5 / float(counts.sum())
-    return {"done": int(counts.sum()), "mean": 100.0 * float(mean), "half": half}
 
 
 class LiveRun:
@@ -66,22 +37,22 @@ class LiveRun:
         title: Folder of the run.
     """
 
-    def __init__(self, title: str, total: int, planners: Sequence[str], read: Read) -> None:
+    def __init__(
+        self, title: str, total: int, planners: Sequence[str], read: Callable[[str], Scenario]
+    ) -> None:
         """A run of so many tasks that has just begun; `read` gives a scenario by its token."""
-        self.title = title
-        self._read = read
+        self.title, self._read = title, read
         self._styles = planner_styles(planners)
         self._lock = Lock()
-        self._began = monotonic()
-        self._ended: float | None = None
+        self._began, self._ended = monotonic(), 0.0
         self._state = "running"
         self._progress = Progress(0, total, 0)
+        self._number = 0  # of results so far
         self._first: int | None = None  # tasks that were done before
-        # scores by group and recording
-        self._scores: dict[_Group, dict[str, list[float]]] = {}
+        # scores by planner, noise and traffic, and by recording
+        self._scores: dict[tuple[str, str, str], dict[str, list[float]]] = {}
         # the lowest scores by scenario: the score, the number of the result, the result
         self._worst: dict[str, tuple[float, int, TaskResult]] = {}
-        self._number = 0
         self._failures: list[TaskResult] = []
         self._num_failures: Counter[tuple[str, str]] = Counter()  # by planner and noise
 
@@ -96,18 +67,18 @@ class LiveRun:
 
     def _add(self, result: TaskResult) -> None:
         self._number += 1
+        planner, noise, _, token = result.task
         if result.status != OK:
-            self._num_failures[result.task.planner, result.task.noise] += 1
+            self._num_failures[planner, noise] += 1
             if len(self._failures) < _FAILURES:
                 self._failures.append(result)
             return
         score = float(result.scores["cls"])
-        group = _Group(result.task.planner, result.task.noise, result.scores["traffic"])
+        group = (planner, noise, result.scores["traffic"])
         by_recording = self._scores.setdefault(group, defaultdict(list))
         by_recording[result.scores["log_name"]].append(score)
-        before = self._worst.get(result.task.token)
-        if score < (before[0] if before else 1.0):
-            self._worst[result.task.token] = (score, self._number, result)
+        if score < (self._worst[token][0] if token in self._worst else 1.0):
+            self._worst[token] = (score, self._number, result)
             if len(self._worst) > _WORST:
                 del self._worst[max(self._worst, key=lambda token: self._worst[token][:2])]
 
@@ -131,10 +102,10 @@ class LiveRun:
                 "left": left,
                 "groups": [
                     {
-                        **group._asdict(),
+                        **dict(zip(("planner", "noise", "traffic"), group, strict=True)),
                         **_statistics(scores),
-                        "failed": self._num_failures[group.planner, group.noise],
-                        "colour": self._styles[group.planner].colour,
+                        "failed": self._num_failures[group[:2]],
+                        "colour": self._styles[group[0]].colour,
                     }
                     for group, scores in sorted(self._scores.items())
                 ],
@@ -149,14 +120,15 @@ class LiveRun:
                 "num_failures": self._num_failures.total(),
             }
 
-    def replay(self, number: int) -> str | None:
+    def replay(self, number: int | str) -> str | None:
         """The replay of one of the worst rollouts; None where it is none of them any more.
 
         Raises:
             ShiftsimError: Its scenario cannot be read.
         """
         with self._lock:
-            found = [r for _, n, r in self._worst.values() if n == number and r.rollout]
+            worst = self._worst.values()
+            found = [r for _, n, r in worst if str(n) == str(number) and r.rollout]
         if not found:
             return None
         (result,) = found
@@ -165,6 +137,20 @@ class LiveRun:
         planner, noise, seed, _ = result.task
         shown = ShownRollout(planner, noise, seed, log, result.scores["cls"], result.metrics)
         return replay_page(scenario, [shown])
+
+
+def _statistics(scores: Mapping[str, list[float]]) -> dict[str, Any]:
+    """Mean and 95 % interval x 100 of scores by recording, whose scenarios are not independent.
+
+    There is no interval of fewer than two recordings.
+    """
+    totals = np.array([sum(values) for values in scores.values()])
+    counts = np.array([len(values) for values in scores.values()])
+    mean, clusters, half = totals.sum() / counts.sum(), len(scores), None
+    if clusters > 1:
+        squares = float(np.square(totals - counts * mean).sum())
+        half = 100.0 * _Z95 * (squares * clusters / (clusters - 1)) ** 0.5 / float(counts.sum())
+    return {"done": int(counts.sum()), "mean": 100.0 * float(mean), "half": half}
 
 
 def _describe(result: TaskResult) -> dict[str, Any]:
@@ -183,7 +169,7 @@ def _describe(result: TaskResult) -> dict[str, Any]:
 
 
 class LiveServer(LocalServer):
-    """Shows a run while it lasts: `with LiveServer(run) as live: execute(…, on_progress=live.add)`.
+    """Shows a run while it lasts: `with LiveServer(run) as live: execute(…, on_progress=run.add)`.
 
     Attributes:
         run: What is shown.
@@ -194,7 +180,19 @@ class LiveServer(LocalServer):
         self.run = run
         self.last_request = 0.0  # when the page asked last
         self.end_was_shown = Event()  # that the run has ended
-        super().__init__(_Handler)
+        page = framed("live", title=f"{run.title} · live")
+        routes = {
+            "GET /": lambda values: page,
+            "GET /replay": lambda values: run.replay(values.get("id", "")),
+            "GET /api/state": lambda values: self._state(),
+        }
+        super().__init__(routes)
+
+    def _state(self) -> dict[str, Any]:
+        values, self.last_request = self.run.values(), monotonic()
+        if values["state"] != "running":
+            self.end_was_shown.set()
+        return values
 
     def __enter__(self) -> "LiveServer":
         """Begin to answer."""
@@ -212,52 +210,6 @@ class LiveServer(LocalServer):
         self.run.end("interrupted" if interrupted else "stopped" if kind else "finished")
         if monotonic() - self.last_request < _PATIENCE:
             self.end_was_shown.wait(_PATIENCE)
-        self.shutdown()
+        with self.turn:  # the answer that shows the end is sent
+            self.shutdown()
         self.server_close()
-
-
-class _Handler(LocalHandler):
-    server: LiveServer
-
-    def do_GET(self) -> None:
-        """The page, what it shows, or one of the replays that it names."""
-        if (url := self.url()) is None:
-            return
-        given = self.headers.get(TOKEN_HEADER) or parse_qs(url.query).get("token", [""])[0]
-        if not self.may(given):
-            return
-        run = self.server.run
-        if url.path == "/":
-            self.answer(live_page(run.title), "text/html")
-        elif url.path == "/state":
-            values = run.values()
-            self.server.last_request = monotonic()
-            self.answer(json.dumps(values), "application/json")
-            if values["state"] != "running":
-                self.server.end_was_shown.set()
-        elif url.path.startswith("/replay/"):
-            self._replay(url.path.removeprefix("/replay/"))
-        else:
-            self.refuse(HTTPStatus.NOT_FOUND, "no such page")
-
-    def _replay(self, number: str) -> None:
-        try:
-            page = self.server.run.replay(int(number)) if number.isdecimal() else None
-        except (ShiftsimError, OSError) as error:
-            self.refuse(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
-            return
-        if page is None:
-            self.refuse(HTTPStatus.NOT_FOUND, "no longer one of the worst")
-        else:
-            self.answer(page, "text/html")
-
-
-def live_page(title: str) -> str:
-    """The page; it fetches everything else."""
-    return framed(
-        "live.html",
-        title=f"{title} · live",
-        meta='<meta name="referrer" content="no-referrer">',
-        styles=["list.css", "live.css"],
-        scripts=["live.js"],
-    )

@@ -1,7 +1,8 @@
-"""The replay page: template, script and packed data in one HTML text."""
+"""Pages: template, style, script and data in one HTML text; the replay is one of them."""
 
 import html
 import json
+import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -13,9 +14,16 @@ from shiftsim.view.pack import pack
 from shiftsim.view.scene import Replay, ShownRollout, describe_scene, rollout_fields, scene_fields
 from shiftsim.world.scenario import Scenario, require_scenario
 
+MAX_ROLLOUTS = 6  # of a replay
 _HERE = Path(__file__).parent
-MAX_ROLLOUTS = 6
-POLICY = (
+_FILES = {  # style and script of each page; its body is the file of its name
+    "list": (["list.css"], ["list.js"]),
+    "live": (["list.css", "live.css"], ["live.js"]),
+    "replay": (["replay.css"], ["codec.js", "world.js", "strips.js", "replay.js"]),
+    "review": (["replay.css", "review.css"], ["codec.js", "world.js", "review.js"]),
+}
+# of pages that are files; those of a server come with a header
+_POLICY = (
     '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; script-src '
     "'unsafe-inline'; style-src 'unsafe-inline'; img-src {images}\">"
 )
@@ -36,7 +44,8 @@ class Page(str):
         return file
 
     def _repr_html_(self) -> str:
-        return embedded(self)
+        source, style = html.escape(self, quote=True), "width:100%;height:640px;border:0"
+        return f'<iframe sandbox="allow-scripts" style="{style}" srcdoc="{source}"></iframe>'
 
 
 def show(scenario: Scenario, **logs: SimulationLog) -> Page:
@@ -44,11 +53,11 @@ def show(scenario: Scenario, **logs: SimulationLog) -> Page:
 
     Args:
         scenario: The scenario that was driven.
-        logs: One to six rollouts by name; underscores stand for hyphens.
+        logs: Rollouts by name, of which the first six are drawn; underscores stand for hyphens.
 
     Raises:
         ConfigError: There is no scenario.
-        ValueError: There are no rollouts, or more than six.
+        ValueError: There are no rollouts.
 
     Example:
         ```python
@@ -72,65 +81,67 @@ def replay_page(
     back: str = "",
     more: Mapping[str, Any] | None = None,
 ) -> Page:
-    """One self-contained HTML page of one to six rollouts; `back` is the address of the list.
+    """One self-contained HTML page of rollouts, the first six; `back` is the address of the list.
 
     `more` are `shown`, what is shown of how much, and `parts`, words and names of all pages of the
     scenario, of which `part` is this one.
 
     Raises:
-        ValueError: There are no rollouts, or more than six.
+        ValueError: There are no rollouts.
     """
-    if not 1 <= len(shown) <= MAX_ROLLOUTS:
-        raise ValueError(f"a replay shows 1 to {MAX_ROLLOUTS} rollouts, not {len(shown)}")
-    replay = Replay(scenario, shown)
-    data = [
-        data_element("meta", describe_scene(replay) | {"back": back, **(more or {})}),
-        _data("scene", "text/plain", pack(scene_fields(replay))),
-    ]
-    for index in range(len(shown)):
-        data.append(_data(f"rollout{index}", "text/plain", pack(rollout_fields(replay, index))))
-    text = framed(
-        "replay.html",
-        title=f"{scenario.token} · shiftsim",
-        meta=POLICY.format(images="data:"),
-        styles=["replay.css"],
-        scripts=["codec.js", "world.js", "strips.js", "replay.js"],
-        data="\n".join(data),
+    if not shown:
+        raise ValueError("a replay shows at least one rollout")
+    drawn = shown[:MAX_ROLLOUTS]
+    words = f"{len(drawn)} of {len(shown)} rollouts shown" if len(drawn) < len(shown) else ""
+    replay = Replay(scenario, drawn)
+    data = {
+        "meta": describe_scene(replay) | {"back": back, "shown": words} | dict(more or {}),
+        "scene": pack(scene_fields(replay)),
+        **{f"rollout{n}": pack(rollout_fields(replay, n)) for n in range(len(drawn))},
+    }
+    return framed("replay", title=f"{scenario.token} · shiftsim", images="data:", data=data)
+
+
+def framed(
+    name: str,
+    *,
+    title: str,
+    images: str = "",
+    data: Mapping[str, Any] | None = None,
+    above: str = "",
+) -> Page:
+    """A whole page of the name, with one head for all pages.
+
+    Args:
+        name: The page, as in `_FILES`.
+        title: Its title, also within the page.
+        images: Where the images of a page that is a file may come from.
+        data: What its script reads, by name: packed text, or JSON values.
+        above: HTML before what the script makes; the caller escapes what comes from data.
+    """
+    styles, scripts = _FILES[name]
+    elements = "\n".join(_data_element(key, value) for key, value in (data or {}).items())
+    title = html.escape(title)
+    text = fill(
+        _asset("frame.html"),
+        title=title,
+        meta=_POLICY.format(images=images) if images else "",
+        style="".join(map(_asset, styles)),
+        body=fill(_asset(f"{name}.html"), title=title, above=above, data=elements),
+        script="\n".join(map(_asset, scripts)),
     )
     return Page(text)
 
 
-def framed(
-    body: str, *, title: str, meta: str, styles: Sequence[str], scripts: Sequence[str], **parts: str
-) -> str:
-    """A whole page from files of this folder, with one head for all pages.
-
-    `body` is the file with what stands between head and scripts; `title` and `parts` are filled in.
-    """
-    return fill(
-        asset("frame.html"),
-        title=html.escape(title),
-        meta=meta,
-        style="".join(map(asset, styles)),
-        body=fill(asset(body), title=html.escape(title), **parts),
-        script="\n".join(map(asset, scripts)),
-    )
-
-
 @cache
-def asset(name: str) -> str:
+def _asset(name: str) -> str:
     """A file of this folder."""
     return (_HERE / name).read_text(encoding="utf-8")
 
 
 def fill(template: str, **parts: str) -> str:
     """The template with every `{{name}}` replaced, in one pass: parts are never scanned again."""
-    pieces = template.split("{{")
-    out = [pieces[0]]
-    for piece in pieces[1:]:
-        name, _, rest = piece.partition("}}")
-        out += [parts[name], rest]
-    return "".join(out)
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], template)
 
 
 def json_text(value: Any) -> str:
@@ -139,17 +150,10 @@ def json_text(value: Any) -> str:
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def data_element(name: str, value: Any) -> str:
-    """A value as JSON in an element `data-name`, which a page's script reads."""
-    return _data(name, "application/json", json_text(value))
-
-
-def _data(name: str, kind: str, text: str) -> str:
+def _data_element(name: str, value: Any) -> str:
+    """Packed text, or a value as JSON, in an element `data-name`, which a page's script reads."""
+    if isinstance(value, str):
+        kind, text = "text/plain", value
+    else:
+        kind, text = "application/json", json_text(value)
     return f'<script type="{kind}" id="data-{name}">{text}</script>'
-
-
-def embedded(page: str, height: int = 640) -> str:
-    """A page as a frame inside a notebook."""
-    source = html.escape(page, quote=True)
-    style = f"width:100%;height:{height}px;border:0"
-    return f'<iframe sandbox="allow-scripts" style="{style}" srcdoc="{source}"></iframe>'

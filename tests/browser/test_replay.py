@@ -12,7 +12,7 @@ from shiftsim.data.store.reading import open_store
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import simulate
 from shiftsim.view.build import Gallery, page_name, write_site
-from shiftsim.view.page import embedded, replay_page
+from shiftsim.view.page import Page, replay_page
 from shiftsim.view.scene import ShownRollout
 from shiftsim.world.state import AgentKind
 
@@ -354,7 +354,7 @@ def test_a_notebook_frame_plays(page, folder, tmp_path):
     text = (folder / "replay" / page_name(VIOLATED)).read_text("utf-8")
     file = tmp_path / "notebook.html"
     file.write_text(
-        f"<!DOCTYPE html><html data-ready=1><body>{embedded(text)}</body></html>", "utf-8"
+        f"<!DOCTYPE html><html data-ready=1><body>{Page(text)._repr_html_()}</body></html>", "utf-8"
     )
     page.open(file.as_uri())
     page.browser.switch_to.frame(0)

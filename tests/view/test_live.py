@@ -86,23 +86,35 @@ def test_failures_are_counted_and_named():
 
 
 def test_nothing_is_shown_without_the_token(server):
-    for path in ("/", "/state", "/replay/1"):
+    for path in ("/", "/api/state", "/replay?id=1"):
         status, body = ask(server, path, **{"X-Shiftsim-Token": "guess"})
         assert (status, "token" in body) == (403, True)
 
 
 @pytest.mark.parametrize("host", ["evil.example", "127.0.0.1", "127.0.0.1:1", ""])
 def test_other_host_names_are_refused(server, host):
-    assert ask(server, "/state", Host=host)[0] == 403
-    assert ask(server, "/state", Origin="http://evil.example")[0] == 403
+    assert ask(server, "/api/state", Host=host)[0] == 403
+    assert ask(server, "/api/state", Origin="http://evil.example")[0] == 403
 
 
-@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS"])
-def test_only_get_is_answered(server, method):
-    assert ask(server, "/state", method)[0] == 501
+@pytest.mark.parametrize(
+    ("method", "status"), [("POST", 404), ("PUT", 501), ("DELETE", 501), ("OPTIONS", 501)]
+)
+def test_only_get_is_answered(server, method, status):
+    assert ask(server, "/api/state", method)[0] == status
 
 
-@pytest.mark.parametrize("path", ["/x", "/replay/", "/replay/7", "/replay/-1", "/../manifest.json"])
+def test_the_token_in_an_address_opens_pages_only(server):
+    address = f"token={server.token}"
+    header = {"X-Shiftsim-Token": ""}
+    assert ask(server, f"/?{address}", **header)[0] == 200
+    assert ask(server, f"/replay?id=7&{address}", **header)[0] == 404
+    assert ask(server, f"/api/state?{address}", **header)[0] == 403
+
+
+@pytest.mark.parametrize(
+    "path", ["/x", "/replay", "/replay?id=7", "/replay?id=-1", "/../manifest.json"]
+)
 def test_other_pages_are_not_there(server, path):
     assert ask(server, path)[0] == 404
 
@@ -113,11 +125,11 @@ def test_only_this_machine_is_answered(server):
 
 def test_the_page_hears_of_the_end_and_then_nothing_is_answered(server):
     with LiveServer(run_of(ended(0, 0.5))) as other:
-        assert json.loads(ask(other, "/state")[1])["state"] == "running"
+        assert json.loads(ask(other, "/api/state")[1])["state"] == "running"
         other.end_was_shown.wait = lambda seconds: None  # nobody asks again here
     assert other.run.values()["state"] == "finished"
     with pytest.raises(OSError, match=r"refused|reset"):
-        ask(other, "/state")
+        ask(other, "/api/state")
 
 
 def test_an_interrupt_is_told():

@@ -24,7 +24,7 @@ from shiftsim.view.build import (
     worst_table,
     write_site,
 )
-from shiftsim.view.page import MAX_ROLLOUTS, embedded, fill, json_text, replay_page
+from shiftsim.view.page import MAX_ROLLOUTS, fill, json_text, replay_page
 from shiftsim.view.scene import ShownRollout
 from shiftsim.view.still import save_figure
 from shiftsim.world.state import AgentKind
@@ -166,7 +166,7 @@ def test_json_for_a_page_has_no_markup():
 
 
 def test_a_page_in_a_notebook_is_a_frame_of_its_own(scenario):
-    frame = embedded(replay_page(scenario, [shown(scenario)]))
+    frame = replay_page(scenario, [shown(scenario)])._repr_html_()
 
     assert frame.count("<") == 2  # the frame's own tag, opened and closed
     assert 'sandbox="allow-scripts"' in frame
@@ -189,9 +189,16 @@ def test_a_run_shows_the_replay_of_a_scenario(clean_run):
     assert json.loads(sections(page)["meta"])["token"] == "0001cafe"
 
 
-def test_more_than_six_rollouts_are_refused(scenario):
-    with pytest.raises(ValueError, match="1 to 6"):
-        replay_page(scenario, [shown(scenario)] * (MAX_ROLLOUTS + 1))
+def test_of_more_than_six_rollouts_the_first_are_drawn_and_the_page_says_so(scenario):
+    page = replay_page(scenario, [shown(scenario)] * (MAX_ROLLOUTS + 1))
+
+    meta = json.loads(sections(page)["meta"])
+    assert meta["shown"] == "6 of 7 rollouts shown"
+    assert len(meta["rollouts"]) == 6
+    assert "rollout5" in sections(page)
+    assert "rollout6" not in sections(page)
+    with pytest.raises(ValueError, match="at least one"):
+        replay_page(scenario, [])
 
 
 def test_sixty_agents_take_less_than_the_promised_room(rng):

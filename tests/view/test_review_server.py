@@ -7,8 +7,8 @@ from stores import write_toy_store
 
 from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.tables import REVIEW
-from shiftsim.view.local import HOST, TOKEN_HEADER
-from shiftsim.view.review import MAX_BODY, ReviewService
+from shiftsim.view.review import ReviewService
+from shiftsim.view.serving import HOST, MAX_BODY, TOKEN_HEADER
 
 FIRST = "0000cafe"
 
