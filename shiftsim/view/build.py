@@ -1,7 +1,7 @@
 """Replays of runs: which rollouts belong on one page, and a folder of pages with a list of them."""
 
 import html
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +26,7 @@ from shiftsim.view.scene import ShownRollout
 
 _ENDS = [*Task._fields, "status", "error", "scenario_type"]
 _NO_PAGE = {"page": None, "index": 0}
+_WORST = 10  # scenarios before the list
 _WRONG = {SHORT_NAMES[name]: reason for name, reason in REASONS.items()}  # in words, in their order
 
 
@@ -56,10 +57,10 @@ class _Rollout:
 
     run: Run
     key: Task  # in the run, whose planners have no remark
-    is_drawable: bool  # whether it is stored, and its scenario can be read
     end: Mapping[str, Any]  # its row of `tasks.parquet`
     score: Mapping[str, Any]  # its row of `scores.parquet`; empty where it failed
     metrics: Sequence[Mapping[str, Any]]  # its rows of `metrics.parquet`
+    is_drawable: bool  # whether it is stored, and its scenario can be read
 
 
 class Gallery:
@@ -67,6 +68,9 @@ class Gallery:
 
     All are listed, also those that failed or were not stored; a page draws up to `MAX_ROLLOUTS` of
     a scenario, the lowest scores first, and the others follow on further pages.
+
+    Attributes:
+        listed: Scenarios with rollouts of the choice: failures first, then the lowest score.
     """
 
     def __init__(self, runs: Sequence[Run], store: Any, choice: Choice | None = None) -> None:
@@ -88,44 +92,25 @@ class Gallery:
             for key, place in run.rollout_places.items():
                 planner = f"{key.planner} ({name})" if name else key.planner
                 (end,), (score,) = ends[key], scores.get(key, [{}])
-                self._rollouts[key._replace(planner=planner)] = _Rollout(
-                    run,
-                    key,
-                    store is not None and place is not None,
-                    end,
-                    score,
-                    metrics.get(key, []),
-                )
-        self._all: dict[str, list[Task]] = {}  # by scenario: failures first, then the lowest score
+                is_drawable = store is not None and place is not None
+                one = _Rollout(run, key, end, score, metrics.get(key, []), is_drawable)
+                self._rollouts[key._replace(planner=planner)] = one
+        # by scenario, all and those of the choice: failures first, then the lowest score
+        self._all: dict[str, list[Task]] = {}
+        self._chosen: dict[str, list[Task]] = {}
         for task in sorted(self._rollouts, key=self._place):
             self._all.setdefault(task.token, []).append(task)
+            if task in self.choice:
+                self._chosen.setdefault(task.token, []).append(task)
+        self.listed = list(self._chosen)
 
-    def _place(self, task: Task) -> tuple[float, Task]:
-        """Where a rollout stands: failures first, then the lowest score."""
-        return float(self._rollouts[task].score.get("cls", -1.0)), task
-
-    def _chosen(self, token: str) -> list[Task]:
-        """The rollouts of the choice of one scenario."""
-        return [task for task in self._all.get(token, []) if task in self.choice]
-
-    @property
-    def listed(self) -> list[str]:
-        """Scenarios with rollouts of the choice: failures first, then the lowest score."""
-        lowest = {
-            token: self._place(tasks[0])[0] for token in self._all if (tasks := self._chosen(token))
-        }
-        return sorted(lowest, key=lambda token: (lowest[token], token))
+    def _place(self, task: Task) -> tuple[float, str, Task]:
+        return float(self._rollouts[task].score.get("cls", -1.0)), task.token, task
 
     @property
     def tokens(self) -> list[str]:
         """Those of `listed` with rollouts to draw."""
         return [token for token in self.listed if self.parts(token)]
-
-    def counts(self, tokens: Iterable[str]) -> tuple[int, int, int]:
-        """Rollouts of some scenarios, and how many of them failed and are only listed."""
-        found = [self._rollouts[task] for token in tokens for task in self._chosen(token)]
-        failed = sum(not one.score for one in found)
-        return len(found), failed, sum(not one.is_drawable for one in found)
 
     def __len__(self) -> int:
         """All rollouts, whatever the choice."""
@@ -133,14 +118,16 @@ class Gallery:
 
     def parts(self, token: str) -> list[list[Task]]:
         """The rollouts that can be drawn, page by page, the lowest scores on the first."""
-        drawn = [task for task in self._chosen(token) if self._rollouts[task].is_drawable]
+        drawn = [task for task in self._chosen.get(token, []) if self._rollouts[task].is_drawable]
         starts = range(0, len(drawn), MAX_ROLLOUTS)
         return [sorted(drawn[start : start + MAX_ROLLOUTS]) for start in starts]
 
     def shown_words(self, token: str, part: int = 0) -> str:
         """What a page draws of how much, such as "6 of 16 rollouts shown"; empty for all."""
-        total, failed, lone = self.counts([token])
-        here = len(self.parts(token)[part])
+        found = [self._rollouts[task] for task in self._chosen[token]]
+        failed = sum(not one.score for one in found)
+        lone = sum(not one.is_drawable for one in found)
+        here, total = len(self.parts(token)[part]), len(found)
         more = [f"{failed} failed"] if failed else []
         more += [f"{lone - failed} not stored"] if lone > failed else []
         more += [f"only {self.choice}"] if any(vars(self.choice).values()) else []
@@ -218,8 +205,8 @@ class Gallery:
             for index, task in enumerate(tasks)
         }
         about = self._about(token)
-        rows = ((task, self._row(task)) for task in self._chosen(token))
-        return [{**about, **row, **where.get(task, _NO_PAGE)} for task, row in rows]
+        tasks = self._chosen[token]
+        return [about | self._row(task) | where.get(task, _NO_PAGE) for task in tasks]
 
     def _about(self, token: str) -> dict[str, str]:
         """Type and city of a scenario; of one that never finished as its store has them."""
@@ -261,13 +248,20 @@ def page_name(token: str, part: int = 0) -> str:
     return f"{safe}.{part + 1}.html" if part else f"{safe}.html"
 
 
-def list_page(title: str, rows: Sequence[Mapping[str, Any]], *, above: str = "") -> Page:
-    """The page that lists rows of `Gallery.rows`, sortable and filterable.
+def list_page(
+    title: str, rows: Sequence[Mapping[str, Any]], *, above: str = "", shown: str = ""
+) -> Page:
+    """The page that lists rows of `Gallery.rows`, sortable and filterable, the worst of them first.
 
-    `above` is HTML between heading and list; the caller escapes what comes from data.
+    The worst are those of the rollouts that finished, as `worst_of` ranks them. `above` is HTML
+    between heading and list, whose caller escapes what comes from data; `shown` are words.
     """
-    data = {"rows": list(rows), "metrics": _WRONG}
-    return framed("list", title=title, images="'self' data:", data=data, above=above)
+    finished = (dict(row, number=n) for n, row in enumerate(rows) if row["cls"] is not None)
+    worst = worst_of((row for row in finished if row["cls"] < 1.0), _WORST)
+    numbers = [(row["number"], others) for row, others in worst]
+    data = {"rows": list(rows), "metrics": _WRONG, "worst": numbers}
+    images, shown = "'self' data:", html.escape(shown)
+    return framed("list", title=title, images=images, data=data, above=above, shown=shown)
 
 
 def write_site(
@@ -300,9 +294,8 @@ def write_site(
         for token in gallery.listed
         for row in gallery.rows(token, with_pages=(gallery, token) in drawn)
     ]
-    words = html.escape(_left_out(galleries, len(found), len(drawable), rows))
-    parts = [above, worst_table(rows), f'<p id="shown">{words}</p>']
-    write_text(folder / "index.html", list_page(title, rows, above="\n".join(parts)))
+    words = _left_out(galleries, len(found), len(drawable), rows)
+    write_text(folder / "index.html", list_page(title, rows, above=above, shown=words))
     return len(found)
 
 
@@ -324,49 +317,15 @@ def _left_out(
     return "; ".join(parts)
 
 
-def worst_table(rows: Sequence[Mapping[str, Any]], count: int = 10) -> str:
-    """HTML: the worst of the rollouts that finished, as `worst_of` ranks them, and what went wrong.
-
-    In words, with links to that moment.
-    """
-    finished = [row for row in rows if row["cls"] is not None and row["cls"] < 1.0]
-    worst = worst_of(finished, count)
-    if not worst:
-        return ""
-    lines = []
-    for row, others in worst:
-        link = html.escape(row["token"])
-        if row["page"] is not None:
-            at = "" if row["at"] is None else f"t={row['at']:.2f}&amp;"
-            link = f'<a href="{row["page"]}#{at}focus={row["index"] + 1}">{link}</a>'
-        noise = row["noise"] if row["noise"] == "none" else f"{row['noise']}, seed {row['seed']}"
-        times = [(_WRONG[s], row["violated"][s]) for s in _WRONG if s in row["violated"]]
-        wrong = ", ".join(w if time is None else f"{w} {time:.1f}\u00a0s" for w, time in times)
-        texts = map(html.escape, (row["type"], row["planner"], noise))
-        cells = (link, *texts, wrong, str(others or ""))
-        score = f'<td class="number">{100.0 * row["cls"]:.2f}</td>'
-        lines.append(f"<tr>{score}{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
-    names = ("scenario", "type", "planner", "noise", "what went wrong, first time", "alike")
-    heads = "".join(f"<th>{name}</th>" for name in names)
-    title = f"The worst {len(lines)} of {len({row['token'] for row in rows})} scenarios"
-    return f"""<section id="worst"><h2>{title}</h2>
-<p>One per recording and cause; alike: other scenarios of both, which the list below holds.</p>
-<div class="wide" tabindex="0" role="region" aria-label="{title}"><table>
-<thead><tr><th class="number" title="closed-loop score (CLS)">score</th>{heads}</tr></thead>
-<tbody>{"".join(lines)}</tbody></table></div></section>"""
-
-
 def galleries(runs: Sequence[Run], stores: Sequence[Any], choice: Choice) -> list[Gallery]:
     """One gallery per store; `stores` are the open ones of runs, None where nothing is drawn."""
-    by_store: dict[str, tuple[list[Any], list[Run]]] = {}
+    opened: dict[str, Any] = {}
+    members: dict[str, list[Run]] = {}
     for run, store in zip(runs, stores, strict=True):
-        opened, members = by_store.setdefault(run.manifest["determining"]["store"], ([], []))
-        opened += [store] if store is not None else []
-        members.append(run)
-    return [
-        Gallery(members, opened[0] if opened else None, choice)
-        for opened, members in by_store.values()
-    ]
+        made_with = run.manifest["determining"]["store"]
+        opened[made_with] = opened.get(made_with) or store
+        members.setdefault(made_with, []).append(run)
+    return [Gallery(found, opened[made_with], choice) for made_with, found in members.items()]
 
 
 def _names(runs: Sequence[Run]) -> list[str]:

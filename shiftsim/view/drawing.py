@@ -13,49 +13,107 @@ from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.kernels import FloatArray
 from shiftsim.report.palette import AGENTS, ALARM, OTHER_AGENT, RECORDED, Style, dashes
 from shiftsim.report.words import violation_words, violations, worst_moment
-from shiftsim.sim.log import SimulationLog
+from shiftsim.sim.log import as_recorded
 from shiftsim.view.scene import ShownRollout, map_lines
 from shiftsim.world.map import VectorMap
+from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import PACIFICA, AgentKind, center_poses
 
 SMALL = 8  # points, of most words
-_LAYERS = {  # what is drawn first lies below
+_AREAS = {  # what is drawn first lies below
     "walkway": "#ece6d8",
     "drivable": "#dcdcd8",
     "route": "#b9d2be",
     "crosswalk": "#f7f4ea",
 }
+_LINES = {"boundary": "#a9a9a3"}
 BURST = (8, 1, 0)  # where something went wrong: no planner has this mark
 _EVERY = 50  # samples from mark to mark
 _EDGE = "#30363c"
-# where a label may stand: which way from its mark, and what part of it lies left of and below that
-_AROUND = {
-    (0.8, 0.6): (0.0, 0.0),
-    (-0.8, 0.6): (-1.0, 0.0),
-    (0.8, -0.6): (0.0, -1.0),
-    (-0.8, -0.6): (-1.0, -1.0),
-    (1.0, 0.0): (0.0, -0.5),
-    (-1.0, 0.0): (-1.0, -0.5),
-    (0.0, 1.0): (-0.5, 0.0),
-    (0.0, -1.0): (-0.5, -1.0),
-}
+# which way from its mark a label may stand
+_AROUND = ((0.8, 0.6), (-0.8, 0.6), (0.8, -0.6), (-0.8, -0.6), (1, 0), (-1, 0), (0, 1), (0, -1))
 _AWAY = (8.0, 22.0, 40.0, 62.0, 90.0)  # points
 
 
-def draw_map(axes: Any, road: VectorMap, route: Sequence[str], extent: FloatArray) -> None:
-    """Areas and boundaries of the map, and the route."""
+def draw_scene(
+    axes: Any,
+    scenario: Scenario,
+    shown: Sequence[ShownRollout],
+    styles: Mapping[str, Style],
+    extent: FloatArray,
+) -> None:
+    """What does not move: the map, and the paths of the recorded driver and of the rollouts."""
+    draw_map(axes, scenario.map, scenario.route, extent)
+    dotted = {"color": RECORDED, "linewidth": 1.1, "linestyle": ":", "zorder": 6.5}
+    axes.plot(*scenario.expert[:, :2].T, label="recorded driver", **dotted)
+    for number, item in enumerate(shown):
+        ego, style = item.log.ego, styles[item.planner]
+        every = (min(10 + number * _EVERY // len(shown), len(ego) - 1), _EVERY)
+        look = {"linewidth": 1.8, "linestyle": dashes(item.noise), "markevery": every}
+        look |= style.marks(item.noise, 5.5)
+        axes.plot(ego[:, 0], ego[:, 1], zorder=6, label=caption(item, shown), **look)
+
+
+def draw_moment(
+    axes: Any,
+    scenario: Scenario,
+    shown: Sequence[ShownRollout],
+    styles: Mapping[str, Style],
+    row: int,
+) -> list[Any]:
+    """What moves, at one sample: the tracks, and the egos of the rollouts, or the recorded one."""
+    drawn: list[Any] = []
+    items = shown or [ShownRollout("", "none", 0, as_recorded(scenario))]
+    tracks = items[0].log.tracks
+    for kind in np.unique(tracks.kinds):
+        there = tracks.valid[row] & (tracks.kinds == kind)
+        colour = AGENTS.get(AgentKind(int(kind)), OTHER_AGENT)
+        drawn += _boxes(axes, tracks.poses[row, there], tracks.sizes[row, there], facecolors=colour)
+    size = np.array([[PACIFICA.length, PACIFICA.width]])
+    for item in items:
+        colour = styles[item.planner].colour if shown else RECORDED
+        look: dict[str, Any] = {"facecolors": colour}
+        if item.noise != "none":  # hollow and dashed
+            look = {"facecolors": "#ffffffd0", "edgecolors": colour, "linewidths": 1.6}
+            look["linestyles"] = [(0, (2.2, 1.0))]
+        drawn += _boxes(axes, center_poses(item.log.ego[row : row + 1, :3]), size, zorder=7, **look)
+    return drawn
+
+
+def _boxes(
+    axes: Any, poses: FloatArray, sizes: FloatArray, *, zorder: float = 3.0, **look: Any
+) -> list[Any]:
+    """(N, 3) centre poses and (N, 2) lengths and widths as boxes."""
+    from matplotlib.collections import PolyCollection
+
+    if not len(poses):
+        return []
+    look = {"edgecolors": _EDGE, "linewidths": 0.6, **look}
+    boxes = PolyCollection(list(boxes_to_corners(poses, sizes)), zorder=zorder, **look)
+    return [axes.add_collection(boxes, autolim=False)]
+
+
+def draw_map(
+    axes: Any,
+    road: VectorMap,
+    route: Sequence[str],
+    extent: FloatArray,
+    areas: Mapping[str, str] = _AREAS,
+    lines: Mapping[str, str] = _LINES,
+) -> None:
+    """Areas and lines of the map in their colours, and the route."""
     from matplotlib.collections import LineCollection
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path as Outline
 
     layers = map_lines(road, route, extent)
-    for name, colour in _LAYERS.items():
+    for name, colour in areas.items():
         if layers[name]:
             outline = Outline.make_compound_path(*(Outline(r, closed=True) for r in layers[name]))
             axes.add_patch(PathPatch(outline, facecolor=colour, edgecolor="none", zorder=1))
-    axes.add_collection(
-        LineCollection(layers["boundary"], colors="#a9a9a3", linewidths=0.5, zorder=1.5)
-    )
+    for name, colour in lines.items():
+        thin = LineCollection(layers[name], colors=colour, linewidths=0.5, zorder=1.5)
+        axes.add_collection(thin, autolim=False)
 
 
 def draw_scale(axes: Any, extent: FloatArray) -> None:
@@ -67,23 +125,6 @@ def draw_scale(axes: Any, extent: FloatArray) -> None:
     box = {"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 1.0}
     place = {"xytext": (0, 5), "textcoords": "offset points", "ha": "center", "va": "bottom"}
     axes.annotate(f"{length} m", (x + length / 2.0, y), fontsize=SMALL, bbox=box, zorder=9, **place)
-
-
-def draw_paths(axes: Any, shown: Sequence[ShownRollout], styles: Mapping[str, Style]) -> None:
-    """The recorded driver's path, and those of the rollouts with what a legend says of them."""
-    draw_recorded(axes, shown[0].log)
-    for number, item in enumerate(shown):
-        ego, style = item.log.ego, styles[item.planner]
-        every = (min(10 + number * _EVERY // len(shown), len(ego) - 1), _EVERY)
-        look = {"linewidth": 1.8, "linestyle": dashes(item.noise), "markevery": every}
-        look |= style.marks(item.noise, 5.5)
-        axes.plot(ego[:, 0], ego[:, 1], zorder=6, label=caption(item, shown), **look)
-
-
-def draw_recorded(axes: Any, log: SimulationLog) -> None:
-    """The recorded driver's path."""
-    dotted = {"color": RECORDED, "linewidth": 1.1, "linestyle": ":", "zorder": 6.5}
-    axes.plot(log.expert_ego[:, 0], log.expert_ego[:, 1], label="recorded driver", **dotted)
 
 
 def caption(item: ShownRollout, shown: Sequence[ShownRollout]) -> str:
@@ -140,51 +181,6 @@ def draw_violation(
     return Mark(worst.time, burst, label)
 
 
-def draw_boxes(
-    axes: Any, shown: Sequence[ShownRollout], row: int, styles: Mapping[str, Style]
-) -> list[Any]:
-    """All that moves, at one sample: the others, and the egos of the rollouts."""
-    drawn = draw_others(axes, shown[0].log, row)
-    for item in shown:
-        is_clean = item.noise == "none"
-        drawn += draw_ego(axes, item.log, row, styles[item.planner].colour, filled=is_clean)
-    return drawn
-
-
-def draw_ego(
-    axes: Any, log: SimulationLog, row: int, colour: str, *, filled: bool = True
-) -> list[Any]:
-    """The ego's box at one sample; hollow and dashed when it is disturbed."""
-    pose, size = center_poses(log.ego[row : row + 1, :3]), [[PACIFICA.length, PACIFICA.width]]
-    hollow: dict[str, Any] = {"facecolors": "#ffffffd0", "edgecolors": colour, "linewidths": 1.6}
-    look = {"facecolors": colour} if filled else {**hollow, "linestyles": [(0, (2.2, 1.0))]}
-    return _boxes(axes, pose, np.array(size), zorder=7, **look)
-
-
-def draw_others(axes: Any, log: SimulationLog, row: int) -> list[Any]:
-    """The tracks at one sample."""
-    tracks = log.tracks
-    drawn: list[Any] = []
-    for kind in np.unique(tracks.kinds):
-        there = tracks.valid[row] & (tracks.kinds == kind)
-        colour = AGENTS.get(AgentKind(int(kind)), OTHER_AGENT)
-        drawn += _boxes(axes, tracks.poses[row, there], tracks.sizes[row, there], facecolors=colour)
-    return drawn
-
-
-def _boxes(
-    axes: Any, poses: FloatArray, sizes: FloatArray, *, zorder: float = 3.0, **look: Any
-) -> list[Any]:
-    """(N, 3) centre poses and (N, 2) lengths and widths as boxes."""
-    from matplotlib.collections import PolyCollection
-
-    if not len(poses):
-        return []
-    look = {"edgecolors": _EDGE, "linewidths": 0.6, **look}
-    boxes = PolyCollection(list(boxes_to_corners(poses, sizes)), zorder=zorder, **look)
-    return [axes.add_collection(boxes, autolim=False)]
-
-
 def spread_labels(figure: Any, axes: Any, marks: Sequence[Mark]) -> None:
     """Move the labels of marks to where they cover neither one another nor marks nor paths.
 
@@ -207,10 +203,13 @@ def spread_labels(figure: Any, axes: Any, marks: Sequence[Mark]) -> None:
     for mark in marks:
         box = mark.label.get_bbox_patch().get_window_extent(renderer)
         x, y = axes.transData.transform(mark.label.xy)
-        corners = [
-            (x + away * unit * cos + side * box.width, y + away * unit * sin + level * box.height)
+        corners = [  # the label is right of a mark that it stands right of, and so on
+            (
+                x + away * unit * cos + (np.sign(cos) - 1.0) / 2.0 * box.width,
+                y + away * unit * sin + (np.sign(sin) - 1.0) / 2.0 * box.height,
+            )
             for away in _AWAY
-            for (cos, sin), (side, level) in _AROUND.items()
+            for cos, sin in _AROUND
         ]
         best = min((Bbox.from_bounds(*at, box.width, box.height) for at in corners), key=cost)
         mark.label.set_position(((best.x0 - x) / unit, (best.y0 - y) / unit))

@@ -4,6 +4,7 @@
 const byId = (id) => document.getElementById(id);
 const rows = JSON.parse(byId("data-rows").textContent);
 const metrics = JSON.parse(byId("data-metrics").textContent); // words by abbreviation, in their order
+const worst = JSON.parse(byId("data-worst").textContent); // [number of a row, how many are like it]
 const PAGE = 200;
 let sorting = { key: "cls", up: true };
 let room = PAGE;
@@ -39,37 +40,62 @@ function compare(a, b) {
   return sorting.up ? order : -order;
 }
 
+// violations in words, each with its first time
+function words(violated) {
+  return violated.map(([name, t]) => {
+    const said = metrics[name] || name;
+    return t === null ? said : `${said} ${t.toFixed(1)}\u00a0s`;
+  });
+}
+
 function violatedText(row) {
   if (row.failed) return row.failed;
   // by time; what has none in the order of the metrics, as it stands there
   const parts = Object.entries(row.violated).sort((a, b) => (a[1] ?? 1e9) - (b[1] ?? 1e9));
-  return parts
-    .map(([name, t]) => [metrics[name] || name, t])
-    .map(([words, t]) => (t === null ? words : `${words} ${t.toFixed(1)}\u00a0s`))
-    .join(" · ");
+  return words(parts).join(" · ");
 }
 
-function linkOf(row) {
+function scenarioOf(row) {
+  const link = document.createElement(row.page ? "a" : "span");
   const at = Number.isFinite(row.first) ? `t=${row.first.toFixed(2)}&` : "";
-  return `${row.page}#${at}focus=${row.index + 1}`;
+  if (row.page) link.href = `${row.page}#${at}focus=${row.index + 1}`;
+  else link.title = "no replay";
+  link.textContent = row.token;
+  return link;
+}
+
+function lineOf(score, cells, place) {
+  const tr = document.createElement("tr");
+  for (const content of cells) tr.insertCell().append(content);
+  const td = tr.insertCell(place);
+  td.className = "number";
+  td.append(score);
+  return tr;
 }
 
 function line(row) {
-  const tr = document.createElement("tr");
-  const link = document.createElement(row.page ? "a" : "span");
-  if (row.page) link.href = linkOf(row);
-  else link.title = "no replay";
-  link.textContent = row.token;
   const score = row.failed ? "failed" : row.cls === null ? "–" : (100 * row.cls).toFixed(2);
   const seed = row.noise === "none" ? "" : row.seed;
-  const cells = [link, row.type, row.city, row.planner, row.noise, seed, score, violatedText(row)];
-  for (const [i, content] of cells.entries()) {
-    const td = document.createElement("td");
-    if (i === 6) td.className = "number";
-    td.append(content);
-    tr.append(td);
-  }
-  return tr;
+  const cells = [scenarioOf(row), row.type, row.city, row.planner, row.noise, seed, violatedText(row)];
+  return lineOf(score, cells, 6);
+}
+
+function worstLine([number, alike]) {
+  const row = rows[number];
+  const noise = row.noise === "none" ? row.noise : `${row.noise}, seed ${row.seed}`;
+  const violated = Object.keys(metrics).filter((name) => name in row.violated);
+  const wrong = words(violated.map((name) => [name, row.violated[name]])).join(", ");
+  const cells = [scenarioOf(row), row.type, row.planner, noise, wrong, alike || ""];
+  return lineOf((100 * row.cls).toFixed(2), cells, 0);
+}
+
+function showWorst() {
+  const section = byId("worst");
+  const count = new Set(rows.map((row) => row.token)).size;
+  const title = `The worst ${worst.length} of ${count} scenarios`;
+  section.querySelector("h2").textContent = section.querySelector("div").ariaLabel = title;
+  section.querySelector("tbody").replaceChildren(...worst.map(worstLine));
+  section.hidden = !worst.length;
 }
 
 function show() {
@@ -108,5 +134,6 @@ byId("more").addEventListener("click", () => {
   room += PAGE;
   show();
 });
+showWorst();
 show();
 document.documentElement.dataset.ready = "1";

@@ -108,7 +108,7 @@ def framed(
     title: str,
     images: str = "",
     data: Mapping[str, Any] | None = None,
-    above: str = "",
+    **parts: str,
 ) -> Page:
     """A whole page of the name, with one head for all pages.
 
@@ -117,7 +117,7 @@ def framed(
         title: Its title, also within the page.
         images: Where the images of a page that is a file may come from.
         data: What its script reads, by name: packed text, or JSON values.
-        above: HTML before what the script makes; the caller escapes what comes from data.
+        parts: What else its file leaves open, as HTML.
     """
     styles, scripts = _FILES[name]
     elements = "\n".join(_data_element(key, value) for key, value in (data or {}).items())
@@ -127,7 +127,7 @@ def framed(
         title=title,
         meta=_POLICY.format(images=images) if images else "",
         style="".join(map(_asset, styles)),
-        body=fill(_asset(f"{name}.html"), title=title, above=above, data=elements),
+        body=fill(_asset(f"{name}.html"), title=title, data=elements, **parts),
         script="\n".join(map(_asset, scripts)),
     )
     return Page(text)

@@ -32,6 +32,7 @@ from shiftsim.view.scene import (
     ShownRollout,
     describe_scene,
     indices_near,
+    line_fields,
     rollout_fields,
     scene_fields,
 )
@@ -39,7 +40,6 @@ from shiftsim.view.serving import LocalServer
 from shiftsim.world.scenario import Scenario
 
 MAX_COMMENT = 4000  # characters
-_STEP = 0.05  # m
 _CHANGED = {"decision", "comment", "route"}  # fields of a review that the page may write
 _NUMBERS = ("max_outside_m", "path_m", "progress_m", "first_violation_s", "partner_token")
 
@@ -181,13 +181,9 @@ def _block_fields(replay: Replay, blocks: list[int]) -> Fields:
     """Outlines of the blocks: rings per block, vertices per ring, vertices."""
     layer = replay.scenario.map.blocks
     rings = [layer.rings(block) for block in blocks]
+    count = Quantised(np.array([len(group) for group in rings], float), 1.0)
     flat = [ring for group in rings for ring in group]
-    xy = np.concatenate(flat) if flat else np.zeros((0, 2))
-    return {
-        "blocks.rings": Quantised(np.array([len(group) for group in rings], float), 1.0),
-        "blocks.count": Quantised(np.array([len(ring) for ring in flat], float), 1.0),
-        "blocks.xy": Quantised(xy - replay.origin, _STEP),
-    }
+    return {"blocks.rings": count, **line_fields("blocks", flat, replay.origin)}
 
 
 def review_server(service: ReviewService, port: int = 0) -> LocalServer:

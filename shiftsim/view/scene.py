@@ -51,12 +51,15 @@ class Replay:
     scenario: Scenario
     shown: Sequence[ShownRollout]
 
+    @property
+    def paths(self) -> list[FloatArray]:
+        """What the recorded driver and the rollouts drive, (N, 2) each [m]."""
+        return [self.scenario.expert[:, :2], *(item.log.ego[:, :2] for item in self.shown)]
+
     @cached_property
     def box(self) -> FloatArray:
         """(4,) min x, min y, max x, max y of the map that is shown [m]."""
-        paths = [self.scenario.expert[:, :2], *(item.log.ego[:, :2] for item in self.shown)]
-        points = np.concatenate(paths)
-        return np.concatenate([points.min(axis=0) - MARGIN, points.max(axis=0) + MARGIN])
+        return box_around(self.paths, MARGIN)
 
     @cached_property
     def origin(self) -> FloatArray:
@@ -84,9 +87,7 @@ def scene_fields(replay: Replay) -> Fields:
     layers["lights"] = _light_lines(replay.scenario)
     fields: Fields = {}
     for name, lines in layers.items():
-        xy = np.concatenate(lines) if lines else np.zeros((0, 2))
-        fields[f"{name}.xy"] = Quantised(xy - origin, _MAP_STEP)
-        fields[f"{name}.count"] = Quantised(np.array([len(line) for line in lines], float), 1.0)
+        fields |= line_fields(name, lines, origin)
     log = replay.shown[0].log
     fields["time"] = Quantised((log.time_us - log.time_us[0]) * 1e-6, _SECONDS)
     fields |= _poses("expert", log.expert_ego[:, None, :3], origin)
@@ -148,6 +149,13 @@ def describe_scene(replay: Replay) -> dict[str, Any]:
     }
 
 
+def line_fields(name: str, lines: Sequence[FloatArray], origin: FloatArray) -> Fields:
+    """Vertices (K, 2) of lines or rings, one after the other, and how many each of them has."""
+    xy = np.concatenate([np.zeros((0, 2)), *lines])
+    count = np.array([len(line) for line in lines], float)
+    return {f"{name}.xy": Quantised(xy - origin, _MAP_STEP), f"{name}.count": Quantised(count, 1.0)}
+
+
 def _poses(name: str, poses: FloatArray, origin: FloatArray) -> Fields:
     """(T, N, 3) poses as positions and continuous headings."""
     heading = poses[:, :, 2].copy()
@@ -163,7 +171,7 @@ def _poses(name: str, poses: FloatArray, origin: FloatArray) -> Fields:
 
 def _track_fields(tracks: Tracks, origin: FloatArray) -> Fields:
     """Tracks that are there at some time; values of absent samples repeat the one before."""
-    used = _used(tracks)
+    used = np.flatnonzero(tracks.valid.any(axis=0))
     valid = tracks.valid[:, used]
     first = valid.argmax(axis=0)
     rows = np.maximum.accumulate(np.where(valid, np.arange(len(valid))[:, None], 0), axis=0)
@@ -179,12 +187,9 @@ def _track_fields(tracks: Tracks, origin: FloatArray) -> Fields:
     }
 
 
-def _used(tracks: Tracks) -> np.ndarray:
-    return np.flatnonzero(tracks.valid.any(axis=0))
-
-
 def _track_names(tracks: Tracks) -> list[str]:
-    return [tracks.tokens[i] for i in _used(tracks)]
+    """Tokens of the tracks of `_track_fields`."""
+    return [tracks.tokens[i] for i in np.flatnonzero(tracks.valid.any(axis=0))]
 
 
 def describe_violations(item: ShownRollout) -> list[dict[str, Any]]:
@@ -230,20 +235,24 @@ def map_lines(
         "walkway": road.walkways,
         "crosswalk": road.crosswalks,
         "stop": road.stop_polygons,
+        "route": road.blocks,
     }
-    near = {name: (layer, indices_near(layer, box)) for name, layer in areas.items()}
-    blocks = {road.blocks.index[name] for name in route if name in road.blocks.index}
-    on_route = [block for block in indices_near(road.blocks, box) if block in blocks]
-    near["route"] = (road.blocks, on_route)
-    out = {
-        name: _rings([layer.shape(index) for index in found], box)
-        for name, (layer, found) in near.items()
-    }
+    out = {}
+    for name, layer in areas.items():
+        near = indices_near(layer, box)
+        shown = [index for index in near if name != "route" or layer.ids[index] in route]
+        out[name] = _rings([layer.shape(index) for index in shown], box)
     edges = indices_near(road.edges, box)
     sides = [lines.at(e) for e in edges for lines in (road.left_boundaries, road.right_boundaries)]
     out["boundary"] = _lines(sides, box)
     out["centre"] = _lines([road.baselines.at(e) for e in edges], box)
     return out
+
+
+def box_around(paths: Sequence[FloatArray], margin: float = 0.0) -> FloatArray:
+    """(4,) min x, min y, max x, max y of a box around paths (N, 2) [m]."""
+    points = np.concatenate(paths)
+    return np.concatenate([points.min(axis=0) - margin, points.max(axis=0) + margin])
 
 
 def indices_near(layer: Layer, box: FloatArray) -> list[int]:

@@ -12,24 +12,20 @@ from typing import Any
 import numpy as np
 
 from shiftsim.errors import ConfigError, MissingExtraError
-from shiftsim.kernels import FloatArray, IntArray
-from shiftsim.report.palette import RECORDED, new_figure, planner_styles, save_picture
-from shiftsim.sim.log import as_recorded
+from shiftsim.kernels import FloatArray
+from shiftsim.report.palette import Style, new_figure, planner_styles, save_picture
 from shiftsim.view.drawing import (
     SMALL,
     Mark,
     caption,
-    draw_boxes,
-    draw_ego,
     draw_map,
-    draw_others,
-    draw_paths,
-    draw_recorded,
+    draw_moment,
     draw_scale,
+    draw_scene,
     draw_violation,
     spread_labels,
 )
-from shiftsim.view.scene import ShownRollout
+from shiftsim.view.scene import Replay, ShownRollout, box_around
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 
@@ -77,16 +73,18 @@ def save_figure(
         save_picture(still(scenario, shown, at=at[0], note=note), path)
 
 
-def still(scenario: Scenario, shown: Sequence[ShownRollout], *, at: float, note: str = "") -> Any:
-    """A matplotlib figure of the moment `at` seconds from the start.
+def still(
+    scenario: Scenario, shown: Sequence[ShownRollout] = (), *, at: float = 0.0, note: str = ""
+) -> Any:
+    """A matplotlib figure of the moment `at` seconds from the start, as recorded if none is shown.
 
     Raises:
         ConfigError: There is no such time.
         MissingExtraError: matplotlib is missing.
     """
-    row = _sample_at(shown[0].log.time_us, at)
+    row = _sample_at(scenario, shown, at)
     figure, axes, _ = _scene(scenario, shown, at, note)
-    draw_boxes(axes, shown, row, planner_styles(item.planner for item in shown))
+    draw_moment(axes, scenario, shown, _styles(shown), row)
     return figure
 
 
@@ -94,17 +92,15 @@ def _scene(
     scenario: Scenario, shown: Sequence[ShownRollout], at: float, note: str
 ) -> tuple[Any, Any, list[Mark]]:
     """Figure and axes with all that does not move, and the marks of violations."""
-    extent = _extent_of(scenario, shown)
-    figure, ((axes,),) = panels(1, 1, extent)
-    draw_map(axes, scenario.map, scenario.route, extent)
-    styles = planner_styles(item.planner for item in shown)
-    draw_paths(axes, shown, styles)
+    extent, styles = _extent(Replay(scenario, shown).paths), _styles(shown)
+    figure, ((axes,),) = _panels(1, 1, extent)
+    draw_scene(axes, scenario, shown, styles, extent)
     found = (draw_violation(axes, item, styles[item.planner]) for item in shown)
     marks = [mark for mark in found if mark]
     draw_scale(axes, extent)
     _heading(axes, scenario, at)
     axes.set_xlabel(note, fontsize=SMALL)
-    add_legend(figure, axes)
+    _add_legend(figure, axes)
     spread_labels(figure, axes, marks)
     return figure, axes, marks
 
@@ -118,22 +114,20 @@ def grid(
         ConfigError: There is no such time.
         MissingExtraError: matplotlib is missing.
     """
-    rows = [_sample_at(shown[0].log.time_us, time) for time in at]
-    extent = _extent_of(scenario, shown)
-    figure, panels_of = panels(len(shown), len(at), extent)
+    rows = [_sample_at(scenario, shown, time) for time in at]
+    extent, styles = _extent(Replay(scenario, shown).paths), _styles(shown)
+    figure, panels = _panels(len(shown), len(at), extent)
     sides = extent[2:] - extent[:2]
     per_line = max(20, int(15 * sides[1] / sides[0] * _width(len(at), extent)))  # characters
-    styles = planner_styles(item.planner for item in shown)
-    for item, line in zip(shown, panels_of, strict=True):
-        for time, row, axes in zip(at, rows, line, strict=True):
-            draw_map(axes, scenario.map, scenario.route, extent)
-            draw_paths(axes, [item], styles)
-            draw_boxes(axes, [item], row, styles)
+    for item, line in zip(shown, panels, strict=True):
+        for row, axes in zip(rows, line, strict=True):
+            draw_scene(axes, scenario, [item], styles, extent)
+            draw_moment(axes, scenario, [item], styles, row)
             draw_violation(axes, item, styles[item.planner], in_short=True)
-            if item is shown[0]:
-                axes.set_title(f"{time:g} s", fontsize=SMALL + 1)
         line[0].set_ylabel(_wrapped(caption(item, shown), per_line), fontsize=SMALL - 1)
-    draw_scale(panels_of[-1][0], extent)
+    for time, axes in zip(at, panels[0], strict=True):
+        axes.set_title(f"{time:g} s", fontsize=SMALL + 1)
+    draw_scale(panels[-1][0], extent)
     figure.supxlabel("\n".join(filter(None, (_KEY, note))), fontsize=SMALL - 1)
     figure.suptitle(_words(scenario), fontsize=SMALL + 1)
     return figure
@@ -145,29 +139,14 @@ def overview(thing: Scenario | VectorMap) -> Any:
     Raises:
         MissingExtraError: matplotlib is missing.
     """
-    if isinstance(thing, VectorMap):
-        bounds = thing.edges.polygons.bounds
-        extent = extent_of_points(np.array([bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)]))
-        figure, ((axes,),) = panels(1, 1, extent)
-        draw_map(axes, thing, (), extent)
-        draw_scale(axes, extent)
-        return figure
-    extent = extent_of_points(thing.expert[:, :2])
-    figure, ((axes,),) = panels(1, 1, extent)
-    draw_start(axes, thing, extent)
-    _heading(axes, thing, 0.0)
-    add_legend(figure, axes)
-    return figure
-
-
-def draw_start(axes: Any, scenario: Scenario, extent: FloatArray) -> None:
-    """A scenario at its first iteration, within an extent (4,) [m]."""
-    log = as_recorded(scenario)
-    draw_map(axes, scenario.map, scenario.route, extent)
-    draw_recorded(axes, log)
-    draw_others(axes, log, 0)
-    draw_ego(axes, log, 0, RECORDED)
+    if isinstance(thing, Scenario):
+        return still(thing)
+    bounds = thing.edges.polygons.bounds
+    extent = _extent([bounds[:, :2], bounds[:, 2:]])
+    figure, ((axes,),) = _panels(1, 1, extent)
+    draw_map(axes, thing, (), extent)
     draw_scale(axes, extent)
+    return figure
 
 
 def before_and_after(recorded: Scenario, edited: Scenario) -> Any:
@@ -176,35 +155,24 @@ def before_and_after(recorded: Scenario, edited: Scenario) -> Any:
     Raises:
         MissingExtraError: matplotlib is missing.
     """
-    points = [recorded.expert[:, :2], edited.expert[:, :2]]
-    changed = _edited_tracks(edited)
-    if len(changed):
-        points.append(edited.tracks.poses[edited.iteration_rows[0], changed, :2])
-    extent = extent_of_points(np.concatenate(points))
-    words = edited.script.words if edited.script else ()
-    lines = [part for line in words for part in wrap(line, _EDIT_WIDTH)]
-    figure, (both,) = panels(1, 2, extent)
-    for scenario, axes in zip((recorded, edited), both, strict=True):
-        draw_start(axes, scenario, extent)
-        axes.set_title(
-            f"{scenario.token}  {scenario.scenario_type}".replace("$", r"\$"), fontsize=9
-        )
     tracks, row = edited.tracks, int(edited.iteration_rows[0])
-    x, y = tracks.poses[row, changed, 0], tracks.poses[row, changed, 1]
+    names, words = (edited.script.tokens, edited.script.words) if edited.script else ((), ())
+    is_edited = np.array([name in names for name in tracks.tokens], np.bool_)
+    changed = tracks.poses[row, tracks.valid[row] & is_edited, :2]
+    extent = _extent([recorded.expert[:, :2], edited.expert[:, :2], changed])
+    figure, (both,) = _panels(1, 2, extent)
+    for scenario, axes in zip((recorded, edited), both, strict=True):
+        draw_scene(axes, scenario, (), {}, extent)
+        draw_moment(axes, scenario, (), {}, 0)
+        draw_scale(axes, extent)
+        title = f"{scenario.token}  {scenario.scenario_type}"
+        axes.set_title(title.replace("$", r"\$"), fontsize=9)
     ring = {"s": 90, "facecolors": "none", "edgecolors": _EDITED, "linewidths": 1.4, "zorder": 8}
-    both[1].scatter(x, y, label="edited", **ring)
+    both[1].scatter(*changed.T, label="edited", **ring)
+    lines = [part for line in words for part in wrap(line, _EDIT_WIDTH)]
     figure.supxlabel("\n".join(lines), fontsize=8)
-    add_legend(figure, both[1])
+    _add_legend(figure, both[1])
     return figure
-
-
-def _edited_tracks(edited: Scenario) -> np.ndarray:
-    """Indices of the tracks that an edit made or changed and that are there at the start."""
-    script, row = edited.script, int(edited.iteration_rows[0])
-    names = set(script.tokens) if script else set()
-    there = edited.tracks.valid[row]
-    found = [name in names for name in edited.tracks.tokens]
-    return np.flatnonzero(there & np.array(found, np.bool_))
 
 
 def svg_of(figure: Any) -> str:
@@ -214,27 +182,32 @@ def svg_of(figure: Any) -> str:
     return "".join(out.getvalue().partition("<svg")[1:])
 
 
-def _sample_at(time_us: IntArray, at: float) -> int:
-    times = (time_us - time_us[0]) * 1e-6
+def _styles(shown: Sequence[ShownRollout]) -> dict[str, Style]:
+    return planner_styles(item.planner for item in shown)
+
+
+def _times(scenario: Scenario, shown: Sequence[ShownRollout]) -> FloatArray:
+    """Times of the samples [s from the start]."""
+    time_us = shown[0].log.time_us if shown else scenario.iteration_times[:-1]
+    return np.asarray((time_us - time_us[0]) * 1e-6)
+
+
+def _sample_at(scenario: Scenario, shown: Sequence[ShownRollout], at: float) -> int:
+    times = _times(scenario, shown)
     if not 0.0 <= at <= times[-1] + 1e-9:
         raise ConfigError(f"time {at} s is not within 0 … {times[-1]:.1f} s", hint="--at SECONDS")
     return int(np.argmin(np.abs(times - at)))
 
 
-def _extent_of(scenario: Scenario, shown: Sequence[ShownRollout]) -> FloatArray:
-    paths = [scenario.expert[:, :2], *(item.log.ego[:, :2] for item in shown)]
-    return extent_of_points(np.concatenate(paths))
-
-
-def extent_of_points(points: FloatArray) -> FloatArray:
-    """(4,) min x, min y, max x, max y of a picture that shows points (N, 2) [m]."""
-    low, high = points.min(axis=0) - _PAD, points.max(axis=0) + _PAD
+def _extent(paths: Sequence[FloatArray]) -> FloatArray:
+    """(4,) min x, min y, max x, max y of a picture that shows paths (N, 2) [m]."""
+    low, high = box_around(paths, _PAD).reshape(2, 2)
     middle, half = (low + high) / 2.0, (high - low) / 2.0
     half = np.maximum(half, half.max() * 0.5)  # never a mere strip
     return np.array([*(middle - half), *(middle + half)])
 
 
-def panels(rows: int, columns: int, extent: FloatArray) -> tuple[Any, Any]:
+def _panels(rows: int, columns: int, extent: FloatArray) -> tuple[Any, Any]:
     """A figure with axes (rows, columns) that are as wide and high as the extent needs."""
     sides, width = extent[2:] - extent[:2], _width(columns, extent)
     height = width * sides[1] / sides[0]
@@ -256,7 +229,7 @@ def _width(columns: int, extent: FloatArray) -> float:
     return float(min(_WIDTH / columns, _LARGEST * sides[0] / sides.max()))
 
 
-def add_legend(figure: Any, axes: Any) -> None:
+def _add_legend(figure: Any, axes: Any) -> None:
     """Beside a tall scene, else below it; the figure grows by as much."""
     width, height = figure.get_size_inches()
     is_tall = height > 1.3 * width
@@ -302,12 +275,11 @@ def _film(path: Path, scenario: Scenario, shown: Sequence[ShownRollout], note: s
                 hint="install ffmpeg, or pip install imageio-ffmpeg, or write a .gif",
             )
         writer = FFMpegWriter(fps=_FPS, extra_args=["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2"])
-    styles = planner_styles(item.planner for item in shown)
-    times = (shown[0].log.time_us - shown[0].log.time_us[0]) * 1e-6
+    styles = _styles(shown)
     figure.set_layout_engine("none")  # it is laid out, and each frame would be again
     with writer.saving(figure, str(path), _FILM_DPI):
-        for row, time in enumerate(times.tolist()):
-            drawn = draw_boxes(axes, shown, row, styles)
+        for row, time in enumerate(_times(scenario, shown).tolist()):
+            drawn = draw_moment(axes, scenario, shown, styles, row)
             for mark in marks:
                 for artist in (mark.burst, mark.label):
                     artist.set_visible(mark.time <= time + 1e-6)

@@ -11,12 +11,15 @@ from shiftsim.data.readers.tracks.table import TrackTable
 from shiftsim.data.store.reading import open_store
 from shiftsim.kernels import FloatArray
 from shiftsim.report.palette import AGENTS, OTHER_AGENT, RECORDED, new_figure, save_picture
+from shiftsim.view.drawing import draw_map
+from shiftsim.view.scene import box_around, indices_near
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AgentKind
 
-_ROAD, _LINE = "#dcdcd8", "#b8b8b2"
 _MARGIN = 0.05  # of the extent
+_NEAR = 100.0  # m beyond the map that tracks may be and still be drawn with it
 _MAX_POINTS = 200_000
+_MAX_ARROWS = 200
 _MAX_EGOS = 40
 Egos = dict[str, list[FloatArray]]  # poses (R, 3) of every scenario, by ego
 
@@ -32,51 +35,55 @@ def save_tracks_picture(path: Path, inspection: Inspection, store: Path | None) 
     road, table = inspection.road, inspection.table
     egos = {} if store is None else _read_egos(store, f"{road.name}_{table.name}")
     bounds = road.edges.polygons.bounds
-    map_box = np.concatenate([bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)])
-    track_box = np.concatenate([*np.percentile(table.xy[:: _step(table)], (0.1, 99.9), axis=0)])
-    inside = (track_box[:2] >= map_box[:2] - 100.0).all() and (
-        track_box[2:] <= map_box[2:] + 100.0
-    ).all()
-    alone = (
-        not inside
-        or (track_box[2:] - track_box[:2]).max() < 0.2 * (map_box[2:] - map_box[:2]).max()
-    )
-    both = np.concatenate(
-        [np.minimum(map_box[:2], track_box[:2]), np.maximum(map_box[2:], track_box[2:])]
-    )
-    shown = [both if inside else map_box, *([track_box] if alone else [])]
-    width = 7.0 if alone else 9.0
-    tall = max(float((box[3] - box[1]) / max(box[2] - box[0], 1e-9)) for box in shown)
+    road_box = box_around([bounds[:, :2], bounds[:, 2:]])
+    points = table.xy[:: _step(table)]
+    track_box = np.concatenate([*np.percentile(points, (0.1, 99.9), axis=0)])
+    low, high = track_box[:2], track_box[2:]
+    is_inside = (low >= road_box[:2] - _NEAR).all() and (high <= road_box[2:] + _NEAR).all()
+    shown = {"the map: the tracks are elsewhere": road_box}
+    if is_inside:
+        corners = np.stack([road_box, track_box]).reshape(-1, 2)
+        shown = {"map and tracks": box_around([corners])}
+    if not is_inside or (high - low).max() < 0.2 * (road_box[2:] - road_box[:2]).max():
+        shown["where the tracks are"] = track_box
+    width = 7.0 if len(shown) > 1 else 9.0
+    tall = max(float((box[3] - box[1]) / max(box[2] - box[0], 1e-9)) for box in shown.values())
     height = width * min(max(tall, 0.3), 1.2) + 1.6
     figure = new_figure(figsize=(width * len(shown), height))
     panels = figure.subplots(1, len(shown), squeeze=False)[0]
-    _panel(panels[0], inspection, egos, shown[0])
-    panels[0].set_title("map and tracks" if inside else "the map: the tracks are elsewhere")
-    if alone:
-        _panel(panels[1], inspection, egos, track_box)
-        panels[1].set_title("where the tracks are")
-    words = [f"{road.name}, {table.name}: {len(table.track_ids)} objects"]
-    if egos:
-        words.append(f"{sum(map(len, egos.values()))} scenarios, {len(egos)} egos")
-    diagnostics = inspection.diagnostics
-    words += [finding.what for finding in (*diagnostics.errors, *diagnostics.warnings)]
+    for axes, (title, box) in zip(panels, shown.items(), strict=True):
+        _draw_panel(axes, inspection, egos, box)
+        axes.set_title(title)
     handles, labels = panels[-1].get_legend_handles_labels()
     look = {"loc": "outside lower center", "ncols": 5, "fontsize": 8, "frameon": False}
     for sample in figure.legend(handles, labels, **look).get_lines():
         sample.set_linewidth(2.0)  # lines of the tracks are too thin to tell colours
-    figure.suptitle("\n".join(words).replace("$", r"\$"), fontsize=9, wrap=True)
+    words = "\n".join(_words(inspection, egos)).replace("$", r"\$")
+    figure.suptitle(words, fontsize=9, wrap=True)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_picture(figure, path)
 
 
-def _panel(axes: Any, inspection: Inspection, egos: Egos, extent: FloatArray) -> None:
-    low, high = extent[:2], extent[2:]
-    pad = _MARGIN * max(float((high - low).max()), 10.0)
-    _draw_road(axes, inspection.road, np.concatenate([low - pad, high + pad]))
+def _words(inspection: Inspection, egos: Egos) -> list[str]:
+    """What is drawn, and what is wrong with it, a line each."""
+    table, diagnostics = inspection.table, inspection.diagnostics
+    words = [f"{inspection.road.name}, {table.name}: {len(table.track_ids)} objects"]
+    if (step := _step(table)) > 1:
+        words[0] += f", of their {len(table.xy)} rows one in {step} drawn"
+    if egos:
+        words.append(f"{sum(map(len, egos.values()))} scenarios, {len(egos)} egos")
+    return words + [found.what for found in (*diagnostics.errors, *diagnostics.warnings)]
+
+
+def _draw_panel(axes: Any, inspection: Inspection, egos: Egos, extent: FloatArray) -> None:
+    pad = _MARGIN * max(float((extent[2:] - extent[:2]).max()), 10.0)
+    box = box_around([extent.reshape(2, 2)], pad)
+    draw_map(axes, inspection.road, (), box, {"drivable": "#dcdcd8"}, {"centre": "#b8b8b2"})
+    _draw_directions(axes, inspection.road, box)
     _draw_tracks(axes, inspection.table)
     _draw_egos(axes, egos)
-    axes.set_xlim(low[0] - pad, high[0] + pad)
-    axes.set_ylim(low[1] - pad, high[1] + pad)
+    axes.set_xlim(box[0], box[2])
+    axes.set_ylim(box[1], box[3])
     axes.set_aspect("equal")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
@@ -84,28 +91,15 @@ def _panel(axes: Any, inspection: Inspection, egos: Egos, extent: FloatArray) ->
     axes.tick_params(labelsize=7)
 
 
-def _draw_road(axes: Any, road: VectorMap, box: FloatArray) -> None:
-    from matplotlib.collections import LineCollection, PolyCollection
-
-    bounds = road.edges.polygons.bounds
-    near = (bounds[:, :2] <= box[2:]).all(axis=1) & (bounds[:, 2:] >= box[:2]).all(axis=1)
-    rings = [
-        np.array(road.drivable_areas.shape(index).exterior.coords)
-        for index in range(len(road.drivable_areas))
-    ]
-    edges = np.flatnonzero(near).tolist()
-    rings += [np.array(road.edges.shape(edge).exterior.coords) for edge in edges]
-    fill: dict[str, Any] = {"facecolors": _ROAD, "edgecolors": "none", "zorder": 1}
-    axes.add_collection(PolyCollection(rings, **fill), autolim=False)
-    lines = [road.baselines.at(edge) for edge in edges]
-    thin: dict[str, Any] = {"colors": _LINE, "linewidths": 0.5, "zorder": 2}
-    axes.add_collection(LineCollection(lines, **thin), autolim=False)
-    for line in lines[:: max(1, len(lines) // 200)]:  # which way the lanes lead
+def _draw_directions(axes: Any, road: VectorMap, box: FloatArray) -> None:
+    """Arrows that say which way the lanes lead."""
+    lines = [road.baselines.at(edge) for edge in indices_near(road.edges, box)]
+    for line in lines[:: max(1, len(lines) // _MAX_ARROWS)]:
         middle = len(line) // 2
         if 0 < middle < len(line) - 1:
-            ends = line[middle - 1], line[middle + 1]
             style = {"arrowstyle": "->", "color": "#8c8c86", "linewidth": 0.7}
-            axes.annotate("", xy=ends[1], xytext=ends[0], arrowprops=style, annotation_clip=True)
+            ends = {"xy": line[middle + 1], "xytext": line[middle - 1]}
+            axes.annotate("", **ends, arrowprops=style, annotation_clip=True)
 
 
 def _draw_tracks(axes: Any, table: TrackTable) -> None:
@@ -117,9 +111,10 @@ def _draw_tracks(axes: Any, table: TrackTable) -> None:
         rows = shown[kinds == kind]
         breaks = np.flatnonzero(np.diff(table.track[rows])) + 1
         xy = np.insert(table.xy[rows], breaks, np.nan, axis=0)
-        known = AgentKind(kind) if kind >= 0 else None
-        colour = OTHER_AGENT if known is None else AGENTS.get(known, OTHER_AGENT)
-        name = known.name.lower().replace("_", " ") if known is not None else "unknown kind"
+        colour, name = OTHER_AGENT, "unknown kind"
+        if kind >= 0:
+            known = AgentKind(kind)
+            colour, name = AGENTS.get(known, OTHER_AGENT), known.name.lower().replace("_", " ")
         axes.plot(xy[:, 0], xy[:, 1], color=colour, linewidth=0.6, zorder=3, label=name)
 
 
@@ -138,16 +133,14 @@ def _read_egos(store: Path, log_name: str) -> Egos:
 
 
 def _draw_egos(axes: Any, egos: Egos) -> None:
+    named = f", {_MAX_EGOS} of {len(egos)} named" if len(egos) > _MAX_EGOS else ""
     for number, (name, paths) in enumerate(egos.items()):
-        path = np.concatenate(paths)
-        x, y = path[:, 0], path[:, 1]
-        named = f", {_MAX_EGOS} of {len(egos)} named" if len(egos) > _MAX_EGOS else ""
-        label = f"egos, from dot to arrow{named}" if not number else None
+        x, y, heading = np.concatenate(paths).T
+        label = None if number else f"egos, from dot to arrow{named}"
         axes.plot(x, y, color=RECORDED, linewidth=1.3, zorder=4, label=label)
         if number < _MAX_EGOS:
             axes.plot(x[0], y[0], "o", color=RECORDED, markersize=4, zorder=5)
-            heading = path[-1, 2]
-            to = x[-1] + 6.0 * np.cos(heading), y[-1] + 6.0 * np.sin(heading)
+            to = x[-1] + 6.0 * np.cos(heading[-1]), y[-1] + 6.0 * np.sin(heading[-1])
             style = {"arrowstyle": "-|>", "color": RECORDED}
             axes.annotate("", xy=to, xytext=(x[-1], y[-1]), arrowprops=style, zorder=5)
             text: dict[str, Any] = {"xytext": (4, 3), "textcoords": "offset points", "fontsize": 6}
