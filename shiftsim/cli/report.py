@@ -2,13 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Exit, Option, echo
 
 from shiftsim import cli
 from shiftsim.cli import Json, Quiet, plural, print_json, progress_bar
-from shiftsim.errors import one_of
+from shiftsim.errors import DataError, one_of
 from shiftsim.files import safe_join
 
 if TYPE_CHECKING:
@@ -128,7 +128,14 @@ def _write_pages(
 
     folder.mkdir(parents=True, exist_ok=True)
     images = {figure.save(folder).name: figure.title for figure in drawn}
-    stores = [open_run_store(run) if any(run.rollout_places.values()) else None for run in runs]
+    stores: list[Any] = []
+    for run in runs:
+        try:
+            stores.append(open_run_store(run))
+        except DataError:
+            if any(run.rollout_places.values()):
+                raise
+            stores.append(None)  # then there is nothing to draw
     write_site(
         folder,
         galleries(runs, stores, Choice()),

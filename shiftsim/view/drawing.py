@@ -182,9 +182,10 @@ def draw_violation(
 
 
 def spread_labels(figure: Any, axes: Any, marks: Sequence[Mark]) -> None:
-    """Move the labels of marks to where they cover neither one another nor marks nor paths.
+    """Move the labels of marks to where they cover neither one another nor other words.
 
-    Each takes the best of some places around its mark, the nearest one where several are as good.
+    Nor marks and paths. Each takes the best of some places around its mark, the nearest one where
+    several are as good.
     """
     from matplotlib.transforms import Bbox
 
@@ -193,6 +194,8 @@ def spread_labels(figure: Any, axes: Any, marks: Sequence[Mark]) -> None:
     unit = figure.dpi / 72.0  # pixels per point
     paths = axes.transData.transform(np.concatenate([line.get_xydata() for line in axes.lines]))
     taken = [mark.burst.get_window_extent(renderer).padded(6.0 * unit) for mark in marks]
+    others = set(axes.texts) - {mark.label for mark in marks}  # the scale
+    taken += [words.get_window_extent(renderer) for words in others]
 
     def cost(spot: Any) -> float:
         inside = Bbox.intersection(spot, frame)

@@ -270,6 +270,18 @@ class TestGallery:
         assert all(row["page"] is None for row in rows)
         assert "4 of 8 rollouts failed; 4 rollouts have no replay" in page
 
+    def test_type_and_city_of_what_never_finished_come_from_the_store(self, tmp_path, toy):
+        lost = [("alpha", "none", 0, "0001cafe")]
+        run = write_run(tmp_path / "run", tokens=("0001cafe",), types=("",), missing=lost)
+        run.manifest["determining"]["store"] = open_store(toy).hash
+
+        (row,) = Gallery([run], open_store(toy)).rows("0001cafe")
+        (alone,) = Gallery([run], None).rows("0001cafe")
+
+        assert row["failed"]
+        assert (row["type"], row["city"]) == ("parked", "straight")
+        assert (alone["type"], alone["city"]) == ("", "")
+
     def test_a_page_and_a_list_say_what_they_leave_out(self, clean_run, toy, tmp_path):
         gallery = Gallery([clean_run], open_store(toy), Choice(seeds=(1,)))
 

@@ -3,17 +3,19 @@
 import shutil
 from dataclasses import replace
 from importlib.util import find_spec
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from pictures import cut_off, overlaps, written
-from worlds import cruise_scenario, standing_tracks
+from worlds import cruise_scenario, standing_tracks, straight_road
 
 from shiftsim.planners.registry import load_planner
 from shiftsim.report.palette import ALARM, RECORDED, planner_styles
 from shiftsim.sim.loop import simulate
 from shiftsim.view.scene import ShownRollout
 from shiftsim.view.still import grid, overview, save_figure, still
+from shiftsim.view.tracks import save_tracks_picture
 from shiftsim.world.state import AgentKind
 
 pytest.importorskip("matplotlib")
@@ -144,6 +146,30 @@ def test_an_mp4_is_a_film_that_players_know(scenario, shown, tmp_path):
     content = (tmp_path / "film.mp4").read_bytes()
     assert content[4:8] == b"ftyp"
     assert b"avc1" in content  # H.264
+
+
+def test_words_do_not_cover_those_of_the_scale(scenario):
+    log = simulate(scenario, load_planner("constant-velocity"))
+    hit = {**COLLISION, "partner_token": scenario.tracks.tokens[1]}
+    several = [
+        ShownRollout(name, "none", 0, log, 0.0, [{**hit, "first_violation_s": 0.1 * number}])
+        for number, name in enumerate(("idm", "log-future", "plantf", "pluto", "carl", "simple"))
+    ]
+    assert overlaps(still(scenario, several, at=1.0)) == []
+
+
+def test_the_picture_of_tracks_says_where_it_draws_one_row_in_several(tmp_path, monkeypatch):
+    monkeypatch.setattr("shiftsim.view.tracks._MAX_POINTS", 100)
+    xy = np.stack([np.linspace(0.0, 80.0, 600), np.zeros(600)], axis=1)
+    table = SimpleNamespace(name="rec", xy=xy, track=np.zeros(600, int), track_ids=["a"])
+    table.category, table.categories = np.zeros(600, int), ["car"]
+    said = SimpleNamespace(errors=[], warnings=[])
+    inspection = SimpleNamespace(road=straight_road(), table=table, diagnostics=said)
+
+    save_tracks_picture(tmp_path / "a.svg", inspection, None)
+
+    words = "1 objects, of their 600 rows one in 6 drawn"
+    assert words in (tmp_path / "a.svg").read_text("utf-8")
 
 
 def test_in_a_grid_words_stand_for_abbreviations_and_a_line_explains_marks(scenario, shown):
