@@ -210,6 +210,7 @@ class LiveServer(LocalServer):
         self.run.end("interrupted" if interrupted else "stopped" if kind else "finished")
         if monotonic() - self.last_request < _PATIENCE:
             self.end_was_shown.wait(_PATIENCE)
-        with self.turn:  # the answer that shows the end is sent
-            self.shutdown()
+        if self.turn.acquire(timeout=_PATIENCE):  # the answer that shows the end is sent
+            self.turn.release()
+        self.shutdown()
         self.server_close()
