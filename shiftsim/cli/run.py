@@ -272,13 +272,14 @@ def _print_results(finished: "Run", *, allow_partial: bool) -> None:
     counts = finished.manifest["counts"]
     echo()
     echo(score_table([finished], allow_partial=allow_partial))
-    worst = [
-        f"{row['token']} {task_words(row)} {100.0 * row['cls']:.2f} {row['reason']}"
-        for row in worst_rollouts(finished, 3)
-        if row["cls"] < 1.0
-    ]
+    worst = [row for row in worst_rollouts(finished, 3) if row["cls"] < 1.0]
     if worst:
-        echo(f" worst: {' · '.join(worst)}")
+        words = (
+            f"{row['token']} {task_words(row)} {100.0 * row['cls']:.2f} {row['reason']}"
+            for row in worst
+        )
+        of = len(set(finished.scores["token"].to_pylist()))
+        echo(f" worst {len(worst)} of {plural(of, 'scenario')}: {' · '.join(words)}")
     lost = failures(finished)
     alike: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for row in lost:
