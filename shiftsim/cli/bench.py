@@ -121,16 +121,16 @@ def _plan_lines(plan: "Plan") -> "Iterator[str]":
 def _report(plan: "Plan", *, published: bool, allow_partial: bool, as_json: bool) -> None:
     """Print the main tables, and write everything below `report/`."""
     from shiftsim.benchmarks.bench import open_runs
-    from shiftsim.report.build import TABLES, Options, write_report
+    from shiftsim.report.build import Options, write_report
     from shiftsim.report.figures import figures
     from shiftsim.report.scores import summary
     from shiftsim.report.tables import FORMATS, render
 
     opened = open_runs([plan.folder])
-    options = Options(tuple(TABLES), None, published, allow_partial)
-    groups, tables = read_tables(opened, options, with_coverage=True)
+    options = Options(with_published=published)
+    groups, tables = read_tables(opened, options, with_coverage=True, allow_partial=allow_partial)
     try:
-        drawn = figures(groups, allow_partial=allow_partial)
+        drawn = figures(groups)
     except MissingExtraError as error:
         echo(f" no pictures: {error.message}; {error.hint}", err=True)
         drawn = []

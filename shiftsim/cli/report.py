@@ -76,9 +76,11 @@ def report(
         out = safe_join(folders[0], "report")
     kind = (style or ["text"])[0]
     default = tuple(TABLES) if out or site else ("scores",) if kind == "csv" else BRIEF
-    options = Options(tuple(table or default), by, published, allow_partial)
-    groups, tables = read_tables(opened, options, with_coverage=not table)
-    drawn = draw(groups, allow_partial=allow_partial) if figures or site else []
+    options = Options(tuple(table or default), by, published)
+    groups, tables = read_tables(
+        opened, options, with_coverage=not table, allow_partial=allow_partial
+    )
+    drawn = draw(groups) if figures or site else []
     title = f"Report on {', '.join(folder.resolve().name for folder in folders)}"
     if out is not None:
         files = write_report(out, title, opened.runs, tables, drawn, style or FORMATS)
@@ -98,7 +100,7 @@ def report(
 
 
 def read_tables(
-    opened: "OpenedRuns", options: "Options", *, with_coverage: bool
+    opened: "OpenedRuns", options: "Options", *, with_coverage: bool, allow_partial: bool
 ) -> "tuple[list[Group], list[Table]]":
     """The scores of runs by planner and noise, and tables, also those of benchmarks if asked."""
     from shiftsim.benchmarks import known_sets
@@ -106,7 +108,7 @@ def read_tables(
     from shiftsim.report.build import make_tables
     from shiftsim.report.groups import read_groups
 
-    groups = read_groups(opened.runs, (*known_sets(), *opened.own))
+    groups = read_groups(opened.runs, (*known_sets(), *opened.own), allow_partial=allow_partial)
     tables = make_tables(groups, published_figures(), options)
     if with_coverage and options.tables != ("scores",):
         tables = [*opened.coverage(groups), *tables]

@@ -247,7 +247,8 @@ def show_stats(
         found = store_stats(
             opened, tokens, progress=lambda done, total, token: advance(done, total)
         )
-    text = stats_table(found, by=by, style=style)
+    width = cli.terminal_width() if out is None else 0
+    text = stats_table(found, by=by, style=style, width=width)
     if figure is not None:
         name = opened.path.resolve().name
         draw_stats(found, figure, title=f"{name}: {plural(len(tokens), 'scenario')}")

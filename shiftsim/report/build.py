@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
+from string import Template
 
 from shiftsim.errors import ConfigError, one_of
 from shiftsim.files import write_text
@@ -15,8 +16,7 @@ from shiftsim.report.groups import (
     Group,
     has_default_weights,
     planner_identities,
-    synthetic_weights_note,
-    weights_note,
+    planner_notes,
 )
 from shiftsim.report.paper import Published
 from shiftsim.report.scores import scores
@@ -26,31 +26,13 @@ from shiftsim.runs.results import Run
 _HASH = 12  # characters shown of a hash
 _PACKAGES = ("python", "numpy", "numba", "torch")
 CITED = "cite.bib"  # the file with the citation
-_CITATION = """@misc{{shiftsim,
-  author = {{{{shiftsim developers}}}},
-  title = {{shiftsim: closed-loop evaluation of driving planners}},
-  year = {{{year}}},
-  note = {{version {version}}}
-}}
-@misc{{shiftdrift,
-  author = {{Canevaro and others}},
-  title = {{Shift \\& Drift: A Zero-Shot Benchmark for Generalizable and Robust Autonomous Driving
-    Motion Planning}}
-}}
-@misc{{nuplan,
-  author = {{Caesar, Holger and Kabzan, Juraj and Tan, Kok Seang and Fong, Whye Kit and Wolff, Eric
-    and Lang, Alex and Fletcher, Luke and Beijbom, Oscar and Omari, Sammy}},
-  title = {{{{nuPlan}}: A closed-loop {{ML}}-based planning benchmark for autonomous vehicles}},
-  year = {{2021}},
-  eprint = {{2106.11810}},
-  archiveprefix = {{arXiv}}
-}}"""
+_HERE = Path(__file__).parent
 
 # the kinds of tables, names up to the first "_", and what they show
 TABLES = {
     "semantic-shift": "clean scores by site, beside the published ones",
     "noise-robustness": "scores under every noise",
-    "edits": "clean scores of edited scenarios by kind and difficulty",
+    "edits": "scores of edited scenarios by kind and difficulty",
     "planner-comparison": "every pair of planners scenario by scenario, clean",
     "planner-comparison-noise": "the same under every noise",
     "scenario-types": "clean scores by scenario type",
@@ -72,7 +54,6 @@ class Options:
     tables: tuple[str, ...] = tuple(TABLES)  # kinds of tables, of `TABLES`
     by: str | None = None  # splits the rows of the score table further
     with_published: bool = False  # show the published figures as well
-    allow_partial: bool = False  # show labelled means of incomplete groups
 
     def __post_init__(self) -> None:
         for name in self.tables:
@@ -90,30 +71,45 @@ def make_tables(
         ConfigError: Nothing is left beside them.
     """
     chosen = options or Options()
-    partial = chosen.allow_partial
     left_out = [group for group in groups if chosen.with_published and has_default_weights(group)]
+    weights = {f"{group.planner}, {group.identity['weights']}" for group in left_out}
+    default_weights = "; ".join(sorted(weights))
     groups = [group for group in groups if group not in left_out]
-    default_weights = weights_note(group.run for group in left_out)
     if left_out and not groups:
         raise ConfigError(
             f"nothing to show beside published figures: {default_weights}", hint=_ASK_FOR_WEIGHTS
         )
-    shown_published = published if chosen.with_published else None
+    runs = list({group.run.path: group.run for group in groups}.values())
+    notes = planner_notes(runs)
+    if left_out:
+        notes.append(f"left out: {default_weights}; {_ASK_FOR_WEIGHTS}")
+    out: list[Table] = []
+    for name, make in _makers(groups, published, chosen, runs).items():
+        for table in filter(None, make() if name in chosen.tables else ()):
+            of_planners = [] if name in _ABOUT_DATA else notes
+            more = (n for n in of_planners if not any(n in other for other in table.notes))
+            named = _unused(table.name, out)
+            out.append(replace(table, name=named, notes=(*table.notes, *more)))
+    return out
+
+
+def _makers(
+    groups: Sequence[Group], published: Published | None, options: Options, runs: Sequence[Run]
+) -> dict[str, Callable[[], Sequence[Table | None]]]:
+    """What makes the tables of each kind of `TABLES`, in their order."""
+    shown = published if options.with_published else None
     statistics = cache(lambda: dataset.own_statistics(groups))
     edited = {group.data.label for group in groups if group.data.edits}
-    runs = list({group.run.path: group.run for group in groups}.values())
-    makers: dict[str, Callable[[], Sequence[Table | None]]] = {
+    return {
         "semantic-shift": lambda: paper.semantic_shift(
-            groups, published, with_published=chosen.with_published, allow_partial=partial
+            groups, published, with_published=options.with_published
         ),
-        "noise-robustness": lambda: [
-            paper.noise_robustness(groups, shown_published, allow_partial=partial)
-        ],
-        "edits": lambda: details.edited_scores(groups, allow_partial=partial),
+        "noise-robustness": lambda: [paper.noise_robustness(groups, shown)],
+        "edits": lambda: details.edited_scores(groups),
         "planner-comparison": lambda: [details.planner_comparison(groups)],
         "planner-comparison-noise": lambda: [details.planner_comparison(groups, noisy=True)],
-        "scenario-types": lambda: details.scenario_types(groups, allow_partial=partial),
-        "scores": lambda: [scores(groups, by=chosen.by, allow_partial=partial)],
+        "scenario-types": lambda: details.scenario_types(groups),
+        "scores": lambda: [scores(groups, by=options.by)],
         "planning-time": lambda: [details.planning_times(groups)],
         "data-statistics": lambda: [dataset.data_statistics(statistics())],
         "benchmark-comparison": lambda: (
@@ -121,19 +117,6 @@ def make_tables(
         ),
         "runs": lambda: [runs_table(runs)],
     }
-    notes = [
-        synthetic_weights_note(runs),
-        weights_note(runs),
-        default_weights and f"left out: {default_weights}; {_ASK_FOR_WEIGHTS}",
-    ]
-    out: list[Table] = []
-    for name in (name for name in TABLES if name in chosen.tables):
-        for table in filter(None, makers[name]()):
-            of_planners = [] if name in _ABOUT_DATA else filter(None, notes)
-            more = (n for n in of_planners if not any(n in other for other in table.notes))
-            named = _unused(table.name, out)
-            out.append(replace(table, name=named, notes=(*table.notes, *more)))
-    return out
 
 
 def _unused(name: str, tables: Sequence[Table]) -> str:
@@ -168,7 +151,8 @@ def write_report(
         if style == "html":
             coded = {path: base64.b64encode(path.read_bytes()).decode() for path in pictures}
             images = {f"data:image/png;base64,{coded[p]}": t for p, t in pictures.items()}
-            parts = [_page(title, report_html(runs, tables, images))]
+            body = report_html(runs, tables, images)
+            parts = [_filled("page.html", title=html.escape(title), body=body)]
         elif style == "md":
             shown = [f"![{markdown_escape(t)}]({path.name})" for path, t in pictures.items()]
             head = [f"# {markdown_escape(title)}", markdown_escape(subtitle)]
@@ -189,55 +173,29 @@ def write_report(
     return out
 
 
-STYLE = """<style>
-section h2 { font-size: 1.05rem; margin: 2.2rem 0 .5rem; }
-section p { color: #555; font-size: .8rem; margin: .25rem 0; overflow-wrap: anywhere; }
-section table { border-collapse: collapse; width: auto; font-size: .85rem;
-  font-variant-numeric: tabular-nums; }
-section th, section td { padding: .22rem .6rem; text-align: left; white-space: nowrap; }
-section th { border-bottom: 1.5px solid #444; vertical-align: bottom; }
-section tbody tr:nth-child(even) { background: #f4f5f7; }
-section .n { text-align: right; }
-section th small { display: block; max-width: 6.5rem; margin-left: auto; white-space: normal;
-  font-weight: normal; line-height: 1.2; }
-section pre { user-select: all; font-size: .8rem; padding: .6rem; background: #f4f5f7; }
-.wide, section pre { overflow-x: auto; }
-img { max-width: 100%; }
-</style>"""
-
-
 def report_html(runs: Sequence[Run], tables: Sequence[Table], images: Mapping[str, str]) -> str:
     """Tables, pictures (titles by address) and citation as sections that any page can hold."""
-    parts = [f"<p>{html.escape(made_of(runs))}</p>", *(render(table, "html") for table in tables)]
+    parts = [f"<style>\n{_filled('tables.css')}\n</style>", f"<p>{html.escape(made_of(runs))}</p>"]
+    parts += [render(table, "html") for table in tables]
     for address, title in images.items():
         words = html.escape(title)
         parts.append(f'<section><h2>{words}</h2>\n<img alt="{words}" src="{address}"></section>')
     cite = html.escape(citation(runs))
     heading = "Cite (a click selects all)"
     parts.append(f"<section><h2>{heading}</h2>\n<pre>{cite}</pre></section>")
-    return "\n".join([STYLE, *parts])
+    return "\n".join(parts)
 
 
-def _page(title: str, body: str) -> str:
-    """One HTML file."""
-    words = html.escape(title)
-    return f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>{words}</title>
-<meta name="viewport" content="width=device-width, initial-scale=1"><link rel="icon" href="data:,">
-<style>
-body {{ font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 75rem;
-  padding: 0 1rem; color: #1c1c1c; background: #fff; }}
-</style></head><body>
-<h1>{words}</h1>
-{body}
-</body></html>"""
+def _filled(name: str, **parts: str) -> str:
+    """A file of this folder with its `$names` filled in."""
+    return Template((_HERE / name).read_text("utf-8").rstrip()).substitute(parts)
 
 
 def citation(runs: Sequence[Run]) -> str:
     """BibTeX entries: shiftsim in the version of the runs, the benchmark's paper, nuPlan."""
     years = [_date(run)[:4] for run in runs]
     versions = dict.fromkeys(map(_version, runs))
-    return _CITATION.format(year=max(years), version=", ".join(filter(None, versions)))
+    return _filled(CITED, year=max(years), version=", ".join(filter(None, versions)))
 
 
 def made_of(runs: Sequence[Run]) -> str:
@@ -267,8 +225,8 @@ def runs_table(runs: Sequence[Run]) -> Table:
         "shiftsim": _version,
         **{name: partial(_package, name=name) for name in _PACKAGES},
     }
-    lines = ((name, *(fact(run) for run in runs)) for name, fact in facts.items())
-    rows = tuple(line for line in lines if any(line[1:]))
+    lines = ((name, *map(fact, runs)) for name, fact in facts.items())
+    rows = [line for line in lines if any(line[1:])]
     header = ("run", *(run.path.name for run in runs))
     return Table("runs", "The runs", header, rows, len(header))
 

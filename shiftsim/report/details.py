@@ -7,11 +7,10 @@ import numpy as np
 import pyarrow.compute as pc
 
 from shiftsim.edits.sampling import GRADES, graded
-from shiftsim.kernels import BoolArray, FloatArray
-from shiftsim.report.groups import Group, distinct_sets
-from shiftsim.report.paper import traffics
+from shiftsim.kernels import FloatArray
+from shiftsim.report.groups import Group, by_set, distinct_sets
 from shiftsim.report.statistics import FEW_CLUSTERS, cluster_codes, compare, holm
-from shiftsim.report.tables import Cell, Estimate, Number, Table
+from shiftsim.report.tables import Number, Row, Table
 from shiftsim.runs.results import Run
 
 ALL_KINDS = "all"
@@ -20,148 +19,148 @@ ALL_KINDS = "all"
 def planner_comparison(groups: Sequence[Group], *, noisy: bool = False) -> Table | None:
     """Every pair of planners on the same scenarios, clean or noisy; None where there is no pair."""
     blocks: dict[tuple[object, ...], list[Group]] = {}  # they differ in nothing but the planner
-    mine = [group for group in groups if (group.noise != "none") == noisy]
-    for group in mine:
-        if group.is_complete:
-            key = (group.data.key, group.traffic, group.noise, group.seeds)
-            blocks.setdefault(key, []).append(group)
-    alone = [
-        f"{group.planner} {group.noise} {group.traffic}"
-        for group in mine
-        if not group.is_complete
-        or len(blocks[group.data.key, group.traffic, group.noise, group.seeds]) < 2
-    ]
-    rows: list[tuple[Cell, ...]] = []
-    num_recordings: set[int] = set()
-    smallest = 0.0
-    for block in blocks.values():
-        pairs = list(combinations(block, 2))
-        clusters = cluster_codes(block[0].data.recordings)
-        results = [compare(100.0 * a.column(), 100.0 * b.column(), clusters) for a, b in pairs]
-        corrected = holm([result.p_value for result in results])
-        for (first, second), result, p_value in zip(pairs, results, corrected, strict=True):
-            num_recordings.add(first.data.num_recordings)
-            smallest = max(smallest, result.smallest_p)
-            where = (first.data.label, first.traffic, first.noise, first.planner, second.planner)
-            count = f"{result.wins}/{result.ties}/{result.losses}"
-            tests = (Number(result.p_value, 4), Number(p_value, 4))
-            rows.append((*where, Number(result.difference), result.interval, count, *tests))
-    if not rows:
+    for group in (group for group in groups if (group.noise != "none") == noisy):
+        without_pair = "" if group.is_complete else group.planner
+        key = (group.data.key, group.traffic, group.noise, group.seeds, without_pair)
+        blocks.setdefault(key, []).append(group)
+    pairs = [block for block in blocks.values() if len(block) > 1]
+    alone = [block[0] for block in blocks.values() if len(block) == 1]
+    if not pairs:
         return None
     notes = [
         *(data.rules for data in distinct_sets(groups)),
         "95 % CI: cluster bootstrap over recordings; p: the sign of each recording's difference "
         "flipped at random; Holm: corrected for all pairs of the same set, traffic and noise",
     ]
-    if min(num_recordings) < FEW_CLUSTERS:
+    rows, smallest = [], 0.0
+    for block in pairs:
+        found, least = _compared(block)
+        rows += found
+        smallest = max(smallest, least)
+    few = min(block[0].data.num_recordings for block in pairs)
+    if few < FEW_CLUSTERS:
         notes.append(
-            f"few recordings ({min(num_recordings)}): intervals are too narrow, and no p can be "
-            f"below {smallest:.4f}"
+            f"few recordings ({few}): intervals are too narrow, and no p can be below "
+            f"{smallest:.4f}"
         )
     if alone:
         words = "not compared, as rollouts are missing or no other planner has the same seeds"
-        notes.append(f"{words}: {', '.join(alone)}")
+        names = (f"{group.planner} {group.noise} {group.traffic}" for group in alone)
+        notes.append(f"{words}: {', '.join(names)}")
     labels = ("set", "traffic", "noise", "first", "second")
     return Table(
         "planner-comparison-noise" if noisy else "planner-comparison",
         f"Planners compared scenario by scenario{', under noise' if noisy else ', clean'}: "
         "difference of closed-loop scores x 100, first minus second",
         (*labels, "difference", "95 % CI", "better/same/worse", "p", "p (Holm)"),
-        tuple(rows),
+        rows,
         len(labels),
-        tuple(notes),
+        notes,
     )
 
 
-def scenario_types(groups: Sequence[Group], *, allow_partial: bool = False) -> list[Table]:
+def _compared(block: Sequence[Group]) -> tuple[list[Row], float]:
+    """A row per pair of groups, and the smallest p-value that their recordings allow."""
+    clusters = cluster_codes(block[0].data.recordings)
+    pairs = [*combinations(block, 2)]
+    results = [
+        compare(100.0 * a.scenario_means(), 100.0 * b.scenario_means(), clusters) for a, b in pairs
+    ]
+    corrected = holm([result.p_value for result in results])
+    rows: list[Row] = [
+        (
+            *(first.data.label, first.traffic, first.noise, first.planner, second.planner),
+            Number(result.difference),
+            result.interval,
+            f"{result.wins}/{result.ties}/{result.losses}",
+            Number(result.p_value, 4),
+            Number(p_value, 4),
+        )
+        for (first, second), result, p_value in zip(pairs, results, corrected, strict=True)
+    ]
+    return rows, max(result.smallest_p for result in results)
+
+
+def scenario_types(groups: Sequence[Group]) -> list[Table]:
     """Clean scores by scenario type, planners side by side; sets of one type are left out."""
-    clean = [group for group in groups if group.noise == "none"]
     out = []
-    for data in distinct_sets(clean):
-        types = sorted(set(data.types))
-        if len(types) < 2:
-            continue
-        mine = [group for group in clean if group.data.key == data.key]
-        columns = [g for traffic in traffics(mine) for g in mine if g.traffic == traffic]
-        rows: list[tuple[Cell, ...]] = []
-        for name in types:
-            where = np.array(data.types) == name
-            scores = (g.estimate("cls", where, allow_partial=allow_partial) for g in columns)
-            rows.append((name or "unknown", Number(int(where.sum()), 0), *scores))
-        header = ("type", "scenarios", *(f"{g.planner} {g.traffic}" for g in columns))
+    for data, mine in by_set(group for group in groups if group.noise == "none"):
+        parts = [dict(group.split("scenario_type")) for group in mine]
+        rows: list[Row] = [
+            (name, Number(len(part.data.tokens), 0), *(each[name].estimate() for each in parts))
+            for name, part in parts[0].items()
+        ]
+        header = ("type", "scenarios", *(f"{g.planner} {g.traffic}" for g in mine))
         title = f"Scores by scenario type: {data.label}, clean, closed-loop score x 100"
-        name = f"scenario-types_{data.name}"
-        out.append(Table(name, title, header, tuple(rows), 1, (data.rules,)))
+        if len(rows) > 1:
+            out.append(Table(f"scenario-types_{data.name}", title, header, rows, 1, (data.rules,)))
     return out
 
 
-def edited_scores(groups: Sequence[Group], *, allow_partial: bool = False) -> list[Table]:
-    """Clean scores of edited scenarios by kind and difficulty; one table per set that was edited.
+def edited_scores(groups: Sequence[Group]) -> list[Table]:
+    """Scores of edited scenarios by kind and difficulty; one table per set that was edited.
 
     Beside them stand those of the same recorded scenarios without the edit, each as often as it was
     edited. Scenarios of interPlan's codes have interPlan's score, and no such column.
     """
-    clean = [group for group in groups if group.noise == "none"]
     out = []
-    for data in distinct_sets(group for group in clean if group.data.edits):
-        mine = [group for group in clean if group.data.key == data.key]
-        kinds = [graded(name) for name in data.types]
-        is_graded = any(grade for _, grade in kinds)
-        grades = [*GRADES] if is_graded else []
-        rows: list[tuple[Cell, ...]] = []
-        names = sorted({kind for kind, _ in kinds})
-        for group in (g for mode in traffics(mine) for g in mine if g.traffic == mode):
+    for data, mine in by_set(group for group in groups if group.data.edits):
+        kinds, difficulties = np.array([graded(name) for name in data.types], str).T
+        names = np.unique(kinds).tolist()
+        grades = [*GRADES] if any(difficulties) else []
+        is_noisy = any(group.noise != "none" for group in mine)
+        rows: list[Row] = []
+        for group in mine:
             for name in [*names, ALL_KINDS] if len(names) > 1 else names:
-                of_kind = [name in (kind, ALL_KINDS) for kind, _ in kinds]
-                cells = [recorded_score(group, np.array(of_kind), clean)]
-                for grade in [*grades, ""]:
-                    pairs = zip(of_kind, kinds, strict=True)
-                    where = np.array([own and g in (grade or g,) for own, (_, g) in pairs])
-                    cells.append(group.estimate("cls", where, allow_partial=allow_partial))
-                count = Number(sum(of_kind), 0)
-                labels = (group.traffic, group.planner, name or "unknown", count)
-                rows.append((*labels, *cells[data.is_interplan :]))
-        last = "interPlan score" if data.is_interplan else "all"
-        header = ["traffic", "planner", "kind", "scenarios", "recorded", *grades, last]
+                part = group.only((kinds == name) | (name == ALL_KINDS))
+                grade = difficulties[(kinds == name) | (name == ALL_KINDS)]
+                noise = (group.noise,) if is_noisy else ()
+                count = Number(len(part.data.tokens), 0)
+                recorded = () if data.is_interplan else (recorded_score(part, groups),)
+                scores = (part.only(grade == one).estimate() for one in grades)
+                labels = (group.traffic, group.planner, *noise, name or "unknown", count)
+                rows.append((*labels, *recorded, *scores, part.estimate()))
+        header = [*("traffic", "planner"), *(["noise"] if is_noisy else []), "kind", "scenarios"]
+        num_labels = len(header) - 1
         notes = [data.rules]
         if data.is_interplan:
-            header.remove("recorded")
+            header += [*grades, "interPlan score"]
             notes.append("interPlan score: its metrics and weights, mean over the scenarios")
         else:
+            header += ["recorded", *grades, "all"]
             notes.append("recorded: the same scenarios without the edit")
-        if is_graded:
+        if grades:
             each = ", ".join(f"{name} {most:g}" for name, most in GRADES.items())
             notes.append(
                 f"difficulty: braking that avoids it [m/s²], up to {each}; hard also where only "
                 "PDM-Closed avoids it"
             )
         title = f"Edited scenarios: {data.label}, closed-loop score x 100"
-        name = f"edits_{data.name}"
-        out.append(Table(name, title, tuple(header), tuple(rows), 3, tuple(notes)))
+        out.append(Table(f"edits_{data.name}", title, tuple(header), rows, num_labels, notes))
     return out
 
 
-def recorded_score(group: Group, where: BoolArray, others: Sequence[Group]) -> Estimate | None:
-    """The score of recorded scenarios that some (N,) scenarios of a group were made of.
+def recorded_score(group: Group, others: Sequence[Group]) -> Number | None:
+    """The score of the recorded scenarios that those of a group were made of.
 
     None where no other group has all of them under the same rules.
     """
     edited = group.run.manifest["edits"]["made"]
-    chosen = np.flatnonzero(where).tolist()
-    bases = [str(edited[group.data.tokens[i]]["base"]) for i in chosen]
-    wanted = _driven_as(group)
+    bases = [str(edited[token]["base"]) for token in group.data.tokens]
     for other in others:
         place = {token: i for i, token in enumerate(other.data.tokens)}
-        if not other.data.edits and _driven_as(other) == wanted and set(bases) <= set(place):
-            values = other.column()[[place[token] for token in bases]]
-            if len(values) and np.isfinite(values).all():
-                return Estimate(100.0 * float(values.mean()), None, len(values), len(values))
+        is_alike = not other.data.edits and _driven_as(other) == _driven_as(group)
+        if bases and is_alike and set(bases) <= set(place):
+            values = other.scenario_means()[[place[token] for token in bases]]
+            if np.isfinite(values).all():
+                return Number(100.0 * float(values.mean()))
     return None
 
 
-def _driven_as(group: Group) -> tuple[str, ...]:
+def _driven_as(group: Group) -> tuple[object, ...]:
     data = group.data
-    return (group.traffic, group.planner, group.noise, data.windows, *data.traits[:3])
+    labels = (group.traffic, group.planner, group.noise, group.seeds)
+    return (*labels, data.windows, *data.traits[:3])
 
 
 def planning_times(groups: Sequence[Group]) -> Table:
@@ -177,10 +176,10 @@ def planning_times(groups: Sequence[Group]) -> Table:
         *dict.fromkeys(f"machine: {_machine(run)}" for run in runs.values()),
     )
     title = "Planning time, and steps driven on a degraded (fallback) plan"
-    return Table("planning-time", title, header, tuple(map(_times_row, each.values())), 3, notes)
+    return Table("planning-time", title, header, [*map(_times_row, each.values())], 3, notes)
 
 
-def _times_row(group: Group) -> tuple[Cell, ...]:
+def _times_row(group: Group) -> Row:
     planner = group.planner.removesuffix(f" @{group.run.path.name}")  # as its run calls it
     tasks, scores = group.run.tasks, group.run.scores
     finished = pc.equal(tasks["status"], "ok")

@@ -1,12 +1,12 @@
-"""Pictures of a report: robustness curves, scores per city and per metric.
+"""Pictures of a report: robustness curves, scores per city, per metric, per difficulty of edits.
 
 Planners and noise are drawn as everywhere (`palette`): clean scores are full marks and solid lines,
 those under noise hollow marks on dashed lines. Nothing is drawn of groups whose score is withheld.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from textwrap import wrap
@@ -18,11 +18,10 @@ import numpy as np
 from shiftsim.edits.sampling import GRADES, graded
 from shiftsim.kernels import BoolArray
 from shiftsim.report.details import recorded_score
-from shiftsim.report.groups import COLUMNS, DataSet, Group, distinct_sets
+from shiftsim.report.groups import COLUMNS, DataSet, Group, by_set
 from shiftsim.report.palette import Style, dashes, new_figure, planner_styles, save_picture
-from shiftsim.report.paper import traffics
 from shiftsim.report.statistics import score_interval
-from shiftsim.report.tables import Estimate
+from shiftsim.report.tables import Interval, Number
 from shiftsim.report.words import LONG
 
 LEVELS = ("none", "low", "mid", "high")
@@ -32,7 +31,7 @@ _SPREAD = 0.62  # how much of a place on the axis the planners share
 _GREY = "0.45"
 _NOTE = 6.5  # points
 _NONE: Mapping[str, str] = MappingProxyType({})
-_BARS = "clean rollouts; bars: 95 % bootstrap interval over recordings"
+_BARS = "bars: 95 % bootstrap interval over recordings"
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,11 +53,10 @@ class _Place(NamedTuple):
     """A place on the axis: its heading, and the score that is drawn there."""
 
     heading: str
-    column: str = "cls"
-    where: BoolArray | None = None
+    score: Callable[[Group], tuple[Number | None, Interval | None]]  # with its interval
 
 
-def figures(groups: Sequence[Group], *, allow_partial: bool = False) -> list[Figure]:
+def figures(groups: Sequence[Group]) -> list[Figure]:
     """All pictures that the groups allow.
 
     Raises:
@@ -66,84 +64,95 @@ def figures(groups: Sequence[Group], *, allow_partial: bool = False) -> list[Fig
     """
     out = []
     styles = planner_styles(dict.fromkeys(group.planner for group in groups))
-    for data in _named_apart(distinct_sets(groups)):
-        mine = [group for group in groups if group.data.key[1:] == data.key[1:]]
-        shown = [g for g in mine if _estimate(g, allow_partial) is not None]
+    names: list[str] = []
+    for data, mine in by_set(groups):
+        # sets of one name are numbered, as it becomes that of a file
+        name = f"{data.name}-{len(names) + 1}" if data.name in names else data.name
+        names.append(data.name)
+        shown = [group for group in mine if group.estimate().value is not None]
         clean = [group for group in shown if group.noise == "none"]
-        out += _robustness(data, shown, styles, allow_partial)
+        if any(group.noise.partition("-")[0] in _KINDS for group in shown):
+            drawn = _robustness(data, shown, styles)
+            out.append(Figure(f"robustness_{name}", f"Noise robustness on {data.label}", drawn))
+        if not clean:
+            continue
+        every = np.ones(len(data.tokens), np.bool_)
         if any(grade for _, grade in map(graded, data.types)):
-            out.append(_difficulty(data, clean, groups, styles, allow_partial))
-        cities = sorted({city for city in data.cities if city})
-        places = [_Place(f"all\n({len(data.tokens)})")]
-        for city in cities:
-            places.append(_Place(f"{city}\n({data.cities.count(city)})", "cls", data.within(city)))
-        if clean and len(cities) > 1:
-            drawn = _dots(clean, places, styles, allow_partial)
-            note = f"{_BARS} (none for a single recording)"
+            drawn = _scores(clean, _difficulties(data, groups), styles, (3.4, 3.1), is_joined=True)
+            _finish(drawn, data, "Edits", f"recorded: the same scenarios without the edit; {_BARS}")
+            title = f"Scores by difficulty of the edits: {data.label}"
+            out.append(Figure(f"edits_{name}", title, drawn))
+        parts = {city: data.within(city) for city in sorted({*data.cities} - {""})}
+        if len(parts) > 1:
+            places = [_place(f"all\n({len(every)})", every)]
+            for city, where in parts.items():
+                places.append(_place(f"{city}\n({data.cities.count(city)})", where))
+            drawn = _scores(clean, {"": places}, styles)
+            note = f"clean rollouts; {_BARS} (none for a single recording)"
             _finish(drawn, data, "Score per city", note)
-            out.append(Figure(f"cities_{data.name}", f"Score per city of {data.label}", drawn))
-        if clean:
-            places = [
-                _Place("\n".join([*wrap(LONG[short], 12), f"({short})"]), name)
-                for name, short in COLUMNS.items()
-            ]
-            drawn = _dots(clean, places, styles, allow_partial)
-            _finish(drawn, data, "Metrics", _BARS)
-            out.append(Figure(f"metrics_{data.name}", f"Metrics on {data.label}", drawn))
+            out.append(Figure(f"cities_{name}", f"Score per city of {data.label}", drawn))
+        places = [
+            _place("\n".join([*wrap(LONG[short], 12), f"({short})"]), every, column)
+            for column, short in COLUMNS.items()
+        ]
+        drawn = _scores(clean, {"": places}, styles, label="score")
+        _finish(drawn, data, "Metrics", f"clean rollouts; {_BARS}")
+        out.append(Figure(f"metrics_{name}", f"Metrics on {data.label}", drawn))
     return out
 
 
-def _named_apart(sets: Sequence[DataSet]) -> list[DataSet]:
-    """The same sets, numbered where several have one name: it becomes that of a file."""
-    names = [data.name for data in sets]
-    return [
-        replace(data, name=f"{data.name}-{i + 1}") if data.name in names[:i] else data
-        for i, data in enumerate(sets)
-    ]
+def _place(heading: str, where: BoolArray, column: str = "cls") -> _Place:
+    """The place of a column over some (N,) scenarios."""
+
+    def score(group: Group) -> tuple[Number, Interval | None]:
+        part = group.only(where)
+        return part.estimate(column), score_interval(part, column)
+
+    return _Place(heading, score)
 
 
-def _estimate(
-    group: Group, allow_partial: bool, name: str = "cls", where: Any = None
-) -> Estimate | None:
-    """A score that may be shown."""
-    found = group.estimate(name, where, allow_partial=allow_partial)
-    return None if found is None or found.mean is None else found
+def _difficulties(data: DataSet, groups: Sequence[Group]) -> dict[str, list[_Place]]:
+    """The places of every kind of edit: the recorded scenarios, and each difficulty."""
+    kinds, grades = np.array([graded(name) for name in data.types], str).T
+
+    def recorded(kind: str) -> _Place:
+        return _Place("recorded", lambda g: (recorded_score(g.only(kinds == kind), groups), None))
+
+    return {
+        kind: [
+            recorded(kind),
+            *(_place(grade, (kinds == kind) & (grades == grade)) for grade in GRADES),
+        ]
+        for kind in np.unique(kinds[grades != ""]).tolist()
+    }
 
 
-def _robustness(
-    data: DataSet, groups: Sequence[Group], styles: dict[str, Style], allow_partial: bool
-) -> list[Figure]:
-    """Scores by strength of the noise, a panel for each of its models; none where all is clean."""
+def _robustness(data: DataSet, groups: Sequence[Group], styles: dict[str, Style]) -> Any:
+    """Scores by strength of the noise, a panel for each of its models."""
     kinds = [kind for kind in _KINDS if any(g.noise.startswith(f"{kind}-") for g in groups)]
-    if not kinds:
-        return []
-    figure, panels = _panels(traffics(groups), kinds, (4.1, 3.3))
+    figure, panels = _panels(_traffics(groups), kinds, (4.1, 3.3))
     planners = list(dict.fromkeys(group.planner for group in groups))
     for axes, traffic, kind in panels:
         names = ["none", *(f"{kind}-{level}" for level in LEVELS[1:])]
         for place, planner in enumerate(planners):
-            found = {
-                group.noise: _estimate(group, allow_partial)
-                for group in groups
-                if (group.traffic, group.planner) == (traffic, planner)
-            }
-            cells = {i: cell for i, name in enumerate(names) if (cell := found.get(name))}
+            labels = (traffic, planner)
+            mine = {g.noise: g for g in groups if (g.traffic, g.planner) == labels}
+            cells = {i: mine[name].estimate() for i, name in enumerate(names) if name in mine}
             if cells:
-                is_partial = any(cell and cell.label for cell in found.values())
-                label = f"{planner} (partial)" if is_partial else planner
                 # shifted a little, so that error bars do not cover those of others
-                _curve(axes, label, cells, 0.02 * (place - len(planners) / 2), styles[planner])
+                shift = 0.02 * (place - len(planners) / 2)
+                _curve(axes, _label(planner, mine.values()), cells, shift, styles[planner])
         axes.set_xticks(range(len(LEVELS)), LEVELS)
         axes.set_xlabel("strength of the noise", fontsize=8)
         _finish_axes(axes, f"{_KINDS[kind]}, {_TRAFFIC.get(traffic, traffic)}")
     note = "error bars: standard deviation over seeds; thin line: the clean score"
     _finish(figure, data, "Noise robustness", note, {"clean": "none", "under noise": "some"})
-    return [Figure(f"robustness_{data.name}", f"Noise robustness on {data.label}", figure)]
+    return figure
 
 
-def _curve(axes: Any, label: str, cells: dict[int, Estimate], shift: float, style: Style) -> None:
+def _curve(axes: Any, label: str, cells: dict[int, Number], shift: float, style: Style) -> None:
     """One planner's scores by level."""
-    means = [cell.mean for cell in cells.values()]
+    means = [cell.value for cell in cells.values()]
     look = {**style.marks("some"), "linestyle": dashes("some"), "linewidth": 1.3, "capsize": 2}
     bars = [cell.std or 0.0 for cell in cells.values()]
     axes.errorbar([place + shift for place in cells], means, yerr=bars, **look)
@@ -153,74 +162,58 @@ def _curve(axes: Any, label: str, cells: dict[int, Estimate], shift: float, styl
     axes.plot([shift], [clean], label=label, linestyle="none", zorder=4, **style.marks("none"))
 
 
-def _difficulty(
-    data: DataSet,
-    clean: Sequence[Group],
+def _scores(
     groups: Sequence[Group],
+    columns: Mapping[str, Sequence[_Place]],
     styles: dict[str, Style],
-    allow_partial: bool,
-) -> Figure:
-    """Scores by difficulty, a panel for each kind of edit."""
-    found = [graded(name) for name in data.types]
-    kinds = sorted({kind for kind, grade in found if grade})
-    figure, panels = _panels(traffics(clean), kinds, (3.4, 3.1))
-    planners = list(dict.fromkeys(group.planner for group in clean))
-    for axes, traffic, kind in panels:
-        parts = [np.array([pair == (kind, grade) for pair in found]) for grade in GRADES]
-        for group in (group for group in clean if group.traffic == traffic):
-            shift = 0.06 * (planners.index(group.planner) - (len(planners) - 1) / 2)
-            cells = [recorded_score(group, np.array([k == kind for k, _ in found]), groups)]
-            cells += [_estimate(group, allow_partial, "cls", where) for where in parts]
-            points = {i + shift: cell.mean for i, cell in enumerate(cells) if cell is not None}
-            style = styles[group.planner]
-            look = {**style.marks("none"), "linestyle": dashes("none"), "linewidth": 1.3}
-            axes.plot([*points], [*points.values()], label=_label(group), **look)
-            for x, where in enumerate(parts, 1):
-                if interval := score_interval(group, "cls", where):
-                    axes.vlines(x + shift, interval.low, interval.high, color=style.colour)
-        axes.set_xticks(range(1 + len(GRADES)), ["recorded", *GRADES])
-        axes.set_xlim(-0.35, len(GRADES) + 0.35)
-        axes.set_xlabel("difficulty of the edit", fontsize=8)
-        _finish_axes(axes, f"{kind}, {_TRAFFIC.get(traffic, traffic)}")
-    note = (
-        "recorded: the same scenarios without the edit; bars: 95 % bootstrap interval over "
-        "recordings"
-    )
-    _finish(figure, data, "Edits", note)
-    return Figure(f"edits_{data.name}", f"Scores by difficulty of the edits: {data.label}", figure)
-
-
-def _dots(
-    groups: Sequence[Group], places: Sequence[_Place], styles: dict[str, Style], allow_partial: bool
+    size: tuple[float, float] | None = None,
+    *,
+    is_joined: bool = False,
+    label: str = "closed-loop score",
 ) -> Any:
-    """Planners side by side at every place, one panel per traffic mode."""
+    """Planners side by side at every place, a row of panels per traffic mode.
+
+    `columns` are the panels of a row by title, `size` that of one; `is_joined` draws lines.
+    """
     planners = list(dict.fromkeys(group.planner for group in groups))
-    figure, panels = _panels(traffics(groups), [""], (max(5.5, 1.05 * len(places)), 2.9))
-    for axes, traffic, _ in panels:
+    spread = 0.06 * len(planners) if is_joined else _SPREAD
+    size = size or (max(5.5, 1.05 * max(map(len, columns.values()))), 2.9)
+    figure, panels = _panels(_traffics(groups), [*columns], size)
+    for axes, traffic, title in panels:
+        places = columns[title]
         for group in (group for group in groups if group.traffic == traffic):
-            style = {**styles[group.planner].marks("none"), "linestyle": "none"}
-            shift = _SPREAD * ((planners.index(group.planner) + 0.5) / len(planners) - 0.5)
-            for x, place in enumerate(places):
-                estimate = _estimate(group, allow_partial, place.column, place.where)
-                interval = score_interval(group, place.column, place.where)
-                if estimate is not None and interval is not None:
-                    low, high = interval.low, interval.high
-                    axes.vlines(x + shift, low, high, color=style["color"], linewidth=1.3)
-                if estimate is not None:
-                    label = None if x else _label(group)
-                    axes.plot([x + shift], [estimate.mean], label=label, **style)
-        for x in range(1, len(places)):
+            style, means = styles[group.planner], {}
+            shift = spread * ((planners.index(group.planner) + 0.5) / len(planners) - 0.5)
+            for x, (found, interval) in enumerate(place.score(group) for place in places):
+                if interval is not None:
+                    bar = (interval.low, interval.high)
+                    axes.vlines(x + shift, *bar, color=style.colour, linewidth=1.3)
+                if found is not None and found.value is not None:
+                    means[x + shift] = found.value
+            line: dict[str, Any] = {
+                "linestyle": dashes("none") if is_joined else "none",
+                "linewidth": 1.3,
+            }
+            line["label"] = _label(group.planner, [group])
+            axes.plot([*means], [*means.values()], **style.marks("none"), **line)
+        for x in () if is_joined else range(1, len(places)):
             axes.axvline(x - 0.5, color="0.9", linewidth=0.7, zorder=0)
         axes.set_xticks(range(len(places)), [place.heading for place in places])
-        axes.set_xlim(-0.5, len(places) - 0.5)
-        several = len({place.column for place in places}) > 1
-        scores = "score" if several else "closed-loop score"
-        _finish_axes(axes, _TRAFFIC.get(traffic, traffic), scores)
+        margin = 0.35 if is_joined else 0.5
+        axes.set_xlim(-margin, len(places) - 1 + margin)
+        if is_joined:
+            axes.set_xlabel("difficulty of the edit", fontsize=8)
+        words = (title, _TRAFFIC.get(traffic, traffic))
+        _finish_axes(axes, ", ".join(filter(None, words)), label)
     return figure
 
 
-def _label(group: Group) -> str:
-    return f"{group.planner}{'' if group.is_complete else ' (partial)'}"
+def _traffics(groups: Sequence[Group]) -> list[str]:
+    return list(dict.fromkeys(group.traffic for group in groups))
+
+
+def _label(planner: str, groups: Iterable[Group]) -> str:
+    return planner if all(group.is_complete for group in groups) else f"{planner} (partial)"
 
 
 def _panels(
@@ -233,10 +226,10 @@ def _panels(
     return figure, [(one, *name) for one, name in zip(axes.flat, names, strict=True)]
 
 
-def _finish_axes(axes: Any, title: str, scores: str = "closed-loop score") -> None:
+def _finish_axes(axes: Any, title: str, label: str = "closed-loop score") -> None:
     axes.set_title(title, fontsize=9)
     axes.set_ylim(-3.0, 103.0)
-    axes.set_ylabel(f"{scores} × 100", fontsize=9)
+    axes.set_ylabel(f"{label} × 100", fontsize=9)
     axes.label_outer()
     axes.grid(axis="y", color="0.9", linewidth=0.7)
     axes.set_axisbelow(True)

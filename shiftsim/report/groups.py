@@ -7,7 +7,7 @@ table is decided by their `DataSet`: the same scenarios under the same threshold
 import hashlib
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import compress
+from itertools import chain, compress, product
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +15,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from shiftsim.errors import DataError
+from shiftsim.errors import DataError, one_of
 from shiftsim.kernels import BoolArray, FloatArray
 from shiftsim.metrics import SHORT_NAMES
-from shiftsim.report.tables import Estimate
+from shiftsim.report.tables import Number
 from shiftsim.runs.results import Run
 from shiftsim.sim.noise import NOISE_NAMES
 from shiftsim.world.scenario import FULL_DURATION
 
+GROUPINGS = ("scenario_type", "city", "seed")
+_OF_SCENARIOS = ("tokens", "cities", "recordings", "types", "durations")
 COLUMNS = {"cls": "CLS"} | {n: short for n, short in SHORT_NAMES.items() if n != "score"}
 TRAFFIC = {"nonreactive": "NR", "reactive": "R"}
 
@@ -60,7 +62,7 @@ class DataSet:
     @property
     def key(self) -> tuple[str, ...]:
         """Equal for sets whose scores may be compared."""
-        return (self.name, token_digest(self.tokens), *self.traits)
+        return (self.name, self.edits, token_digest(self.tokens), *self.traits)
 
     @property
     def traits(self) -> tuple[str, ...]:
@@ -79,10 +81,14 @@ class DataSet:
         )
 
     @property
+    def classes(self) -> list[str]:
+        """The known classes of duration, short ones first."""
+        return sorted(set(self.durations) - {""}, key=lambda name: (len(name), name))
+
+    @property
     def windows(self) -> str:
         """How long the scenarios are, in words; empty where it is not known."""
-        classes = sorted(set(self.durations) - {""}, key=lambda name: (len(name), name))
-        return f" · windows of {', '.join(classes)}" if classes else ""
+        return f" · windows of {', '.join(self.classes)}" if self.classes else ""
 
     @property
     def is_interplan(self) -> bool:
@@ -96,31 +102,19 @@ class DataSet:
 
     def within(self, city: str) -> BoolArray:
         """(N,) scenarios of a city, and those that could be because nothing is known of them."""
-        return np.array([name in (city, "") for name in self.cities], np.bool_)
+        return np.isin(self.cities, (city, ""))
 
-    def parts(self) -> list[tuple["DataSet", BoolArray]]:
-        """The scenarios of each class of duration, as a set of its own, and (N,) which they are.
-
-        Scores of short scenarios are others (`docs/open_data.md`). One of unknown duration belongs
-        to each part, so that no part of an incomplete set looks complete.
-        """
-        classes = sorted(set(self.durations) - {""}, key=lambda name: (len(name), name))
-        if not set(classes) - {FULL_DURATION}:
-            return [(self, np.ones(len(self.tokens), np.bool_))]
-        return [self._part(name) for name in classes]
-
-    def _part(self, duration: str) -> tuple["DataSet", BoolArray]:
-        chosen = np.array([name in (duration, "") for name in self.durations], np.bool_)
-        columns = ("tokens", "cities", "recordings", "types", "durations")
-        columns_of_part: dict[str, Any] = {
-            name: tuple(compress(getattr(self, name), chosen.tolist())) for name in columns
+    def only(self, where: BoolArray) -> "DataSet":
+        """Some (N,) of the scenarios."""
+        columns: dict[str, Any] = {
+            name: tuple(compress(getattr(self, name), where.tolist())) for name in _OF_SCENARIOS
         }
-        return replace(self, label=f"{self.label}, {duration}", **columns_of_part), chosen
+        return replace(self, **columns)
 
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """All rollouts of one planner under one noise in one run."""
+    """All rollouts of one planner under one noise in one run, or those of some scenarios."""
 
     run: Run  # the run
     data: DataSet  # its scenarios
@@ -130,30 +124,54 @@ class Group:
     seeds: tuple[int, ...]  # the seeds
     # (S, N, C) seeds, scenarios, `COLUMNS`, in [0, 1]; NaN where nothing finished
     values: FloatArray
+    allow_partial: bool = False  # whether estimates are labelled means of what finished
 
     @property
     def is_complete(self) -> bool:
         """Whether every rollout finished."""
         return bool(np.isfinite(self.values[:, :, 0]).all())
 
-    def column(self, name: str = "cls") -> FloatArray:
-        """(N,) mean over the seeds of one column, for complete groups."""
-        return self.values[:, :, list(COLUMNS).index(name)].mean(axis=0)
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What identifies the planner, where that is more than a name."""
+        return planner_identities(self.run).get(self.planner.partition(" @")[0], {})
 
-    def estimate(
-        self, name: str = "cls", where: BoolArray | None = None, *, allow_partial: bool = False
-    ) -> Estimate | None:
-        """The score of one column over some scenarios; None where there are none."""
-        values = self.values[:, :, list(COLUMNS).index(name)]
-        chosen = values if where is None else values[:, where]
-        if not chosen.size:
-            return None
-        done, expected = int(np.isfinite(chosen).sum()), chosen.size
-        if not done or (done < expected and not allow_partial):
-            return Estimate(None, None, done, expected)
-        seeds = [row[np.isfinite(row)] for row in chosen]
-        means = 100.0 * np.array([row.mean() for row in seeds if len(row)])
-        return Estimate(float(means.mean()), seed_deviation(means), done, expected)
+    def only(self, where: BoolArray) -> "Group":
+        """The rollouts of some (N,) of the scenarios."""
+        return replace(self, data=self.data.only(where), values=self.values[:, where])
+
+    def split(self, by: str | None) -> list[tuple[str, "Group"]]:
+        """The rollouts by one of `GROUPINGS`, with the name of each part; None does not split."""
+        if by is None:
+            return [("", self)]
+        one_of("column", by, GROUPINGS)
+        if by == "seed":
+            each = enumerate(self.seeds)
+            return [(str(n), replace(self, seeds=(n,), values=self.values[[i]])) for i, n in each]
+        names = np.array(self.data.types if by == "scenario_type" else self.data.cities)
+        return [(name or "unknown", self.only(names == name)) for name in np.unique(names).tolist()]
+
+    def column(self, name: str = "cls") -> FloatArray:
+        """(S, N) values of one column by seed and scenario."""
+        return self.values[:, :, list(COLUMNS).index(name)]
+
+    def scenario_means(self, name: str = "cls") -> FloatArray:
+        """(N,) mean over the seeds of one column; NaN where a seed is missing."""
+        return self.column(name).mean(axis=0)
+
+    def seed_means(self, name: str = "cls") -> FloatArray:
+        """Mean of one column over what finished of each seed, in [0, 1]; seeds of nothing lack."""
+        seeds = (row[np.isfinite(row)] for row in self.column(name))
+        return np.array([row.mean() for row in seeds if len(row)])
+
+    def estimate(self, name: str = "cls") -> Number:
+        """The score of one column, times 100; empty where there are no scenarios."""
+        finished = np.isfinite(self.column(name))
+        done, expected = int(finished.sum()), finished.size
+        if not done or (done < expected and not self.allow_partial):
+            return Number(None, done=done, expected=expected)
+        means = 100.0 * self.seed_means(name)
+        return Number(float(means.mean()), 2, seed_deviation(means), done, expected)
 
 
 def seed_deviation(values: FloatArray) -> float | None:
@@ -167,44 +185,31 @@ def planner_identities(run: Run) -> dict[str, dict[str, Any]]:
     return {name: identity for name, identity in planners if isinstance(identity, dict)}
 
 
-def synthetic_weights_note(runs: Iterable[Run]) -> str:
-    """Which planners drove with deterministic weights, so that no score of theirs is believed."""
-    names = {
-        name
-        for run in runs
-        for name, identity in planner_identities(run).items()
-        if str(identity.get("checkpoint", "")).startswith("deterministic:")
-    }
-    return f"MEANINGLESS: made-up weights of {', '.join(sorted(names))}" if names else ""
-
-
-def weights_note(runs: Iterable[Run]) -> str:
-    """Which planners drove with weights of our own, in place of their authors'."""
+def planner_notes(runs: Iterable[Run]) -> list[str]:
+    """What a reader must know of planners: whose weights they had, and who saw the recording."""
+    made_up, own, informed = set[str](), set[str](), set[str]()
+    for name, identity in (pair for run in runs for pair in planner_identities(run).items()):
+        if str(identity.get("checkpoint", "")).startswith("deterministic:"):
+            made_up.add(name)
+        if identity.get("weights"):
+            own.add(f"{name}, {identity['weights']}")
+        if identity.get("sees_recording"):
+            informed.add(name)
     notes = {
-        f"{name}, {identity['weights']}"
-        for run in runs
-        for name, identity in planner_identities(run).items()
-        if identity.get("weights")
+        f"MEANINGLESS: made-up weights of {', '.join(sorted(made_up))}": made_up,
+        "; ".join(sorted(own)): own,
+        f"given the recorded future: {', '.join(sorted(informed))}": informed,
     }
-    return "; ".join(sorted(notes))
+    return [note for note, names in notes.items() if names]
 
 
 def has_default_weights(group: Group) -> bool:
     """Whether a planner drove with weights of our own that nobody asked for by `--checkpoint`."""
-    name = group.planner.partition(" @")[0]
-    if not planner_identities(group.run).get(name, {}).get("weights"):
-        return False
-    config = group.run.manifest["config"]
+    name, config = group.planner.partition(" @")[0], group.run.manifest["config"]
     given = [text.partition("=") for text in config.get("checkpoints", ())]
     named = any(not equals or owner == name for owner, equals, _ in given)
-    return not named and "checkpoint" not in config.get("planner_args", {}).get(name, {})
-
-
-def recording_note(run: Run) -> str:
-    """Which planners of a run were given the recording, the future included."""
-    identities = planner_identities(run).items()
-    names = sorted(name for name, identity in identities if identity.get("sees_recording"))
-    return f"given the recorded future: {', '.join(names)}" if names else ""
+    named = named or "checkpoint" in config.get("planner_args", {}).get(name, {})
+    return bool(group.identity.get("weights")) and not named
 
 
 def token_digest(tokens: Iterable[str]) -> str:
@@ -212,15 +217,30 @@ def token_digest(tokens: Iterable[str]) -> str:
     return hashlib.sha256("\n".join(sorted(tokens)).encode()).hexdigest()
 
 
+def by_set(groups: Iterable[Group]) -> list[tuple[DataSet, list[Group]]]:
+    """The data sets of groups, each once, with its groups; traffic is NR, R, then others."""
+    found: dict[tuple[str, ...], list[Group]] = {}
+    for group in groups:
+        found.setdefault(group.data.key, []).append(group)
+    return [(mine[0].data, sorted(mine, key=_traffic_rank)) for mine in found.values()]
+
+
 def distinct_sets(groups: Iterable[Group]) -> list[DataSet]:
     """The data sets of groups, each once."""
-    return list({group.data.key: group.data for group in groups}.values())
+    return [data for data, _ in by_set(groups)]
 
 
-def read_groups(runs: Sequence[Run], known: Sequence[KnownSet] = ()) -> list[Group]:
+def _traffic_rank(group: Group) -> tuple[bool, str]:
+    return (group.traffic not in TRAFFIC.values(), group.traffic)
+
+
+def read_groups(
+    runs: Sequence[Run], known: Sequence[KnownSet] = (), *, allow_partial: bool = False
+) -> list[Group]:
     """The groups of runs, in the order of runs, planners and noises.
 
-    Sets of scenarios are recognised by the published lists that are known.
+    Sets of scenarios are recognised by the published lists that are known. `allow_partial` gives
+    labelled means of groups that are not complete.
 
     Raises:
         DataError: Runs contradict each other, or hold no tasks.
@@ -229,7 +249,7 @@ def read_groups(runs: Sequence[Run], known: Sequence[KnownSet] = ()) -> list[Gro
     seen: dict[tuple[object, ...], Group] = {}
     for group in (group for run in runs for group in _groups(run, known, labels[run.path])):
         key = (group.data.key, group.traffic, group.planner, group.noise)
-        other = seen.setdefault(key, group)
+        other = seen.setdefault(key, replace(group, allow_partial=allow_partial))
         alike = np.array_equal(group.values, other.values, equal_nan=True)
         if group.seeds != other.seeds or not alike:
             raise DataError(
@@ -276,24 +296,25 @@ def _groups(run: Run, known: Sequence[KnownSet], labels: dict[str, str]) -> Iter
     if not len(tasks):
         raise DataError(f"run {run.path.name!r} holds no tasks", hint="make the run again")
     data = _data_set(run, known)
+    parts = _by_duration(data)
     traffic = str(run.manifest["determining"]["traffic"])
     # nuPlan rule 570: a metric without a score counts as 0
     table = np.stack([pc.fill_null(scores[name], 0.0).to_numpy() for name in COLUMNS], axis=1)
     places = pc.index_in(scores["token"], value_set=pa.array(data.tokens, pa.string())).to_numpy()
-    for planner in _ordered(tasks["planner"], run.manifest["config"]["planners"]):
-        for noise in _ordered(tasks["noise"], NOISE_NAMES):
-            mine = _matching(tasks, planner, noise)
-            if not mine.any():
-                continue
-            seeds = np.unique(tasks["seed"].to_numpy()[mine])
-            values = np.full((len(seeds), len(data.tokens), len(COLUMNS)), np.nan)
-            rows = np.flatnonzero(_matching(scores, planner, noise))
-            row_seeds = np.searchsorted(seeds, scores["seed"].to_numpy()[rows])
-            values[row_seeds, places[rows].astype(np.int64)] = table[rows]
-            mode, name = TRAFFIC.get(traffic, traffic), labels.get(planner, planner)
-            for part, chosen in data.parts():
-                part_values = values[:, chosen]
-                yield Group(run, part, mode, name, noise, tuple(seeds.tolist()), part_values)
+    order = product(
+        _ordered(tasks["planner"], run.manifest["config"]["planners"]),
+        _ordered(tasks["noise"], NOISE_NAMES),
+    )
+    for planner, noise in order:
+        seeds = np.unique(tasks["seed"].to_numpy()[_matching(tasks, planner, noise)])
+        values = np.full((len(seeds), len(data.tokens), len(COLUMNS)), np.nan)
+        rows = np.flatnonzero(_matching(scores, planner, noise))
+        row_seeds = np.searchsorted(seeds, scores["seed"].to_numpy()[rows])
+        values[row_seeds, places[rows].astype(np.int64)] = table[rows]
+        mode, name = TRAFFIC.get(traffic, traffic), labels.get(planner, planner)
+        whole = Group(run, data, mode, name, noise, tuple(seeds.tolist()), values)
+        for part, chosen in parts if len(seeds) else ():
+            yield replace(whole.only(chosen), data=part)
 
 
 def _ordered(column: pa.ChunkedArray, names: Collection[str]) -> list[str]:
@@ -307,29 +328,43 @@ def _matching(table: pa.Table, planner: str, noise: str) -> BoolArray:
     return mask.to_numpy().astype(np.bool_)
 
 
+def _by_duration(data: DataSet) -> list[tuple[DataSet, BoolArray]]:
+    """The scenarios of each class of duration, as a set of its own, and (N,) which they are.
+
+    Scores of short scenarios are others (`docs/open_data.md`). One of unknown duration belongs
+    to each part, so that no part of an incomplete set looks complete.
+    """
+    if not set(data.classes) - {FULL_DURATION}:
+        return [(data, np.ones(len(data.tokens), np.bool_))]
+    masks = {name: np.isin(data.durations, (name, "")) for name in data.classes}
+    return [
+        (replace(data.only(mask), label=f"{data.label}, {name}"), mask)
+        for name, mask in masks.items()
+    ]
+
+
 def _data_set(run: Run, known: Sequence[KnownSet]) -> DataSet:
-    tokens = tuple(sorted(pc.unique(run.tasks["token"]).to_pylist()))
     manifest, determining = run.manifest, run.manifest["determining"]
-    split = str(manifest["split"])
-    whole = _published_list(split, tokens, known)
+    split, tokens = str(manifest["split"]), sorted(pc.unique(run.tasks["token"]).to_pylist())
+    listed = _published_list(split, tokens, known)
     suffix = ""
     if manifest.get("shard"):
         suffix = f" (shard {manifest['shard']})"
-    elif whole is not None and len(tokens) != whole.count:
-        suffix = f" ({len(tokens)}/{whole.count})"
-    elif whole is None and manifest["config"].get("limit"):
+    elif listed is not None and len(tokens) != listed.count:
+        suffix = f" ({len(tokens)}/{listed.count})"
+    elif listed is None and manifest["config"].get("limit"):
         suffix = f" (first {len(tokens)})"
-    elif whole is None and split in {one.name for one in known}:
+    elif listed is None and split in {one.name for one in known}:
         suffix = " (not the published list)"
     return DataSet(
-        name=whole.name if whole else split,
-        label=f"{whole.label if whole else split}{suffix}",
-        known=whole.name if whole else "",
-        whole=whole.count if whole else len(tokens),
+        name=listed.name if listed else split,
+        label=f"{listed.label if listed else split}{suffix}",
+        known=listed.name if listed else "",
+        whole=listed.count if listed else len(tokens),
         thresholds=str(determining["thresholds"]["name"]),
         metric_version=str(determining["metric_version"]),
         controller=str(determining["controller"]),
-        tokens=tokens,
+        tokens=tuple(tokens),
         cities=_of_tokens(run.scores, "city", tokens),
         durations=_of_tokens(run.scores, "duration_class", tokens),
         recordings=_of_tokens(run.scores, "log_name", tokens),
@@ -350,12 +385,11 @@ def _published_list(
 ) -> KnownSet | None:
     """The published list that the scenarios are, or are a part of."""
     digest = token_digest(tokens)
-    for one in known:
-        if one.sha256 == digest:
-            return one
-    for one in known:
-        if one.tokens and set(tokens) <= set(one.tokens):
-            return one
-        if not one.tokens and split == one.name and len(tokens) < one.count:
-            return one
-    return None
+    whole = [one for one in known if one.sha256 == digest]
+    partly = (
+        one
+        for one in known
+        if (set(tokens) <= set(one.tokens) if one.tokens else split == one.name)
+        and (one.tokens or len(tokens) < one.count)
+    )
+    return next(chain(whole, partly), None)

@@ -1,13 +1,13 @@
 """The paper's tables from own runs, and its figures: zero-shot generalization, noise robustness."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from operator import methodcaller
 from typing import NamedTuple
 
-from shiftsim.report.groups import COLUMNS, DataSet, Group, distinct_sets
+from shiftsim.report.groups import COLUMNS, DataSet, Group, by_set, distinct_sets
 from shiftsim.report.statistics import FEW_CLUSTERS, score_interval
-from shiftsim.report.tables import Cell, Estimate, Number, Table
+from shiftsim.report.tables import Cell, Number, Row, Table
 from shiftsim.report.words import LONG, NAMES
 from shiftsim.sim.noise import NOISE_NAMES
 
@@ -50,11 +50,6 @@ class Published:
         }
 
 
-def called_alike(name: str, listed: Iterable[str]) -> list[str]:
-    """Planners of a published table that are called like one of ours: one or none."""
-    return [other for other in listed if _letters(other) == _letters(name)]
-
-
 def _letters(text: str) -> str:
     return "".join(c for c in text.casefold() if c.isalnum())
 
@@ -68,28 +63,30 @@ class _Column(NamedTuple):
 
 
 def semantic_shift(
-    groups: Sequence[Group],
-    published: Published | None = None,
-    *,
-    with_published: bool = False,
-    allow_partial: bool = False,
+    groups: Sequence[Group], published: Published | None = None, *, with_published: bool = False
 ) -> list[Table]:
     """Clean scores of all scenarios, per city and per metric: one table per set of scenarios.
 
     The paper's sites give cities their short names and order. `with_published` shows its scores as
-    well, in the same table where the cities are the same; `allow_partial` labelled partial means.
+    well, in the same table where the cities are the same.
     """
-    clean = [group for group in groups if group.noise == "none"]
-    others = [group for group in clean if group.data.known != VAL14]
-    val14 = [group for group in clean if group.data.known == VAL14]
+    sets = by_set(group for group in groups if group.noise == "none")
+    others = [one for one in sets if one[0].known != VAL14]
+    val14 = [one for one in sets if one[0].known == VAL14]
     out = []
-    for data in distinct_sets(others or val14):
-        mine = [group for group in clean if group.data.key == data.key]
-        compared = val14 if data.known != VAL14 else []
-        columns = _columns(data, compared, published, allow_partial)
-        notes = [data.rules, *(one.rules for one in distinct_sets(compared)), INTERVALS]
-        out.append(_semantic_table(data, mine, columns, notes, published, with_published))
-    alike = [one for one in distinct_sets(clean) if published and _is_paper_like(one, published)]
+    for data, mine in others or val14:
+        columns = _columns(data, val14 if others else [], published)
+        compared = [one.rules for one, _ in val14] if others else []
+        notes = [data.rules, *compared, INTERVALS, *_set_notes(data, published)]
+        paper = published if published and _is_paper_like(data, published) else None
+        if with_published and paper:
+            notes.append(f"{PUBLISHED[1:-1]}: {paper.source}")
+        rows = _semantic_rows(mine, columns, paper if with_published else None)
+        header = ("traffic", "planner", *(column.heading for column in columns))
+        title = f"Zero-shot generalization: {data.label}, clean, scores x 100"
+        name = f"semantic-shift_{data.name}"
+        out.append(Table(name, title, header, rows, 2, notes, words=_words(published)))
+    alike = [data for data, _ in sets if published and _is_paper_like(data, published)]
     if published is not None and with_published and not alike:
         out.append(published_semantic(published))
     return out
@@ -101,24 +98,23 @@ def _is_paper_like(data: DataSet, published: Published) -> bool:
 
 
 def _columns(
-    data: DataSet, val14: Sequence[Group], published: Published | None, allow_partial: bool
+    data: DataSet, val14: Sequence[tuple[DataSet, list[Group]]], published: Published | None
 ) -> list[_Column]:
     """Val14 where it was run, too; the set; its cities; the metrics."""
-    estimate = partial(Group.estimate, allow_partial=allow_partial)
 
-    def on_val14(group: Group, data: DataSet) -> Cell:
-        wanted = (data.key, group.traffic, group.planner)
-        same = (g for g in val14 if (g.data.key, g.traffic, g.planner) == wanted)
-        found = next(same, None)
-        return None if found is None else estimate(found)
+    def of_val14(mine: Sequence[Group]) -> Callable[[Group], Cell]:
+        cells = {(g.traffic, g.planner): g.estimate() for g in mine}
+        return lambda group: cells.get((group.traffic, group.planner))
 
-    cities = _cities(data, published).items()
+    def of_city(city: str) -> Callable[[Group], Cell]:
+        return lambda group: group.only(data.within(city)).estimate()
+
     return [
-        *(_Column(one.label, VAL14, partial(on_val14, data=one)) for one in distinct_sets(val14)),
-        _Column(data.label, "all", estimate),
+        *(_Column(one.label, VAL14, of_val14(mine)) for one, mine in val14),
+        _Column(data.label, "all", Group.estimate),
         _Column("95 % CI", "", score_interval),
-        *(_Column(name, name, partial(estimate, where=data.within(city))) for city, name in cities),
-        *(_Column(COLUMNS[n], COLUMNS[n], partial(estimate, name=n)) for n in NAMES),
+        *(_Column(name, name, of_city(city)) for city, name in _cities(data, published).items()),
+        *(_Column(COLUMNS[n], COLUMNS[n], methodcaller("estimate", n)) for n in NAMES),
     ]
 
 
@@ -133,41 +129,24 @@ def _cities(data: DataSet, published: Published | None) -> dict[str, str]:
     return {name: shorts[name] or name for name in names}
 
 
-def _semantic_table(
-    data: DataSet,
-    groups: Sequence[Group],
-    columns: Sequence[_Column],
-    notes: list[str],
-    published: Published | None,
-    with_published: bool,
-) -> Table:
-    paper = published if published and with_published and _is_paper_like(data, published) else None
-    rows: list[tuple[Cell, ...]] = []
-    for traffic in traffics(groups):
+def _semantic_rows(
+    groups: Sequence[Group], columns: Sequence[_Column], paper: Published | None
+) -> list[Row]:
+    """A row per group, below it the paper's of that planner; last the paper's other planners."""
+    rows: list[Row] = []
+    for traffic in dict.fromkeys(group.traffic for group in groups):
         left = paper.scores(traffic) if paper else {}
         for group in (group for group in groups if group.traffic == traffic):
             rows.append((traffic, group.planner, *(column.cell(group) for column in columns)))
-            for name in called_alike(group.planner, left):
+            for name in [name for name in left if _letters(name) == _letters(group.planner)]:
                 rows.append(_published_row(traffic, name, left.pop(name), columns))
         rows += [_published_row(traffic, name, left[name], columns) for name in left]
-    notes += _set_notes(data, published)
-    notes += [f"{PUBLISHED[1:-1]}: {paper.source}"] if paper else []
-    header = ("traffic", "planner", *(column.heading for column in columns))
-    title = f"Zero-shot generalization: {data.label}, clean, scores x 100"
-    name = f"semantic-shift_{data.name}"
-    words = _words(published)
-    return Table(name, title, header, tuple(rows), 2, tuple(notes), words=words)
-
-
-def traffics(groups: Iterable[Group]) -> list[str]:
-    """Traffic modes: NR, R, then others."""
-    found = {group.traffic for group in groups}
-    return sorted(found, key=lambda name: (name not in ("NR", "R"), name))
+    return rows
 
 
 def _published_row(
     traffic: str, planner: str, values: Mapping[str, float], columns: Sequence[_Column]
-) -> tuple[Cell, ...]:
+) -> Row:
     """A row of the paper under the columns of an own table: `all` stands under the own set."""
     names = (column.published for column in columns)
     cells = (Number(values[name]) if name in values else None for name in names)
@@ -191,18 +170,19 @@ def _set_notes(data: DataSet, published: Published | None) -> list[str]:
 
 def published_semantic(published: Published) -> Table:
     """The paper's own table."""
-    metrics = [name for name in LONG if name in published.columns]
-    columns = [*(name for name in published.columns if name not in LONG), *metrics]
-    rows: list[tuple[Cell, ...]] = [
-        (traffic, f"{planner} {PUBLISHED}", *(Number(values[name]) for name in columns))
+    sites = (name for name in published.columns if name not in LONG)
+    names = [*sites, *(name for name in LONG if name in published.columns)]
+    columns = [_Column(_SETS.get(name, name), name, Group.estimate) for name in names]
+    rows = [
+        _published_row(traffic, planner, values, columns)
         for traffic in published.semantic_shift
         for planner, values in published.scores(traffic).items()
     ]
-    header = ("traffic", "planner", *(_SETS.get(name, name) for name in columns))
+    header = ("traffic", "planner", *(column.heading for column in columns))
     notes = (published.source, "Val14 thresholds nuplan, DeepPlan thresholds deepplan")
     title = "Zero-shot generalization as published"
     words = _words(published)
-    return Table("semantic-shift_published", title, header, tuple(rows), 2, notes, words=words)
+    return Table("semantic-shift_published", title, header, rows, 2, notes, words=words)
 
 
 def _words(published: Published | None) -> dict[str, str]:
@@ -211,33 +191,26 @@ def _words(published: Published | None) -> dict[str, str]:
     return LONG | {short: names[0] for short, names in sites.items()}
 
 
-def noise_robustness(
-    groups: Sequence[Group], published: Published | None = None, *, allow_partial: bool = False
-) -> Table | None:
+def noise_robustness(groups: Sequence[Group], published: Published | None = None) -> Table | None:
     """Scores by noise, mean and deviation over the seeds; None where all is clean."""
     found = {group.noise for group in groups}
     if found <= {"none"}:
         return None
     noises = [name for name in NOISE_NAMES if name in found or published is not None]
     noises += sorted(found - set(NOISE_NAMES))
-    rows: list[tuple[Cell, ...]] = []
-    sets = distinct_sets(groups)
-    for data in sets:
-        mine = [group for group in groups if group.data.key == data.key]
-        cells = {
-            (g.traffic, g.planner, g.noise): g.estimate(allow_partial=allow_partial) for g in mine
-        }
-        for traffic in traffics(mine):
-            for planner in dict.fromkeys(g.planner for g in mine if g.traffic == traffic):
-                scores = (cells.get((traffic, planner, noise)) for noise in noises)
-                rows.append((data.label, traffic, planner, *scores))
-    notes = [*(data.rules for data in sets), _seeds_note(groups)]
+    scores: dict[tuple[str, ...], dict[str, Cell]] = {}
+    for data, mine in by_set(groups):
+        for group in mine:
+            row = scores.setdefault((data.label, group.traffic, group.planner), {})
+            row[group.noise] = group.estimate()
+    notes = [*(data.rules for data in distinct_sets(groups)), _seeds_note(groups)]
     if published is not None:
-        rows += _published_robustness(published, noises)
+        scores |= _published_robustness(published)
         notes.append(f"published: {published.source}")
+    rows = [(*labels, *map(row.get, noises)) for labels, row in scores.items()]
     header = ("set", "traffic", "planner", *noises)
     title = "Noise robustness: closed-loop score x 100"
-    return Table("noise-robustness", title, header, tuple(rows), 3, tuple(notes))
+    return Table("noise-robustness", title, header, rows, 3, notes)
 
 
 def _seeds_note(groups: Sequence[Group]) -> str:
@@ -248,15 +221,14 @@ def _seeds_note(groups: Sequence[Group]) -> str:
     return f"± sample standard deviation (n − 1) of the mean over {seeds} seeds; clean has none"
 
 
-def _published_robustness(published: Published, noises: Sequence[str]) -> list[tuple[Cell, ...]]:
-    rows: list[tuple[Cell, ...]] = []
-    for traffic, sets in published.robustness.items():
-        for name, planners in sets.items():
-            for planner, values in planners.items():
-                cells = {
-                    noise: Estimate(cell[0], cell[1] if len(cell) > 1 else None, 1, 1)
-                    for noise, cell in zip(published.noises, values, strict=True)
-                }
-                scores = (cells.get(noise) for noise in noises)
-                rows.append((f"{_SETS[name]} {PUBLISHED}", traffic, planner, *scores))
-    return rows
+def _published_robustness(published: Published) -> dict[tuple[str, ...], dict[str, Cell]]:
+    """The paper's scores by noise, of every set, traffic mode and planner."""
+    return {
+        (f"{_SETS[name]} {PUBLISHED}", traffic, planner): {
+            noise: Number(mean, std=std[0] if std else None)
+            for noise, (mean, *std) in zip(published.noises, values, strict=True)
+        }
+        for traffic, sets in published.robustness.items()
+        for name, planners in sets.items()
+        for planner, values in planners.items()
+    }

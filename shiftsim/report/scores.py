@@ -6,23 +6,14 @@ are printed times 100. Where tasks failed or are missing no score is printed, or
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pyarrow.compute as pc
 
-from shiftsim.errors import one_of
-from shiftsim.kernels import FloatArray
-from shiftsim.report.groups import (
-    COLUMNS,
-    Group,
-    read_groups,
-    recording_note,
-    synthetic_weights_note,
-    weights_note,
-)
-from shiftsim.report.tables import Cell, Number, Table, text
+from shiftsim.report.groups import COLUMNS, Group, planner_notes, read_groups, seed_deviation
+from shiftsim.report.tables import Number, Row, Table, text
 from shiftsim.report.words import (
     Violation,
     rows_by_task,
@@ -35,61 +26,7 @@ from shiftsim.report.words import (
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
 
-GROUPINGS = ("scenario_type", "city", "seed")
 _NO_CAUSE: dict[str, Any] = {"cause": "", "severity": ()}
-
-
-@dataclass(frozen=True, slots=True)
-class ScoreRow:
-    """One line of a score table."""
-
-    labels: tuple[str, ...]  # planner, noise, and what else tells the lines apart
-    num_done: int  # finished tasks
-    num_expected: int  # tasks of a complete run
-    num_scenarios: int  # scenarios of a complete run
-    num_seeds: int  # seeds
-    # mean of each column of `COLUMNS` in [0, 1]; empty when nothing finished
-    means: dict[str, float]
-    # standard deviation over the seeds' means; empty for a single seed
-    deviations: dict[str, float]
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether the means are those of the whole benchmark."""
-        return self.num_done == self.num_expected
-
-
-def score_rows(run: Run, *, by: str | None = None) -> list[ScoreRow]:
-    """One row per planner and noise, in the order of the settings; `by` splits them further."""
-    return [row for group in read_groups([run]) for row in _score_rows(group, by)]
-
-
-def _score_rows(group: Group, by: str | None) -> list[ScoreRow]:
-    labels = (group.planner, group.noise)
-    if by is None:
-        return [_score_row(labels, group.values)]
-    if by == "seed":
-        each = zip(group.seeds, group.values, strict=True)
-        return [_score_row((*labels, str(seed)), values[None]) for seed, values in each]
-    kinds = np.array(group.data.types if by == "scenario_type" else group.data.cities)
-    return [
-        _score_row((*labels, name or "unknown"), group.values[:, kinds == name])
-        for name in sorted(set(kinds.tolist()))
-    ]
-
-
-def _score_row(labels: tuple[str, ...], values: FloatArray) -> ScoreRow:
-    finished = np.isfinite(values[:, :, 0])
-    seeds = zip(values, finished, strict=True)
-    means = np.array([seed[done].mean(axis=0) for seed, done in seeds if any(done)])
-    spread = means.std(axis=0, ddof=1) if len(means) > 1 else None
-    mean = means.mean(axis=0) if len(means) else None
-    counts = (int(finished.sum()), finished.size, values.shape[1], len(values))
-    return ScoreRow(labels, *counts, _by_column(mean), _by_column(spread))
-
-
-def _by_column(values: FloatArray | None) -> dict[str, float]:
-    return {} if values is None else dict(zip(COLUMNS, values.tolist(), strict=True))
 
 
 def score_table(runs: Sequence[Run], *, allow_partial: bool = False) -> str:
@@ -97,67 +34,62 @@ def score_table(runs: Sequence[Run], *, allow_partial: bool = False) -> str:
 
     `allow_partial` prints the mean over the finished tasks of an incomplete row, labelled so.
     """
-    return text(replace(scores(read_groups(runs), allow_partial=allow_partial), title=""))
+    return text(replace(scores(read_groups(runs, allow_partial=allow_partial)), title=""))
 
 
-def scores(groups: Sequence[Group], *, by: str | None = None, allow_partial: bool = False) -> Table:
+def scores(groups: Sequence[Group], *, by: str | None = None) -> Table:
     """All columns of all groups: means, and below them their deviations over the seeds.
 
     For machines every row says by itself what it is.
     """
-    if by is not None:
-        one_of("column", by, GROUPINGS)
     several = len({(group.data.key, group.traffic) for group in groups}) > 1
     heading = [*(["set", "traffic"] if several else []), "planner", "noise", *([by] if by else [])]
-    rows: list[tuple[Cell, ...]] = []
-    full: list[tuple[Cell, ...]] = []
-    captions = [_describe(group) for group in groups]
-    for group, caption in zip(groups, captions, strict=True):
+    rows: list[Row] = []
+    full: list[Row] = []
+    for group in groups:
         where = (group.data.label, group.traffic) if several else ()
-        for row in _score_rows(group, by):
-            lines = _lines((*where, *row.labels), row, caption, allow_partial=allow_partial)
-            rows += lines[0]
-            full += lines[1]
-    header, count = (*heading, *COLUMNS.values()), len(heading)
-    header_in_full = (*header, "statistic", "done", "expected", "label")
-    machine = Table("scores", "", header_in_full, tuple(full), count)
-    title, notes = "All planners and noises, scores x 100", tuple(dict.fromkeys(captions))
-    return Table("scores", title, header, tuple(rows), count, notes, machine)
+        for name, part in group.split(by):
+            labels = (*where, group.planner, group.noise, *([name] if by else []))
+            shown, complete = _lines(labels, part, _describe(group))
+            rows += shown
+            full += complete
+    header = (*heading, *COLUMNS.values())
+    in_full = (*header, "statistic", "done", "expected", "label")
+    machine = Table("scores", "", in_full, full, len(heading))
+    title, notes = "All planners and noises, scores x 100", dict.fromkeys(map(_describe, groups))
+    return Table("scores", title, header, rows, len(heading), tuple(notes), machine)
 
 
 def _describe(group: Group) -> str:
     """What stands beside every printed score."""
     data = group.data
-    run = group.run
-    notes = filter(None, (synthetic_weights_note([run]), weights_note([run]), recording_note(run)))
-    return (
-        f"split {data.label} ({len(data.tokens)} scenarios) · "
-        f"traffic {run.manifest['determining']['traffic']} · controller {data.controller} · "
-        f"thresholds {data.thresholds} · metrics v{data.metric_version} · scores x 100"
-        f"{''.join(f' · {note}' for note in notes)}"
+    return " · ".join(
+        [
+            f"split {data.label} ({len(data.tokens)} scenarios)",
+            f"traffic {group.run.manifest['determining']['traffic']}",
+            f"controller {data.controller}",
+            f"thresholds {data.thresholds}",
+            f"metrics v{data.metric_version}",
+            "scores x 100",
+            *planner_notes([group.run]),
+        ]
     )
 
 
-def _lines(
-    labels: tuple[str, ...], row: ScoreRow, caption: str, *, allow_partial: bool
-) -> tuple[list[tuple[Cell, ...]], list[tuple[Cell, ...]]]:
+def _lines(labels: tuple[str, ...], part: Group, caption: str) -> tuple[list[Row], list[Row]]:
     """The lines of a row for people and for machines: the means, and their deviation over seeds."""
-    count = f"({row.num_done}/{row.num_expected}"
-    done = (str(row.num_done), str(row.num_expected))
-    if not row.is_complete and not (allow_partial and row.means):
-        dashes, empty = ["–"] * (len(COLUMNS) - 1), [None] * len(COLUMNS)
-        note = f"withheld {count} done); {caption}"
-        return [(*labels, f"– {count} done)", *dashes)], [(*labels, *empty, "mean", *done, note)]
-    means: list[Cell] = [Number(100.0 * value) for value in row.means.values()]
-    tail = (*done, caption if row.is_complete else f"partial {count}); {caption}")
-    full = [(*labels, *means, "mean", *tail)]
-    if not row.is_complete:
-        means[0] = f"{means[0]} partial {count})"
-    shown = [(*labels, *means)]
-    if row.deviations:
-        spread = [Number(100.0 * value) for value in row.deviations.values()]
-        shown.append((*[""] * (len(labels) - 1), f"± {row.num_seeds} seeds", *spread))
-        full.append((*labels, *spread, f"std over {row.num_seeds} seeds", *tail))
+    found = [part.estimate(name) for name in COLUMNS]
+    means = [None if one.value is None else Number(one.value) for one in found]
+    spread = [Number(one.std) for one in found if one.std is not None]
+    count, label = f"{found[0].done}/{found[0].expected}", found[0].label
+    about = (*count.split("/"), f"{label}; {caption}" if label else caption)
+    first = f"– ({count} done)" if means[0] is None else f"{means[0]} {label}".rstrip()
+    shown: list[Row] = [(*labels, first, *(number or "–" for number in means[1:]))]
+    full: list[Row] = [(*labels, *means, "mean", *about)]
+    if spread:
+        seeds = f"{len(part.seeds)} seeds"
+        shown.append((*[""] * (len(labels) - 1), f"± {seeds}", *spread))
+        full.append((*labels, *spread, f"std over {seeds}", *about))
     return shown, full
 
 
@@ -204,23 +136,27 @@ def summary(run: Run) -> dict[str, Any]:
         "thresholds": determining["thresholds"]["name"],
         "metric_version": determining["metric_version"],
         "counts": manifest["counts"],
-        "scores": [
-            {
-                "set": group.data.label,
-                "planner": row.labels[0],
-                "noise": row.labels[1],
-                "scenarios": row.num_scenarios,
-                "seeds": row.num_seeds,
-                "done": row.num_done,
-                "expected": row.num_expected,
-                "mean": row.means if row.is_complete else None,
-                "std_over_seeds": row.deviations if row.is_complete else None,
-                "partial_mean": None if row.is_complete else row.means,
-            }
-            for group in read_groups([run])
-            for row in _score_rows(group, None)
-        ],
+        "scores": [_summary(group) for group in read_groups([run])],
         "failures": failures(run),
+    }
+
+
+def _summary(group: Group) -> dict[str, Any]:
+    seeds = {name: group.seed_means(name) for name in COLUMNS}
+    means = {name: float(values.mean()) for name, values in seeds.items() if len(values)}
+    spread = {name: seed_deviation(values) for name, values in seeds.items() if len(values) > 1}
+    finished = np.isfinite(group.column())
+    return {
+        "set": group.data.label,
+        "planner": group.planner,
+        "noise": group.noise,
+        "scenarios": len(group.data.tokens),
+        "seeds": len(group.seeds),
+        "done": int(finished.sum()),
+        "expected": finished.size,
+        "mean": means if group.is_complete else None,
+        "std_over_seeds": spread if group.is_complete else None,
+        "partial_mean": None if group.is_complete else means,
     }
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.kernels import BoolArray, FloatArray, IntArray
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.report.groups import Group
 from shiftsim.report.tables import Interval
 
@@ -21,16 +21,12 @@ _BLOCK = 500  # draws held in memory at once
 _EXACT_CLUSTERS = 13  # up to here all 2^G sign patterns are fewer than DRAWS
 
 
-def score_interval(
-    group: Group, name: str = "cls", where: BoolArray | None = None
-) -> Interval | None:
+def score_interval(group: Group, name: str = "cls") -> Interval | None:
     """Bootstrap interval of a group's score; None unless complete and of several recordings."""
-    mask = np.ones(len(group.data.tokens), np.bool_) if where is None else where
-    values = group.column(name)[mask]
+    values = group.scenario_means(name)
     if not len(values) or not np.isfinite(values).all():
         return None
-    recordings = np.array(group.data.recordings)[mask].tolist()
-    return bootstrap_interval(100.0 * values, cluster_codes(recordings))
+    return bootstrap_interval(100.0 * values, cluster_codes(group.data.recordings))
 
 
 def cluster_codes(clusters: Sequence[str]) -> IntArray:
@@ -119,10 +115,9 @@ def sign_flip_test(
 
 def holm(p_values: Sequence[float]) -> list[float]:
     """Holm's step-down correction: p-values that may all be compared with one level."""
-    order = np.argsort(p_values, kind="stable")
-    out = np.zeros(len(order))
-    worst = 0.0
-    for rank, index in enumerate(order):
-        worst = max(worst, min(1.0, (len(order) - rank) * p_values[index]))
-        out[index] = worst
+    values = np.asarray(p_values, np.float64)
+    order = np.argsort(values, kind="stable")
+    out = np.zeros(len(values))
+    scaled = np.minimum(1.0, (len(values) - np.arange(len(values))) * values[order])
+    out[order] = np.maximum.accumulate(scaled)
     return out.tolist()

@@ -6,6 +6,7 @@ import io
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from textwrap import wrap
 from typing import TypeAlias
 
@@ -19,13 +20,35 @@ _GAP = 2  # blanks between columns of text
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """A number and how many digits of it are shown."""
+    """A number, or the reason why there is none; empty where nothing was expected."""
 
-    value: float  # the number
-    digits: int = 2  # behind the point
+    value: float | None  # None when withheld; of scores, the mean over scenarios, then seeds
+    digits: int = 2  # shown behind the point
+    std: float | None = None  # standard deviation over the seeds' means; None for one seed
+    done: int = 1  # finished rollouts
+    expected: int = 1  # rollouts of a complete group
+
+    @property
+    def label(self) -> str:
+        """Empty for a complete score."""
+        if self.done == self.expected:
+            return ""
+        count = f"({self.done}/{self.expected})"
+        return f"{'withheld' if self.value is None else 'partial'} {count}"
+
+    @property
+    def parts(self) -> dict[str, str]:
+        """In full, by the ending of the column's name in CSV."""
+        if self.value is not None and not self.digits:
+            return {"": str(self)}
+        numbers = {"": self.value, " std": self.std}
+        return {end: repr(float(value)) for end, value in numbers.items() if value is not None}
 
     def __str__(self) -> str:
-        return f"{self.value:.{self.digits}f}"
+        if self.value is None:
+            return f"– ({self.done}/{self.expected})" if self.expected else ""
+        spread = "" if self.std is None else f" ± {self.std:.2f}"
+        return f"{self.value:.{self.digits}f}{spread} {self.label}".rstrip()
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,36 +58,17 @@ class Interval:
     low: float
     high: float
 
+    @property
+    def parts(self) -> dict[str, str]:
+        """In full, by the ending of the column's name in CSV."""
+        return {" low": repr(self.low), " high": repr(self.high)}
+
     def __str__(self) -> str:
         return f"[{self.low:.2f}, {self.high:.2f}]"
 
 
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """A score times 100, or the reason why there is none."""
-
-    mean: float | None  # mean over scenarios, then over seeds; None when withheld
-    # standard deviation over the seeds' means; None for one seed or when withheld
-    std: float | None
-    done: int  # finished rollouts
-    expected: int  # rollouts of a complete group
-
-    @property
-    def label(self) -> str:
-        """Empty for a complete score."""
-        if self.done == self.expected:
-            return ""
-        count = f"({self.done}/{self.expected})"
-        return f"{'withheld' if self.mean is None else 'partial'} {count}"
-
-    def __str__(self) -> str:
-        if self.mean is None:
-            return f"– ({self.done}/{self.expected})"
-        spread = "" if self.std is None else f" ± {self.std:.2f}"
-        return f"{self.mean:.2f}{spread}{f' {self.label}' if self.label else ''}"
-
-
-Cell: TypeAlias = str | Number | Estimate | Interval | None
+Cell: TypeAlias = str | Number | Interval | None
+Row: TypeAlias = tuple[Cell, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,10 +77,10 @@ class Table:
 
     name: str  # of its files and LaTeX label
     title: str  # what it shows
-    header: tuple[str, ...]  # names of the columns
-    rows: tuple[tuple[Cell, ...], ...]  # cells; None where there is nothing to say
+    header: Sequence[str]  # names of the columns
+    rows: Sequence[Row]  # cells; None where there is nothing to say
     num_labels: int  # leading columns that hold text
-    notes: tuple[str, ...] = ()  # what a reader must know to use the numbers
+    notes: Sequence[str] = ()  # what a reader must know to use the numbers
     full: "Table | None" = None  # the same for machines, where it is another table
     words: Mapping[str, str] = field(default_factory=lambda: LONG)  # what headings are short for
 
@@ -91,7 +95,7 @@ class Table:
         return [[*self.header], *([shown(cell) for cell in row] for row in self.rows)]
 
     @property
-    def remarks(self) -> tuple[str, ...]:
+    def remarks(self) -> Sequence[str]:
         """What the short headings mean, as "no at-fault collision (NCR), …", and the notes."""
         known = legend(self.header, self.words)
         return (f"columns: {known}", *self.notes) if known else self.notes
@@ -162,11 +166,11 @@ def markdown_escape(value: str) -> str:
 def _csv(table: Table) -> str:
     """Every number in full and in a column of its own; notes are the last column of every row."""
     table = table.full or table
-    columns = [
-        [f"{name}{ending}", *values]
-        for index, name in enumerate(table.header)
-        for ending, values in _parts([row[index] for row in table.rows]).items()
-    ]
+    columns = []
+    for index, name in enumerate(table.header):
+        parts = [_parts(row[index]) for row in table.rows]
+        endings = dict.fromkeys(chain(*parts)) or [""]
+        columns += [[f"{name}{end}", *(each.get(end, "") for each in parts)] for end in endings]
     labels = [_labels(row, table.header) for row in table.rows]
     if any(labels):
         columns.append(["label", *labels])
@@ -182,34 +186,14 @@ def csv_text(rows: Iterable[Sequence[str]]) -> str:
     return out.getvalue().rstrip("\n")
 
 
-def _parts(cells: Sequence[Cell]) -> dict[str, list[str]]:
-    """One or several columns, by what the cells hold; keys are added to the column's name."""
-    if any(isinstance(cell, Interval) for cell in cells):
-        return {f" {end}": [_full(getattr(c, end, None)) for c in cells] for end in ("low", "high")}
-    out = {"": [_plain(cell) for cell in cells]}
-    spreads = [cell.std if isinstance(cell, Estimate) else None for cell in cells]
-    if any(spread is not None for spread in spreads):
-        out[" std"] = [_full(spread) for spread in spreads]
-    return out
+def _parts(cell: Cell) -> dict[str, str]:
+    """What CSV holds of a cell, by the ending of the column's name."""
+    return {"": cell} if isinstance(cell, str) else {} if cell is None else cell.parts
 
 
-def _plain(cell: Cell) -> str:
-    if cell is None or isinstance(cell, str):
-        return cell or ""
-    if isinstance(cell, Number):
-        return f"{cell.value:.0f}" if cell.digits == 0 else _full(cell.value)
-    assert isinstance(cell, Estimate)
-    return _full(cell.mean)
-
-
-def _full(value: float | None) -> str:
-    return "" if value is None else repr(float(value))
-
-
-def _labels(row: Sequence[Cell], header: Sequence[str]) -> str:
+def _labels(row: Row, header: Sequence[str]) -> str:
     named = zip(header, row, strict=True)
-    found = [f"{n} {c.label}" for n, c in named if isinstance(c, Estimate) and c.label]
-    return "; ".join(found)
+    return "; ".join(f"{n} {c.label}" for n, c in named if isinstance(c, Number) and c.label)
 
 
 _LATEX = {

@@ -15,8 +15,8 @@ pytest.importorskip("matplotlib")
 
 
 @pytest.fixture(scope="module")
-def groups(tmp_path_factory):
-    run = write_run(
+def run(tmp_path_factory):
+    return write_run(
         tmp_path_factory.mktemp("figures") / "run",
         planners=("alpha", "beta", "gamma"),
         noise=("none", "awgn-low", "awgn-high", "ou-mid"),
@@ -24,34 +24,38 @@ def groups(tmp_path_factory):
         score=random_scores(5),
         missing=[("gamma", "none", 0, "t1")],
     )
+
+
+@pytest.fixture(scope="module")
+def groups(run):
     return read_groups([run])
 
 
-def drawn(groups, **options):
+def drawn(groups):
     from shiftsim.report.figures import figures
 
-    return {figure.name: figure for figure in figures(groups, **options)}
+    return {figure.name: figure for figure in figures(groups)}
 
 
 def test_there_are_pictures_of_robustness_cities_and_metrics(groups):
     assert set(drawn(groups)) == {"robustness_made-up", "cities_made-up", "metrics_made-up"}
 
 
-def test_a_withheld_score_is_not_drawn_and_a_partial_one_on_request(groups):
+def test_a_withheld_score_is_not_drawn_and_a_partial_one_on_request(run, groups):
     def points(found):
         axes = found["cities_made-up"].drawn.axes[0]
         return {line.get_label() for line in axes.lines}
 
     assert {"alpha", "beta"} <= points(drawn(groups))
     assert "gamma" not in points(drawn(groups))
-    assert "gamma (partial)" in points(drawn(groups, allow_partial=True))
+    assert "gamma (partial)" in points(drawn(read_groups([run], allow_partial=True)))
 
 
 def test_points_are_the_scores(groups):
     axes = drawn(groups)["metrics_made-up"].drawn.axes[0]
     heights = {line.get_label(): line.get_ydata()[0] for line in axes.lines}
     expected = next(g for g in groups if (g.planner, g.noise) == ("alpha", "none"))
-    assert heights["alpha"] == pytest.approx(expected.estimate().mean)
+    assert heights["alpha"] == pytest.approx(expected.estimate().value)
 
 
 def test_planners_differ_without_colour(groups):
@@ -129,7 +133,7 @@ def test_clean_is_full_and_solid_and_noise_hollow_and_dashed(groups):
     }
     assert faces == {(1, "None", colour), (3, "--", "white")}
     (thin,) = [line for line in mine if line.get_linestyle() == "-" and len(line.get_xdata()) == 2]
-    assert thin.get_ydata()[0] == pytest.approx(groups[0].estimate().mean)
+    assert thin.get_ydata()[0] == pytest.approx(groups[0].estimate().value)
 
 
 def test_a_report_in_latex_holds_the_pictures_as_pdf(groups, tmp_path):

@@ -10,7 +10,6 @@ from shiftsim.errors import ConfigError
 from shiftsim.report.groups import read_groups
 from shiftsim.report.scores import (
     failures,
-    score_rows,
     score_table,
     scores,
     summary,
@@ -20,36 +19,44 @@ from shiftsim.report.tables import FORMATS, render
 from shiftsim.report.words import severity, violations, worst_of
 
 
+def of(run, planner, noise):
+    groups = read_groups([run])
+    (group,) = [group for group in groups if (group.planner, group.noise) == (planner, noise)]
+    return group
+
+
 def test_the_score_is_the_plain_mean_of_the_scenarios(clean_run):
-    row = score_rows(clean_run)[0]
     expected = [
         r["cls"]
         for r in clean_run.scores.to_pylist()
-        if (r["planner"], r["noise"]) == row.labels == ("constant-velocity", "none")
+        if (r["planner"], r["noise"]) == ("constant-velocity", "none")
     ]
     assert len(expected) == 4
-    assert row.means["cls"] == pytest.approx(np.mean(expected), abs=1e-15)
-    assert row.deviations == {}
+    group = of(clean_run, "constant-velocity", "none")
+    assert group.seed_means() == pytest.approx([np.mean(expected)], abs=1e-15)
+    assert group.estimate().std is None
 
 
 def test_the_deviation_is_over_the_means_of_the_seeds(clean_run):
-    row = next(r for r in score_rows(clean_run) if r.labels == ("log-future", "ou-high"))
     means = [
         np.mean(
             [
                 r["cls"]
                 for r in clean_run.scores.to_pylist()
-                if (r["planner"], r["noise"], r["seed"]) == (*row.labels, seed)
+                if (r["planner"], r["noise"], r["seed"]) == ("log-future", "ou-high", seed)
             ]
         )
         for seed in (0, 1)
     ]
-    assert row.means["cls"] == pytest.approx(np.mean(means), abs=1e-12)
-    assert row.deviations["cls"] == pytest.approx(np.std(means, ddof=1), abs=1e-12)
+    found = next(
+        r for r in summary(clean_run)["scores"] if r["planner"] == "log-future" and r["seeds"] == 2
+    )
+    assert found["mean"]["cls"] == pytest.approx(np.mean(means), abs=1e-12)
+    assert found["std_over_seeds"]["cls"] == pytest.approx(np.std(means, ddof=1), abs=1e-12)
 
 
 def test_rows_stand_in_the_order_of_the_settings(clean_run):
-    assert [row.labels for row in score_rows(clean_run)] == [
+    assert [(group.planner, group.noise) for group in read_groups([clean_run])] == [
         ("constant-velocity", "none"),
         ("constant-velocity", "ou-high"),
         ("log-future", "none"),
@@ -58,9 +65,10 @@ def test_rows_stand_in_the_order_of_the_settings(clean_run):
 
 
 def test_rows_can_be_split_by_scenario_type(clean_run):
-    rows = score_rows(clean_run, by="scenario_type")
-    assert [row.labels[2] for row in rows[:2]] == ["free", "parked"]
-    assert all(row.num_scenarios == 2 for row in rows)
+    table = scores(read_groups([clean_run]), by="scenario_type")
+    assert [row[2] for row in table.rows[:2]] == ["free", "parked"]
+    parts = of(clean_run, "log-future", "none").split("scenario_type")
+    assert [len(part.data.tokens) for _, part in parts] == [2, 2]
 
 
 def test_the_table_of_a_run_is_the_text_of_its_scores(clean_run):
@@ -79,7 +87,7 @@ def test_profile_version_and_scenario_count_stand_with_every_table(clean_run, st
 def test_csv_has_unrounded_numbers(clean_run):
     table = render(scores(read_groups([clean_run])), "csv")
     rows = list(csv.DictReader(io.StringIO(table)))
-    assert float(rows[0]["CLS"]) == 100.0 * score_rows(clean_run)[0].means["cls"]
+    assert float(rows[0]["CLS"]) == of(clean_run, "constant-velocity", "none").estimate().value
 
 
 def test_an_unknown_format_or_column_is_refused(clean_run):
@@ -131,5 +139,5 @@ def test_the_summary_is_json_and_complete(clean_run):
     found = summary(clean_run)
     assert found["counts"]["ok"] == 24
     assert found["failures"] == failures(clean_run) == []
-    assert found["scores"][0]["mean"]["cls"] == score_rows(clean_run)[0].means["cls"]
+    assert found["scores"][0]["mean"]["cls"] == read_groups([clean_run])[0].seed_means()[0]
     assert found["scores"][0]["partial_mean"] is None

@@ -75,7 +75,7 @@ def test_a_scenario_that_nobody_finished_could_be_in_any_city(tmp_path):
 
 def test_a_partial_mean_is_labelled_wherever_it_stands(tmp_path):
     run = write_run(tmp_path / "a", missing=[("alpha", "none", 0, "t3")])
-    (table,) = semantic_shift(read_groups([run]), allow_partial=True)
+    (table,) = semantic_shift(read_groups([run], allow_partial=True))
     assert cells(table, "NR", "alpha")["made-up"] == "50.00 partial (3/4)"
     for style in ("text", "md", "latex", "html", "csv"):
         assert "partial (3/4)" in render(table, style)
@@ -447,6 +447,27 @@ def test_scenarios_of_interplan_have_its_score_and_their_window(tmp_path):
     assert cells(table, "R", "alpha", "overtake")["interPlan score"] == f"{np.mean(new[:2]):.2f}"
     assert cells(table, "R", "alpha", "all")["interPlan score"] == f"{np.mean(new):.2f}"
     assert "30 s" in table.title
+
+
+def test_edits_under_noise_have_rows_of_their_own(tmp_path):
+    score, recorded = random_scores(1), random_scores(2)
+    settings = {"noise": ("none", "ou-low"), "seeds": (0, 1)}
+    runs = [
+        write_run(tmp_path / "own", score=recorded, **settings),
+        edited_run(tmp_path / "e", score, **settings),
+    ]
+    [table] = edited_scores(read_groups(runs))
+    noisy = cells(table, "NR", "alpha", "ou-low", "parked")
+    new, own = (
+        [[100.0 * values("alpha", "ou-low", seed, n) for n in range(2)] for seed in (0, 1)]
+        for values in (score, recorded)
+    )
+    assert noisy["recorded"] == f"{np.mean(own):.2f}"
+    assert noisy["all"].startswith(f"{np.mean(new):.2f} ± ")
+    clean = edited_scores(read_groups([edited_run(tmp_path / "clean", score)]))[0]
+    assert [row[:2] + row[3:5] for row in table.rows if row[2] == "none"] == [
+        row[:4] for row in clean.rows
+    ]
 
 
 def test_runs_without_edits_have_no_such_table(tmp_path):

@@ -45,13 +45,13 @@ def duckdb_means(path):
 
 @pytest.mark.parametrize("means_of", [pandas_means, polars_means, duckdb_means])
 def test_other_readers_give_the_same_means(clean_run, means_of):
-    from shiftsim.report.scores import score_rows
+    from shiftsim.report.scores import summary
 
     means = means_of(clean_run.path / "scores.parquet")
-    rows = score_rows(clean_run)
-    assert set(means) == {row.labels for row in rows}
-    for row in rows:
-        assert means[row.labels] == pytest.approx(row.means["cls"], abs=1e-12)
+    rows = {(row["planner"], row["noise"]): row["mean"] for row in summary(clean_run)["scores"]}
+    assert set(means) == set(rows)
+    for labels, mean in rows.items():
+        assert means[labels] == pytest.approx(mean["cls"], abs=1e-12)
 
 
 @pytest.mark.parametrize("reader", ["pandas", "polars", "duckdb"])
@@ -68,13 +68,14 @@ def test_other_readers_open_rollouts(clean_run, reader):
 
 
 def test_grouping_with_arrow_gives_the_same_means(clean_run):
-    from shiftsim.report.scores import score_rows
+    from shiftsim.report.scores import summary
 
     table = pq.read_table(clean_run.path / "scores.parquet")
     means = table.group_by(["planner", "noise"]).aggregate([("cls", "mean")]).to_pylist()
     found = {(row["planner"], row["noise"]): row["cls_mean"] for row in means}
-    for row in score_rows(clean_run):
-        assert found[row.labels] == pytest.approx(row.means["cls"], abs=1e-12)
+    for row in summary(clean_run)["scores"]:
+        labels = (row["planner"], row["noise"])
+        assert found[labels] == pytest.approx(row["mean"]["cls"], abs=1e-12)
 
 
 def test_metrics_and_scores_join_on_the_key(clean_run):
