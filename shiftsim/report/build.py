@@ -4,7 +4,7 @@ import base64
 import html
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from string import Template
 
@@ -209,26 +209,35 @@ def made_of(runs: Sequence[Run]) -> str:
 
 def runs_table(runs: Sequence[Run]) -> Table:
     """A column per run: date, data with its hash, settings, weights, versions."""
-    facts: dict[str, Callable[[Run], str]] = {
-        "date": _date,
-        "rollouts finished": lambda run: "{ok} of {expected}".format(**run.manifest["counts"]),
-        "scenarios": lambda run: f"split {run.manifest['split']}",
-        "store": _store,
-        "traffic": lambda run: run.manifest["determining"]["traffic"],
-        "controller": lambda run: run.manifest["determining"]["controller"],
-        "thresholds": lambda run: run.manifest["determining"]["thresholds"]["name"],
-        "metrics": lambda run: f"v{run.manifest['determining']['metric_version']}",
-        "planners": lambda run: ", ".join(run.manifest["config"]["planners"]),
-        "weights": _weights,
-        "noise": lambda run: ", ".join(run.manifest["config"]["noise"]),
-        "seeds": lambda run: ", ".join(map(str, run.manifest["config"]["seeds"])),
-        "shiftsim": _version,
-        **{name: partial(_package, name=name) for name in _PACKAGES},
+    header, facts = ("run", *(run.path.name for run in runs)), [*map(_facts, runs)]
+    rows = [(name, *(fact[name] for fact in facts)) for name in facts[0]]
+    return Table("runs", "The runs", header, [row for row in rows if any(row[1:])], len(header))
+
+
+def _facts(run: Run) -> dict[str, str]:
+    """What a run was made of and with; empty where it is not known."""
+    manifest, config, rules = run.manifest, run.manifest["config"], run.manifest["determining"]
+    store = str(manifest["store"]).replace("\\", "/").rstrip("/").rpartition("/")[2]
+    identities = planner_identities(run).items()
+    weights = {
+        name: one.get("weights") or _short(one.get("checkpoint", "")) for name, one in identities
     }
-    lines = ((name, *map(fact, runs)) for name, fact in facts.items())
-    rows = [line for line in lines if any(line[1:])]
-    header = ("run", *(run.path.name for run in runs))
-    return Table("runs", "The runs", header, rows, len(header))
+    return {
+        "date": _date(run),
+        "rollouts finished": "{ok} of {expected}".format(**manifest["counts"]),
+        "scenarios": f"split {manifest['split']}",
+        "store": f"{store}, {_short(rules['store'])}",
+        "traffic": rules["traffic"],
+        "controller": rules["controller"],
+        "thresholds": rules["thresholds"]["name"],
+        "metrics": f"v{rules['metric_version']}",
+        "planners": ", ".join(config["planners"]),
+        "weights": "; ".join(f"{name}: {words}" for name, words in weights.items() if words),
+        "noise": ", ".join(config["noise"]),
+        "seeds": ", ".join(map(str, config["seeds"])),
+        "shiftsim": _version(run),
+        **{name: str(manifest.get("versions", {}).get(name, "")) for name in _PACKAGES},
+    }
 
 
 def _date(run: Run) -> str:
@@ -238,28 +247,10 @@ def _date(run: Run) -> str:
 
 
 def _version(run: Run) -> str:
-    version, commit = _package(run, name="shiftsim"), run.manifest.get("git")
-    return f"{version} ({commit})" if commit else version
-
-
-def _package(run: Run, *, name: str) -> str:
-    return str(run.manifest.get("versions", {}).get(name, ""))
-
-
-def _store(run: Run) -> str:
-    name = str(run.manifest["store"]).replace("\\", "/").rstrip("/").rpartition("/")[2]
-    return f"{name}, {_short(run.manifest['determining']['store'])}"
+    version, commit = run.manifest.get("versions", {}).get("shiftsim", ""), run.manifest.get("git")
+    return f"{version} ({commit})" if commit else str(version)
 
 
 def _short(text: str) -> str:
     """The beginning of a hash; other text as it is."""
     return text if ":" in text else text[:_HASH]
-
-
-def _weights(run: Run) -> str:
-    """What learned planners drove with: the label of the weights, or their hash."""
-    found = {
-        name: str(identity.get("weights") or _short(str(identity.get("checkpoint", ""))))
-        for name, identity in planner_identities(run).items()
-    }
-    return "; ".join(f"{name}: {words}" for name, words in found.items() if words)

@@ -108,25 +108,18 @@ def shown(cell: Cell) -> str:
 
 def text(table: Table, width: int = 0) -> str:
     """A table in plain text; wider than `width` it is printed in pieces, 0 for any."""
-    lines = table.lines
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    columns = []
+    for index, cells in enumerate(zip(*table.lines, strict=True)):
+        side, size = "<" if index < table.num_labels else ">", max(map(len, cells))
+        columns.append([f"{cell:{side}{size}}" for cell in cells])
     out = [table.title] if table.title else []
-    for piece, columns in enumerate(_pieces(widths, table.num_labels, width)):
+    for piece, chosen in enumerate(_pieces([len(c[0]) for c in columns], table.num_labels, width)):
+        lines = zip(*(columns[i] for i in chosen), strict=True)
         out += [""] if piece else []
-        chosen = [[line[i] for i in columns] for line in lines]
-        out += [f" {line}".rstrip() for line in aligned(chosen, table.num_labels)]
+        out += [f" {(' ' * _GAP).join(cells)}".rstrip() for cells in lines]
     fitted = (wrap(note, width - 1, subsequent_indent="  ") for note in table.remarks)
     notes = [line for lines in fitted for line in lines] if width else table.remarks
     return "\n".join([*out, *(f" {note}" for note in notes)])
-
-
-def aligned(lines: Sequence[Sequence[str]], num_labels: int) -> list[str]:
-    """Lines of cells with columns of equal width, the leading `num_labels` to the left."""
-    columns = []
-    for index, cells in enumerate(zip(*lines, strict=True)):
-        width = max(map(len, cells))
-        columns.append([c.ljust(width) if index < num_labels else c.rjust(width) for c in cells])
-    return [(" " * _GAP).join(cells) for cells in zip(*columns, strict=True)]
 
 
 def _pieces(widths: Sequence[int], num_labels: int, width: int) -> list[list[int]]:
