@@ -36,18 +36,14 @@ def select_tasks(
         f"run {run.path.name!r}", "scenario", token, set(run.tasks["token"].to_pylist())
     )
     wanted = {"planner": planner, "noise": noise, "seed": seed}
-    rows = [
-        row
-        for row in run.tasks.filter(pc.equal(run.tasks["token"], full)).to_pylist()
-        if all(value is None or row[name] == value for name, value in wanted.items())
-    ]
+    given = {name: value for name, value in wanted.items() if value is not None}
+    of_token = run.tasks.filter(pc.equal(run.tasks["token"], full)).to_pylist()
+    rows = [row for row in of_token if given.items() <= row.items()]
     if not rows:
         config = run.manifest["config"]
-        given = ", ".join(
-            f"{n} {v}" for n, v in {**wanted, "scenario": full}.items() if v is not None
-        )
+        words = (f"{name} {value}" for name, value in {**given, "scenario": full}.items())
         raise ConfigError(
-            f"run {run.path.name!r} has no task with {given}",
+            f"run {run.path.name!r} has no task with {', '.join(words)}",
             hint="; ".join(f"{n}: {', '.join(map(str, config[n]))}" for n in _HAS),
         )
     scores, metrics = (
@@ -58,22 +54,16 @@ def select_tasks(
     for row in rows:
         task = task_of(row)
         cls = scores[task][0]["cls"] if task in scores else None
-        listed = metrics.get(task, [])
-        _add_roles(listed)
-        listed.sort(key=_place)
+        listed = _with_roles(metrics.get(task, []))
         out.append(row | {"cls": cls, "why": why(cls, listed), "edits": edits, "metrics": listed})
     return out
 
 
-def _place(row: dict[str, Any]) -> tuple[int, int]:
-    """Where a metric stands in a list: by role, then in the order of all tables."""
-    name, names = row["metric"], list(SHORT_NAMES)
-    role = ("multiplier", "weighted", "").index(row["role"])
-    return role, names.index(name) if name in SHORT_NAMES else len(names)
+def _with_roles(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The metrics of a task with role and weight, by role, then in the order of all tables.
 
-
-def _add_roles(rows: list[dict[str, Any]]) -> None:
-    """Add role and weight to the metrics of a task; those of interPlan differ from nuPlan's."""
+    Those of interPlan differ from nuPlan's.
+    """
     names = {row["metric"] for row in rows}
     sorts = next((name.removeprefix(SORTS) for name in names if name.startswith(SORTS)), "")
     for row in rows:
@@ -83,6 +73,9 @@ def _add_roles(rows: list[dict[str, Any]]) -> None:
         if LANES in names and row["score"] is not None:
             role, weight = role_of(name, sorts)
         row |= {"role": role, "weight": weight}
+    roles = ("multiplier", "weighted", "")
+    order = {name: place for place, name in enumerate(SHORT_NAMES)}
+    return sorted(rows, key=lambda r: (roles.index(r["role"]), order.get(r["metric"], len(order))))
 
 
 def explain_tasks(
@@ -111,13 +104,12 @@ def why(cls: float | None, metrics: list[dict[str, Any]]) -> str:
     scored = [row for row in metrics if row["score"] is not None]
     factors = [row for row in scored if row["role"] == "multiplier"]
     parts = [row for row in scored if row["role"] == "weighted"]
-    zero = [row for row in factors if row["score"] == 0.0]
-    if zero:
-        causes = []
-        for row in zero:
-            is_dated = row["first_violation_iteration"] is not None
-            time = f" at {row['first_violation_s']:.1f} s{_partner(row)}" if is_dated else ""
-            causes.append(f"{in_words(row['metric'], REASONS)}{time}")
+    causes = []
+    for row in (row for row in factors if row["score"] == 0.0):
+        is_dated = row["first_violation_iteration"] is not None
+        time = f" at {row['first_violation_s']:.1f} s{_partner(row)}" if is_dated else ""
+        causes.append(f"{in_words(row['metric'], REASONS)}{time}")
+    if causes:
         return f"score 0 because of {' and '.join(causes)}"
     if cls == 0.0:
         return "score 0 because every weighted metric is 0"

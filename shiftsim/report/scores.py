@@ -26,8 +26,6 @@ from shiftsim.report.words import (
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
 
-_NO_CAUSE: dict[str, Any] = {"cause": "", "severity": ()}
-
 
 def score_table(runs: Sequence[Run], *, allow_partial: bool = False) -> str:
     """The scores of runs as text; threshold profile, metric version and count stand with it.
@@ -99,30 +97,29 @@ def worst_rollouts(run: Run, count: int = 10) -> list[dict[str, Any]]:
     Each with the key of that rollout, its `cls`, the `reason` in words, and how many `others` of
     the same recording have the same cause.
     """
-    lowest = run.scores.group_by("token").aggregate([("cls", "min")])
-    scores = run.scores.select([*Task._fields, "cls", "log_name"]).join(lowest, "token")
-    scores = scores.filter(pc.equal(scores["cls"], scores["cls_min"]))
     keys = [*Task._fields]
+    lowest = run.scores.group_by("token").aggregate([("cls", "min")])
+    scores = run.scores.select([*keys, "cls", "log_name"]).join(lowest, "token")
+    scores = scores.filter(pc.equal(scores["cls"], scores["cls_min"]))
     below = run.metrics.filter(pc.less(run.metrics["score"], 1.0))
     metrics = rows_by_task(below.join(scores.select(keys), keys, join_type="left semi"))
     rows = []
     for row in scores.to_pylist():
-        task = task_of(row)
-        cause = worst_violation(violations(metrics.get(task, [])))
-        known = {"cause": cause.reason, "severity": severity(cause)} if cause else _NO_CAUSE
-        reason = "" if cause is None else _in_words(cause)
-        rows.append(row | known | {"log": row["log_name"], "reason": reason})
+        cause = worst_violation(violations(metrics.get(task_of(row), [])))
+        known = {"cause": "", "severity": (), "reason": "", "log": row["log_name"]}
+        if cause is not None:
+            known |= {"cause": cause.reason, "severity": severity(cause), "reason": _words(cause)}
+        rows.append(row | known)
     return [
         {**task_of(row)._asdict(), "cls": row["cls"], "reason": row["reason"], "others": others}
         for row, others in worst_of(rows, count)
     ]
 
 
-def _in_words(cause: Violation) -> str:
+def _words(cause: Violation) -> str:
     """A violation with its time; one that does not multiply the score with its own, times 100."""
     score = "" if cause.is_multiplier else f" {100.0 * cause.row['score']:.2f}"
-    time = "" if cause.time is None else f" {cause.time:.1f} s"
-    return f"{cause.reason}{score}{time}"
+    return f"{cause.reason}{score}{'' if cause.time is None else f' {cause.time:.1f} s'}"
 
 
 def summary(run: Run) -> dict[str, Any]:
