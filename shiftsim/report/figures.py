@@ -5,7 +5,7 @@ those under noise hollow marks on dashed lines. Nothing is drawn of groups whose
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -71,14 +71,21 @@ def figures(groups: Sequence[Group]) -> list[Figure]:
         names.append(data.name)
         shown = [group for group in mine if group.estimate().value is not None]
         clean = [group for group in shown if group.noise == "none"]
-        if any(group.noise.partition("-")[0] in _KINDS for group in shown):
-            drawn = _robustness(data, shown, styles)
+        found = {group.noise.partition("-")[0] for group in shown}
+        if kinds := {_KINDS[kind]: _levels(kind, shown) for kind in _KINDS if kind in found}:
+            labels = ("strength of the noise", "closed-loop score")
+            drawn = _scores(shown, kinds, styles, (4.1, 3.3), noise="some", labels=labels)
+            note = "error bars: standard deviation over seeds; thin line: the clean score"
+            samples = {"clean": "none", "under noise": "some"}
+            _finish(drawn, data, "Noise robustness", note, samples)
             out.append(Figure(f"robustness_{name}", f"Noise robustness on {data.label}", drawn))
         if not clean:
             continue
         every = np.ones(len(data.tokens), np.bool_)
         if any(grade for _, grade in map(graded, data.types)):
-            drawn = _scores(clean, _difficulties(data, groups), styles, (3.4, 3.1), is_joined=True)
+            labels = ("difficulty of the edit", "closed-loop score")
+            kinds = _difficulties(data, groups)
+            drawn = _scores(clean, kinds, styles, (3.4, 3.1), noise="none", labels=labels)
             _finish(drawn, data, "Edits", f"recorded: the same scenarios without the edit; {_BARS}")
             title = f"Scores by difficulty of the edits: {data.label}"
             out.append(Figure(f"edits_{name}", title, drawn))
@@ -95,7 +102,7 @@ def figures(groups: Sequence[Group]) -> list[Figure]:
             _place("\n".join([*wrap(LONG[short], 12), f"({short})"]), every, column)
             for column, short in COLUMNS.items()
         ]
-        drawn = _scores(clean, {"": places}, styles, label="score")
+        drawn = _scores(clean, {"": places}, styles, labels=("", "score"))
         _finish(drawn, data, "Metrics", f"clean rollouts; {_BARS}")
         out.append(Figure(f"metrics_{name}", f"Metrics on {data.label}", drawn))
     return out
@@ -127,39 +134,22 @@ def _difficulties(data: DataSet, groups: Sequence[Group]) -> dict[str, list[_Pla
     }
 
 
-def _robustness(data: DataSet, groups: Sequence[Group], styles: dict[str, Style]) -> Any:
-    """Scores by strength of the noise, a panel for each of its models."""
-    kinds = [kind for kind in _KINDS if any(g.noise.startswith(f"{kind}-") for g in groups)]
-    figure, panels = _panels(_traffics(groups), kinds, (4.1, 3.3))
-    planners = list(dict.fromkeys(group.planner for group in groups))
-    for axes, traffic, kind in panels:
-        names = ["none", *(f"{kind}-{level}" for level in LEVELS[1:])]
-        for place, planner in enumerate(planners):
-            labels = (traffic, planner)
-            mine = {g.noise: g for g in groups if (g.traffic, g.planner) == labels}
-            cells = {i: mine[name].estimate() for i, name in enumerate(names) if name in mine}
-            if cells:
-                # shifted a little, so that error bars do not cover those of others
-                shift = 0.02 * (place - len(planners) / 2)
-                _curve(axes, _label(planner, mine.values()), cells, shift, styles[planner])
-        axes.set_xticks(range(len(LEVELS)), LEVELS)
-        axes.set_xlabel("strength of the noise", fontsize=8)
-        _finish_axes(axes, f"{_KINDS[kind]}, {_TRAFFIC.get(traffic, traffic)}")
-    note = "error bars: standard deviation over seeds; thin line: the clean score"
-    _finish(figure, data, "Noise robustness", note, {"clean": "none", "under noise": "some"})
-    return figure
+def _levels(kind: str, groups: Sequence[Group]) -> list[_Place]:
+    """The places of every level of a noise; the bars are the deviation over the seeds."""
+    scores = {(g.traffic, g.planner, g.noise): g.estimate() for g in groups}
 
+    def place(level: str) -> _Place:
+        noise = level if level == "none" else f"{kind}-{level}"
 
-def _curve(axes: Any, label: str, cells: dict[int, Number], shift: float, style: Style) -> None:
-    """One planner's scores by level."""
-    means = [cell.value for cell in cells.values()]
-    look = {**style.marks("some"), "linestyle": dashes("some"), "linewidth": 1.3, "capsize": 2}
-    bars = [cell.std or 0.0 for cell in cells.values()]
-    axes.errorbar([place + shift for place in cells], means, yerr=bars, **look)
-    clean = means[0] if 0 in cells else math.nan
-    if 0 in cells:
-        axes.axhline(clean, linewidth=0.8, alpha=0.35, color=style.colour, zorder=1)
-    axes.plot([shift], [clean], label=label, linestyle="none", zorder=4, **style.marks("none"))
+        def score(group: Group) -> tuple[Number | None, Interval | None]:
+            found = scores.get((group.traffic, group.planner, noise))
+            if found is None or found.value is None or found.std is None:
+                return found, None
+            return found, Interval(found.value - found.std, found.value + found.std)
+
+        return _Place(level, score)
+
+    return [place(level) for level in LEVELS]
 
 
 def _scores(
@@ -168,52 +158,62 @@ def _scores(
     styles: dict[str, Style],
     size: tuple[float, float] | None = None,
     *,
-    is_joined: bool = False,
-    label: str = "closed-loop score",
+    noise: str = "",
+    labels: tuple[str, str] = ("", "closed-loop score"),
 ) -> Any:
     """Planners side by side at every place, a row of panels per traffic mode.
 
-    `columns` are the panels of a row by title, `size` that of one; `is_joined` draws lines.
+    `columns` are the panels of a row by title, `size` that of one, `labels` those of the axes.
+    Places are joined by lines if a `noise` is given, which look like it.
     """
     planners = list(dict.fromkeys(group.planner for group in groups))
-    spread = 0.06 * len(planners) if is_joined else _SPREAD
+    spread = {"": _SPREAD, "none": 0.06 * len(planners)}.get(noise, 0.02 * len(planners))
     size = size or (max(5.5, 1.05 * max(map(len, columns.values()))), 2.9)
-    figure, panels = _panels(_traffics(groups), [*columns], size)
+    rows = list(dict.fromkeys(group.traffic for group in groups))
+    figure, panels = _panels(rows, [*columns], size)
     for axes, traffic, title in panels:
-        places = columns[title]
-        for group in (group for group in groups if group.traffic == traffic):
-            style, means = styles[group.planner], {}
+        mine = [group for group in groups if group.traffic == traffic]
+        for group in {group.planner: group for group in mine}.values():
             shift = spread * ((planners.index(group.planner) + 0.5) / len(planners) - 0.5)
-            for x, (found, interval) in enumerate(place.score(group) for place in places):
-                if interval is not None:
-                    bar = (interval.low, interval.high)
-                    axes.vlines(x + shift, *bar, color=style.colour, linewidth=1.3)
-                if found is not None and found.value is not None:
-                    means[x + shift] = found.value
-            line: dict[str, Any] = {
-                "linestyle": dashes("none") if is_joined else "none",
-                "linewidth": 1.3,
-            }
-            line["label"] = _label(group.planner, [group])
-            axes.plot([*means], [*means.values()], **style.marks("none"), **line)
-        for x in () if is_joined else range(1, len(places)):
+            is_whole = all(one.is_complete for one in mine if one.planner == group.planner)
+            label = group.planner if is_whole else f"{group.planner} (partial)"
+            _series(axes, group, columns[title], shift, styles[group.planner], noise, label)
+        headings = [place.heading for place in columns[title]]
+        for x in () if noise else range(1, len(headings)):
             axes.axvline(x - 0.5, color="0.9", linewidth=0.7, zorder=0)
-        axes.set_xticks(range(len(places)), [place.heading for place in places])
-        margin = 0.35 if is_joined else 0.5
-        axes.set_xlim(-margin, len(places) - 1 + margin)
-        if is_joined:
-            axes.set_xlabel("difficulty of the edit", fontsize=8)
+        axes.set_xticks(range(len(headings)), headings)
+        margin = 0.35 if noise else 0.5
+        axes.set_xlim(-margin, len(headings) - 1 + margin)
+        axes.set_xlabel(labels[0], fontsize=8)
         words = (title, _TRAFFIC.get(traffic, traffic))
-        _finish_axes(axes, ", ".join(filter(None, words)), label)
+        _finish_axes(axes, ", ".join(filter(None, words)), labels[1])
     return figure
 
 
-def _traffics(groups: Sequence[Group]) -> list[str]:
-    return list(dict.fromkeys(group.traffic for group in groups))
-
-
-def _label(planner: str, groups: Iterable[Group]) -> str:
-    return planner if all(group.is_complete for group in groups) else f"{planner} (partial)"
+def _series(
+    axes: Any,
+    group: Group,
+    places: Sequence[_Place],
+    shift: float,
+    style: Style,
+    noise: str,
+    label: str,
+) -> None:
+    """One planner's scores, a little beside the places, so that bars do not cover each other."""
+    means = {}
+    for x, (found, interval) in enumerate(place.score(group) for place in places):
+        if interval is not None:
+            axes.vlines(x + shift, interval.low, interval.high, color=style.colour, linewidth=1.3)
+        if found is not None and found.value is not None:
+            means[x + shift] = found.value
+    line = {"linestyle": dashes(noise) if noise else "none", "linewidth": 1.3}
+    if noise in ("", "none"):
+        axes.plot([*means], [*means.values()], label=label, **style.marks("none"), **line)
+        return
+    axes.plot([*means], [*means.values()], **style.marks(noise), **line)
+    clean = means.get(shift, math.nan)
+    axes.axhline(clean, linewidth=0.8, alpha=0.35, color=style.colour, zorder=1)
+    axes.plot([shift], [clean], label=label, linestyle="none", zorder=4, **style.marks("none"))
 
 
 def _panels(
