@@ -54,7 +54,12 @@ def wheel(tmp_path_factory):
 def test_a_wheel_holds_the_package_with_its_data_and_weights_and_is_small(wheel):
     with zipfile.ZipFile(wheel) as archive:
         sizes = {info.filename: info.compress_size for info in archive.infolist()}
-    for name in (SHIPPED, "shiftsim/py.typed", "shiftsim/benchmarks/published.toml"):
+    for name in (
+        SHIPPED,
+        "shiftsim/py.typed",
+        "shiftsim/benchmarks/published.toml",
+        "shiftsim/report/cite.bib",
+    ):
         assert name in sizes
     modules = {name for name in sizes if name.endswith(".py")}
     copy = wheel.parent / "copy"
