@@ -72,7 +72,7 @@ def make_tables(
     """
     chosen = options or Options()
     left_out = [group for group in groups if chosen.with_published and has_default_weights(group)]
-    weights = {f"{group.planner}, {group.identity['weights']}" for group in left_out}
+    weights = {f"{group.name}, {group.weights}" for group in left_out}
     default_weights = "; ".join(sorted(weights))
     groups = [group for group in groups if group not in left_out]
     if left_out and not groups:

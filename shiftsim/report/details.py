@@ -10,7 +10,7 @@ from shiftsim.edits.sampling import GRADES, graded
 from shiftsim.kernels import FloatArray
 from shiftsim.report.groups import Group, by_set, distinct_sets
 from shiftsim.report.statistics import FEW_CLUSTERS, cluster_codes, compare, holm
-from shiftsim.report.tables import Number, Row, Table
+from shiftsim.report.tables import Cell, Number, Row, Table
 from shiftsim.runs.results import Run
 
 ALL_KINDS = "all"
@@ -180,25 +180,26 @@ def planning_times(groups: Sequence[Group]) -> Table:
 
 
 def _times_row(group: Group) -> Row:
-    planner = group.planner.removesuffix(f" @{group.run.path.name}")  # as its run calls it
     tasks, scores = group.run.tasks, group.run.scores
     finished = pc.equal(tasks["status"], "ok")
-    done = tasks.filter(pc.and_(pc.equal(tasks["planner"], planner), finished))
-    degraded = scores.filter(pc.equal(scores["planner"], planner))["degraded_steps"].to_numpy()
+    done = tasks.filter(pc.and_(pc.equal(tasks["planner"], group.name), finished))
+    degraded = scores.filter(pc.equal(scores["planner"], group.name))["degraded_steps"].to_numpy()
 
     def known(name: str) -> FloatArray:
         values = done[name].to_numpy() if name in done.column_names else np.zeros(0)
         return values[np.isfinite(values)]
 
-    parts = [known(f"{name}_seconds") for name in ("read", "simulate", "metrics")]
-    each = [float(np.median(values)) for values in parts if len(values)]
-    mean, tail = known("planning_ms_mean"), known("planning_ms_p95")
+    def medians(*names: str, digits: int = 2) -> Cell:
+        found = [float(np.median(values)) for name in names if len(values := known(name))]
+        return Number(sum(found), digits) if found else None
+
+    tail = known("planning_ms_p95")
     return (
         *(group.data.label, group.traffic, group.planner),
         Number(len(done), 0),
-        *(Number(float(np.median(one))) if len(one) else None for one in (mean, tail)),
+        *(medians("planning_ms_mean"), medians("planning_ms_p95")),
         Number(float(tail.max())) if len(tail) else None,
-        Number(sum(each), 3) if each else None,
+        medians("read_seconds", "simulate_seconds", "metrics_seconds", digits=3),
         Number(int(degraded.sum()), 0),
         Number(int(np.sum(degraded > 0)), 0),
     )

@@ -132,9 +132,14 @@ class Group:
         return bool(np.isfinite(self.values[:, :, 0]).all())
 
     @property
-    def identity(self) -> dict[str, Any]:
-        """What identifies the planner, where that is more than a name."""
-        return planner_identities(self.run).get(self.planner.partition(" @")[0], {})
+    def name(self) -> str:
+        """The planner as its run calls it."""
+        return self.planner.removesuffix(f" @{self.run.path.name}")
+
+    @property
+    def weights(self) -> str:
+        """What weights of our own are called that the planner drove with; else empty."""
+        return str(planner_identities(self.run).get(self.name, {}).get("weights") or "")
 
     def only(self, where: BoolArray) -> "Group":
         """The rollouts of some (N,) of the scenarios."""
@@ -205,11 +210,11 @@ def planner_notes(runs: Iterable[Run]) -> list[str]:
 
 def has_default_weights(group: Group) -> bool:
     """Whether a planner drove with weights of our own that nobody asked for by `--checkpoint`."""
-    name, config = group.planner.partition(" @")[0], group.run.manifest["config"]
+    config = group.run.manifest["config"]
     given = [text.partition("=") for text in config.get("checkpoints", ())]
-    named = any(not equals or owner == name for owner, equals, _ in given)
-    named = named or "checkpoint" in config.get("planner_args", {}).get(name, {})
-    return bool(group.identity.get("weights")) and not named
+    named = any(not equals or owner == group.name for owner, equals, _ in given)
+    named = named or "checkpoint" in config.get("planner_args", {}).get(group.name, {})
+    return bool(group.weights) and not named
 
 
 def token_digest(tokens: Iterable[str]) -> str:
