@@ -64,26 +64,23 @@ class Dsc3dReader(Reader):
         self.name = site or src.resolve().name
         self.source = self.download.folder
         path = find_map(self.download, map_path)
-        self.site: BuiltMap = self._map(path)
-        self.settings = {
-            "site": [self.name, *self.download.offset.tolist()],
-            "rate": [self.download.frame_rate, self.download.frame_distance],
-            "config": asdict(self.config),
-            "map": digest(path),
-        }
-
-    def _map(self, path: Path) -> BuiltMap:
         drive = read_opendrive(path)
         _check_georeference(drive, self.download)
         x, y, *_ = drive.offset or (0.0, 0.0)
         place = self.download.offset
-        return opendrive_site(
+        self.site: BuiltMap = opendrive_site(
             drive,
             name=self.name,
             offset=(float(place[0]) - x, float(place[1]) - y),  # the header's is applied
             epsg=self.download.epsg,
             country=self.config.country,
         )
+        self.settings = {
+            "site": [self.name, *self.download.offset.tolist()],
+            "rate": [self.download.frame_rate, self.download.frame_distance],
+            "config": asdict(self.config),
+            "map": digest(path),
+        }
 
     def recordings(self) -> Sequence[str]:
         """Names as listed in `data_meta.json`."""

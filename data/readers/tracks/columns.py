@@ -44,6 +44,7 @@ _ROLES = {
     "speed": ("velocity", "speed v vel velocity vvel absvelocity vehiclespeed"),
 }
 ROLES = tuple(_ROLES)
+QUANTITIES = {role: quantity for role, (quantity, _) in _ROLES.items()}
 # what a unit is multiplied by to become ours
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3},  # to us
@@ -100,7 +101,7 @@ class Column:
 
     def factor(self, role: str) -> float:
         """What values are multiplied by to become ours."""
-        return self.sign * UNITS.get(_ROLES[role][0], {}).get(self.unit, 1.0)
+        return self.sign * UNITS.get(QUANTITIES[role], {}).get(self.unit, 1.0)
 
     @property
     def words(self) -> str:
@@ -121,7 +122,7 @@ class Columns:
 
     def unit_factors(self, role: str) -> dict[str, float]:
         """By unit, what the values of a column are multiplied by if they are in that one."""
-        units, unit_now = UNITS[_ROLES[role][0]], self.found[role].unit
+        units, unit_now = UNITS[QUANTITIES[role]], self.found[role].unit
         return {unit: factor / units[unit_now] for unit, factor in units.items()}
 
 
@@ -156,7 +157,7 @@ def recognise(names: Sequence[str], overrides: Mapping[str, Any], where: str) ->
     for quantity, unit in _table(overrides, "units").items():
         one_of("unit of", quantity, tuple(UNITS))
         unit = one_of(f"unit of {quantity}", _SPELLINGS.get(unit, unit), UNITS[quantity])
-        for role in [r for r in found if _ROLES[r][0] == quantity]:
+        for role in [r for r in found if QUANTITIES[r] == quantity]:
             found[role] = replace(found[role], unit=unit)
     _require_columns(found, names, where)
     for column in found.values():
@@ -202,7 +203,7 @@ def _named_columns(
     out = {}
     for role, text in overrides.items():
         one_of("column", role, ROLES)
-        usual = units.get(_ROLES[role][0], "")
+        usual = units.get(QUANTITIES[role], "")
         if text.startswith("="):
             out[role] = Column("", usual, constant=text[1:])
             continue

@@ -16,10 +16,11 @@ from shiftsim.data.maps.opendrive.reading import read_opendrive
 from shiftsim.data.readers.build import make_samples
 from shiftsim.data.readers.codes import KINDS
 from shiftsim.data.readers.convert import ConversionReport, convert
+from shiftsim.data.readers.placement import extent_of
 from shiftsim.data.readers.reader import Reader, SourceRecording, opendrive_site
 from shiftsim.data.readers.scenarios import EGO_CATEGORIES
+from shiftsim.data.readers.tracks.axes import Diagnostics
 from shiftsim.data.readers.tracks.diagnostics import diagnose
-from shiftsim.data.readers.tracks.findings import Diagnostics
 from shiftsim.data.readers.tracks.table import TrackTable, read_tracks
 from shiftsim.data.readers.windows import ConversionConfig
 from shiftsim.data.store.map import read_map_file
@@ -123,8 +124,7 @@ def inspect_tracks(
 
 def _at_origin(table: TrackTable, road: VectorMap, origin: tuple[float, float]) -> TrackTable:
     """Tracks moved by the origin of their frame, where that brings them nearer to the map."""
-    bounds, middle = road.edges.polygons.bounds, np.median(table.xy, axis=0)
-    low, high = bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)
+    middle, (low, high) = np.median(table.xy, axis=0), extent_of(road)
 
     def gap(place: FloatArray) -> float:
         return float(np.hypot(*(place - np.clip(place, low, high))))
