@@ -22,6 +22,7 @@ NUMBERS = (
 )
 TEXTS = ("", " ", "x", "nan", "-1", "../..", "\u202e\U0001f697", "a" * 100_000, "9" * 5_000)
 DEEP = "[" * 20_000 + "]" * 20_000
+_MOST_VALUES = 1_000_000  # bytes of what is very long
 WHOLE = (-1, 0, 1, 127, 10**4, 2**31 - 1, 2**53 + 1, 2**63 - 1, -(2**63))
 _TOKEN = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][+-]?\d+)?")
 _QUOTED = re.compile(rb"\"[^\"\n]*\"")
@@ -48,7 +49,8 @@ def damage(path: Path, random: Random) -> str:
     try:
         return f"{path.name}: {way(path, random) or way.__name__.strip('_')}"
     except Exception as error:  # what is damaged already cannot be damaged with care
-        return f"{path.name}: {_bytes(path, random)} ({type(error).__name__})"
+        what = _bytes(path, random) if path.stat().st_size else "nothing left"
+        return f"{path.name}: {what} ({type(error).__name__})"
 
 
 def _bytes(path: Path, random: Random) -> str:
@@ -377,16 +379,17 @@ def _long(table: pa.Table, index: int, random: Random) -> tuple[pa.Table, str]:
     name, field = table.column_names[index], table.schema.field(index)
     kind = random.choice(("rows", "columns", "items"))
     if kind == "rows":
-        times = -(-200_000 // max(len(table), 1))
+        times = max(_MOST_VALUES // max(table.nbytes, 1), 2)
         return pa.concat_tables([table] * times), f"{times} times the rows"
     if kind == "columns":
-        for number in range(2_000):
+        more = max(min(_MOST_VALUES // max(table[index].nbytes, 1), 2_000), 2)
+        for number in range(more):
             table = table.append_column(f"{name}{number}", table[index])
-        return table, "2000 columns more"
+        return table, f"{more} columns more"
     values = table.column(index).to_pylist()
     row = random.randrange(max(len(values), 1))
     if isinstance(values[row], list) and values[row]:
-        values[row] = values[row] * 100_000
+        values[row] = values[row] * max(100_000 // len(str(values[row])), 2)
     elif isinstance(values[row], str):
         values[row] = random.choice(
             (DEEP, "9" * 5_000, f'{{"x": {DEEP}}}', f'{{"x": {"9" * 5_000}}}')
@@ -453,7 +456,7 @@ def _header(path: Path, random: Random) -> str:
 
 def _packed(path: Path, random: Random) -> str:
     """What an xz file holds, damaged as bytes."""
-    path.write_bytes(lzma.decompress(path.read_bytes()))
+    path.write_bytes(lzma.decompress(path.read_bytes()) or b"\0")
     if ".msgpack" in path.name and random.random() < 0.3:
         pickled, what = _repacked(path.read_bytes(), random)
         path.write_bytes(pickled)
