@@ -110,7 +110,7 @@ def _check_type(name: str, value: Any) -> None:
     }.get(name, (is_number, "a number from 0 on"))
     if not is_good:
         raise ConfigError(f"{name} is {value!r}; it must be {wanted}")
-    if name in SETTINGS and value is not None and not SETTINGS[name].holds(float(value)):
+    if name in SETTINGS and value is not None and not SETTINGS[name].holds(value):
         raise ConfigError(f"{name} is {value!r}; it must be within {SETTINGS[name]}")
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from shiftsim.data.readers.codes import KINDS
-from shiftsim.data.readers.tracks.inspection import Inspection
+from shiftsim.data.readers.tracks.reader import TracksReader
 from shiftsim.data.readers.tracks.table import TrackTable
 from shiftsim.data.store.reading import open_store
 from shiftsim.kernels import FloatArray
@@ -21,7 +21,7 @@ _MAX_EGOS = 40
 Egos = dict[str, list[FloatArray]]  # poses (R, 3) of every scenario, by ego
 
 
-def save_tracks_picture(path: Path, inspection: Inspection, store: Path | None) -> None:
+def save_tracks_picture(path: Path, inspection: TracksReader, store: Path | None) -> None:
     """Draw map, tracks and, if a store has scenarios of them, their egos.
 
     Where the tracks are far from the map, or hardly seen beside it, both are also drawn alone.
@@ -69,7 +69,7 @@ def save_tracks_picture(path: Path, inspection: Inspection, store: Path | None) 
     save_picture(figure, path)
 
 
-def _panel(axes: Any, inspection: Inspection, egos: Egos, extent: FloatArray) -> None:
+def _panel(axes: Any, inspection: TracksReader, egos: Egos, extent: FloatArray) -> None:
     low, high = extent[:2], extent[2:]
     pad = _MARGIN * max(float((high - low).max()), 10.0)
     _draw_road(axes, inspection.road, np.concatenate([low - pad, high + pad]))

@@ -89,7 +89,17 @@ def _text(path: Path, random: Random) -> str:
     if spot[0].startswith(b'"'):
         new = json.dumps(random.choice((*TEXTS, *map(str, NUMBERS))))
     else:
-        words = ("", "true", '"x"', "[]", "{}", "null", "1979-05-27", "9" * 5_000, DEEP)
+        words = (
+            "",
+            "true",
+            '"x"',
+            "[]",
+            "{}",
+            "null",
+            "1979-05-27",
+            *("9" * n for n in (400, 5_000)),
+            DEEP,
+        )
         new = str(random.choice((*NUMBERS, *words)))
     path.write_bytes(data[: spot.start()] + new.encode() + data[spot.end() :])
     return f"{spot[0][:40]!r} -> {new[:40]!r}"

@@ -76,7 +76,7 @@ def read_track_table(folder: Path) -> Any:
     from fuzz.targets import read_store
 
     from shiftsim.data.readers.scenarios import EGO_CATEGORIES
-    from shiftsim.data.readers.tracks.inspection import convert_tracks, inspect_tracks
+    from shiftsim.data.readers.tracks.reader import TracksReader, convert_tracks
     from shiftsim.data.readers.windows import ConversionConfig
     from shiftsim.errors import ConfigError, ConversionError
     from shiftsim.files import read_toml
@@ -92,7 +92,7 @@ def read_track_table(folder: Path) -> Any:
     )
     words = read_toml(said) if said.exists() else {}
     try:
-        inspection = inspect_tracks(tracks, folder / "road.xodr", overrides=words, config=short)
+        inspection = TracksReader(tracks, folder / "road.xodr", overrides=words, config=short)
         convert_tracks(inspection, folder / "store")
     except ConfigError as error:  # the command names the file
         raise ConfigError(f"{tracks}: {error.message}", error.hint) from error

@@ -152,7 +152,7 @@ def recognise(names: Sequence[str], overrides: Mapping[str, Any], where: str) ->
                 found[role] = Column(name, unit or usual.get(quantity, ""))
                 break
     named = {r: n for r, n in given.get("columns", {}).items() if n.lstrip("-") in names}
-    found |= _named_columns(named | overrides.get("columns", {}), found, names, usual, where)
+    found |= _named_columns(named | _table(overrides, "columns"), found, names, usual, where)
     found = {role: column for role, column in found.items() if column.name or column.constant}
     for quantity, unit in _table(overrides, "units").items():
         one_of("unit of", quantity, tuple(UNITS))
@@ -167,12 +167,12 @@ def recognise(names: Sequence[str], overrides: Mapping[str, Any], where: str) ->
                 "give each a name of its own",
             )
     shift = overrides.get("shift_m", (0.0, 0.0))
-    if len(shift) != 2 or not all(isinstance(v, int | float) for v in shift):
+    if not isinstance(shift, list | tuple) or [_within(v, 1e9) for v in shift] != [True, True]:
         raise ConfigError(f"shift_m is {shift!r}", "shift_m = [x, y] in metres")
     hz = overrides.get("hz", 1.0)
-    if not isinstance(hz, int | float) or not 0.0 < hz < np.inf:
+    if not _within(hz, 1e9) or hz <= 0.0:
         raise ConfigError(f"hz is {hz!r}", "hz = 25, or --hz 25")
-    reference = overrides.get("reference", given.get("reference", ""))
+    reference = str(overrides.get("reference", given.get("reference", "")))
     if reference:
         one_of("reference", reference, ("center", "front", "rear", "corner"))
     told = SAME | given.get("kinds", {}) | _table(overrides, "kinds")
@@ -241,6 +241,10 @@ def _require_columns(found: Mapping[str, Column], names: Sequence[str], where: s
             " (pyproj), and give x and y in metres"
         )
     raise ConversionError(f"{where} has {' and '.join(what)}; it has {', '.join(names)}", hint)
+
+
+def _within(value: object, most: float) -> bool:
+    return isinstance(value, int | float) and abs(value) <= most
 
 
 def _table(overrides: Mapping[str, Any], key: str) -> dict[str, str]:

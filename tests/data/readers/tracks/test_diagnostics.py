@@ -416,7 +416,12 @@ def test_repeated_rows_are_named(town, tmp_path):
         ({"kinds": {"1": "tank"}}, "kind 'tank' unknown"),
         ({"column": {}}, "setting 'column' unknown"),
         ({"shift_m": [1]}, "shift_m"),
+        ({"shift_m": [10**400, 0]}, "shift_m"),
+        ({"shift_m": 5}, "shift_m is 5"),
         ({"reference": "axle"}, "reference 'axle' unknown"),
+        ({"reference": 5}, "reference '5' unknown"),
+        ({"columns": ["x_m"]}, "columns is"),
+        ({"hz": 10**400}, "hz is"),
     ],
 )
 def test_what_is_said_wrongly_is_named(overrides, what, town, tmp_path):
