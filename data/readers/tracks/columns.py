@@ -135,22 +135,18 @@ def recognise(names: Sequence[str], overrides: Mapping[str, Any], where: str) ->
     """
     for key in overrides:
         one_of("setting", key, _SETTINGS)
-    by_name: dict[str, list[tuple[str, str]]] = {}
-    for name in names:
-        base, unit = _split_unit(name)
-        by_name.setdefault(base, []).append((name, unit))
-    fitting_layouts = [n for n, (m, _) in _LAYOUTS.items() if all(w in by_name for w in m.split())]
-    layout = fitting_layouts[0] if fitting_layouts else ""
+    split = [(*_split_unit(name), name) for name in names]
+    words = {word for word, *_ in split}
+    layout = next((n for n, (marks, _) in _LAYOUTS.items() if words >= {*marks.split()}), "")
     given = _LAYOUTS[layout][1] if layout else {}
     usual = _USUAL | given.get("units", {})
     found = {}
     for role, (quantity, known) in _ROLES.items():
-        for word in known.split():
-            fitting = [(n, u) for n, u in by_name.get(word, []) if not u or u in UNITS[quantity]]
-            if fitting:
-                name, unit = fitting[0]
-                found[role] = Column(name, unit or usual.get(quantity, ""))
-                break
+        surest, units = known.split(), UNITS.get(quantity, {})
+        fitting = [s for s in split if s[0] in surest and (not s[1] or s[1] in units)]
+        if fitting:
+            _, unit, name = min(fitting, key=lambda one: surest.index(one[0]))
+            found[role] = Column(name, unit or usual.get(quantity, ""))
     named = {r: n for r, n in given.get("columns", {}).items() if n.lstrip("-") in names}
     found |= _named_columns(named | _table(overrides, "columns"), found, names, usual, where)
     found = {role: column for role, column in found.items() if column.name or column.constant}

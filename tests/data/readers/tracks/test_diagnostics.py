@@ -342,6 +342,12 @@ def test_a_missing_column_is_named(name, town, tmp_path):
     assert "--" in error.value.hint
 
 
+def test_a_name_with_a_unit_where_none_belongs_is_not_known(town, tmp_path):
+    changed = {"kind": None, "kind [s]": town[0]["kind"]}
+    with pytest.raises(ConversionError, match="known as 'kind'"):
+        read_tracks(write_tracks(tmp_path / "t.csv", town[0], **changed))
+
+
 def test_columns_of_longitude_and_latitude_are_refused(town, tmp_path):
     changed = {"x_m": None, "y_m": None, "lon": town[0]["x_m"], "lat": town[0]["y_m"]}
     with pytest.raises(ConversionError) as error:
