@@ -225,32 +225,34 @@ class _TableFile(SourceFile):
         """
         try:
             if self.path.suffix.lower() in (".parquet", ".pq"):
-                return pq.read_table(self.path, use_threads=False)
-            with pa.input_stream(str(self.path), compression="detect") as stream:
-                data = stream.read()
-            lines = data[: 1 << 16].decode("utf-8-sig", "replace").splitlines()[:2]
-            if not lines:
-                raise ConversionError(f"{self.path} is empty", "export the tracks again")
-            delimiter = max(_DELIMITERS, key=lines[0].count)
-            if delimiter not in lines[0] and len(lines[0].split()) > 1:  # any number of spaces
-                data = b"\n".join(b",".join(row.split()) for row in data.splitlines())
-                lines = [",".join(lines[0].split())]
-            is_named = self._is_named(lines[0].split(delimiter), header)
-            has_comma = delimiter != "," and "," in lines[-1] and "." not in lines[-1]
-            return pc.read_csv(
-                io.BytesIO(data),
-                read_options=pc.ReadOptions(
-                    use_threads=False,
-                    column_names=header,
-                    skip_rows=int(is_named and header is not None),
-                ),
-                parse_options=pc.ParseOptions(delimiter=delimiter),
-                convert_options=pc.ConvertOptions(decimal_point="," if has_comma else "."),
-            )
+                table = pq.read_table(self.path, use_threads=False)
+            else:
+                table = self._read_csv(header)
+            self.require_that(table.column_names, "it has no columns")  # all names are UTF-8
+            return table
         except (OSError, pa.ArrowException, ValueError) as error:
             raise self.fault(
                 f"not readable ({error})", "give CSV in UTF-8, or Parquet (.parquet)"
             ) from error
+
+    def _read_csv(self, header: object) -> pa.Table:
+        with pa.input_stream(str(self.path), compression="detect") as stream:
+            data = stream.read()
+        lines = data[: 1 << 16].decode("utf-8-sig", "replace").splitlines()[:2]
+        if not lines:
+            raise ConversionError(f"{self.path} is empty", "export the tracks again")
+        delimiter = max(_DELIMITERS, key=lines[0].count)
+        if delimiter not in lines[0] and len(lines[0].split()) > 1:  # any number of spaces
+            data = b"\n".join(b",".join(row.split()) for row in data.splitlines())
+            lines = [",".join(lines[0].split())]
+        skipped = int(self._is_named(lines[0].split(delimiter), header) and header is not None)
+        has_comma = delimiter != "," and "," in lines[-1] and "." not in lines[-1]
+        return pc.read_csv(
+            io.BytesIO(data),
+            read_options=pc.ReadOptions(use_threads=False, column_names=header, skip_rows=skipped),
+            parse_options=pc.ParseOptions(delimiter=delimiter),
+            convert_options=pc.ConvertOptions(decimal_point="," if has_comma else "."),
+        )
 
     def _is_named(self, cells: list[str], header: object) -> bool:
         """Whether the first line of a file are names, not numbers."""
@@ -375,7 +377,14 @@ class _TableFile(SourceFile):
             values = column.to_numpy()
             if (values == np.rint(values)).all():
                 return pa.chunked_array([values.astype(np.int64)])
-        return column if pa.types.is_integer(column.type) else column.cast(pa.string())
+        return column if pa.types.is_integer(column.type) else self._texts(column, name)
+
+    def _texts(self, column: pa.ChunkedArray, name: str) -> pa.ChunkedArray:
+        try:
+            return column.cast(pa.string())
+        except (pa.ArrowException, ValueError) as error:
+            what = f"column {name!r} is {column.type}, need texts ({error})"
+            raise self.fault(what, "write the file in UTF-8") from error
 
     def categories(
         self, track_ids: NDArray[Any], track: IntArray
@@ -389,7 +398,7 @@ class _TableFile(SourceFile):
         else:
             values = self.table[column.name]
             if not pa.types.is_dictionary(values.type):
-                values = values.cast(pa.string())
+                values = self._texts(values, column.name)
             found, codes = dictionary_codes(values)
             names = [*map(str, found.to_pylist()), ""]
         plain = [normalise_category(name) for name in names]
