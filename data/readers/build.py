@@ -121,7 +121,7 @@ def make_samples(
     time_us, track, category, xy = time_us[order], track[order], category[order], xy[order]
     headings, velocities, sizes = headings[order], velocities[order], sizes[order]
     first_us = int(time_us.min() if frames is None else frames.time_us[0])
-    fault = find_twice(track_ids, track, time_us - first_us)
+    fault = find_twice(track_ids, track, (time_us - first_us) / 1e6)
     if fault := fault or (find_pause(time_us) if frames is None else None):
         raise ConversionError(f"{where}: {fault[0]}", fault[1])
     if frames is None:
@@ -180,12 +180,12 @@ def find_pause(time_us: NDArray[Any]) -> Fault:
     return None
 
 
-def find_twice(ids: NDArray[Any], track: IntArray, time_us: NDArray[Any]) -> Fault:
-    """Two rows of one object at one time [us]; rows (A,) are sorted by track and time."""
-    twice = np.flatnonzero((np.diff(track) == 0) & (np.diff(time_us) == 0))
+def find_twice(ids: NDArray[Any], track: IntArray, time: FloatArray) -> Fault:
+    """Two rows of one object at one time [s]; rows (A,) are sorted by track and time."""
+    twice = np.flatnonzero((np.diff(track) == 0) & (np.diff(time) == 0))
     if not len(twice):
         return None
-    name, when = ids[track[twice[0]]].item(), time_us[twice[0]] / 1e6
+    name, when = ids[track[twice[0]]].item(), time[twice[0]]
     return (
         f"object {name!r} has two rows at {when:g} s ({len(twice)} such rows): rows are repeated,"
         " or one id names two objects",

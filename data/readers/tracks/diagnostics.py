@@ -90,7 +90,7 @@ def _check_times(table: TrackTable, out: Diagnostics) -> bool:
             f"each of the {len(table.track_ids)} objects has one row only",
             "check the column of ids: an object needs the same id in all its rows",
         )
-    elif fault := find_twice(table.track_ids, table.track, table.time_us - table.time_us.min()):
+    elif fault := find_twice(table.track_ids, table.track, table.time):
         out.error(*fault)
     elif is_usual(period):
         if fault := find_pause(table.time_us):

@@ -166,9 +166,8 @@ def read_tracks(
 def _centers(table: TrackTable) -> FloatArray:
     """(A, 2) middles of the boxes, of whose positions the columns tell which point they are [m]."""
     reference, found = table.columns.reference, table.columns.found
-    if reference in ("", "center") or find_twice(
-        table.track_ids, table.track, table.time_us - table.time_us.min()
-    ):
+    twice = find_twice(table.track_ids, table.track, table.time)
+    if reference in ("", "center") or twice:
         return table.xy
     names = [table.categories[code] for code in table.category[table.ends[:-1]].tolist()]
     kinds = np.array([KINDS.get(name, AgentKind.VEHICLE) for name in names], np.int64)
@@ -231,9 +230,8 @@ class _TableFile(SourceFile):
             self.require_that(table.column_names, "it has no columns")  # all names are UTF-8
             return table
         except (OSError, pa.ArrowException, ValueError) as error:
-            raise self.fault(
-                f"not readable ({error})", "give CSV in UTF-8, or Parquet (.parquet)"
-            ) from error
+            remedy = "give CSV in UTF-8, or Parquet (.parquet)"
+            raise self.fault(f"not readable ({error})", remedy) from error
 
     def _read_csv(self, header: object) -> pa.Table:
         with pa.input_stream(str(self.path), compression="detect") as stream:
@@ -247,9 +245,10 @@ class _TableFile(SourceFile):
             lines = [",".join(lines[0].split())]
         skipped = int(self._is_named(lines[0].split(delimiter), header) and header is not None)
         has_comma = delimiter != "," and "," in lines[-1] and "." not in lines[-1]
+        read = pc.ReadOptions(use_threads=False, column_names=header, skip_rows=skipped)
         return pc.read_csv(
             io.BytesIO(data),
-            read_options=pc.ReadOptions(use_threads=False, column_names=header, skip_rows=skipped),
+            read_options=read,
             parse_options=pc.ParseOptions(delimiter=delimiter),
             convert_options=pc.ConvertOptions(decimal_point="," if has_comma else "."),
         )
@@ -274,9 +273,7 @@ class _TableFile(SourceFile):
     def _read_beside(self, overrides: dict[str, Any], names: list[str]) -> None:
         """Origin, rate and kinds from levelXdata's files; what the user gives goes first."""
         stem = self.path.stem.removesuffix("tracks")
-        rates, kinds = (
-            self.path.with_name(f"{stem}{part}Meta.csv") for part in ("recording", "tracks")
-        )
+        rates, kinds = (self.path.with_name(f"{stem}{p}Meta.csv") for p in ("recording", "tracks"))
         file = rates
         try:
             if rates.is_file():
@@ -285,8 +282,7 @@ class _TableFile(SourceFile):
                 if "xUtmOrigin" in meta:
                     self.origin = float(meta["xUtmOrigin"][0]), float(meta["yUtmOrigin"][0])
             file = kinds
-            has_kinds = {"class", "kind"} & {name.lower() for name in names}
-            if kinds.is_file() and not has_kinds:
+            if kinds.is_file() and not {"class", "kind"} & {*map(str.lower, names)}:
                 found = pc.read_csv(kinds).to_pydict()
                 ids = found["trackId" if "trackId" in found else "id"]
                 self.kinds = dict(zip(ids, map(str, found["class"]), strict=True))
@@ -303,11 +299,7 @@ class _TableFile(SourceFile):
             except ValueError:
                 what = f"column {role!r} is {column.constant!r} for all rows"
                 raise ConfigError(what, f"{role} = '=NUMBER'") from None
-        try:
-            values = _floats(self.table[column.name])
-        except (pa.ArrowException, ValueError) as error:
-            kind = self.table[column.name].type
-            raise self.fault(f"column {column.name!r} is {kind}, need numbers") from error
+        values = self._cast(column.name, pa.float64(), "numbers").to_numpy().copy()
         needed = role in ("x", "y")
         self._refuse(
             column,
@@ -344,7 +336,7 @@ class _TableFile(SourceFile):
             elif pa.types.is_string(values.type):  # a clock: 09:00:00.033
                 dates = pa.compute.binary_join_element_wise("1970-01-01T", values, "")
                 values, column = dates.cast(pa.timestamp("us")).cast(pa.int64()), _IN_US
-            stamps = _floats(values)
+            stamps = values.cast(pa.float64(), safe=False).to_numpy().copy()  # ns have 64 bits
         except (pa.ArrowException, ValueError) as error:
             what = f"column {column.name!r} is {values.type}, need times"
             hint = "give seconds, 13:02:03.040, or dates with times: 2024-05-01T13:02:03.040"
@@ -377,14 +369,15 @@ class _TableFile(SourceFile):
             values = column.to_numpy()
             if (values == np.rint(values)).all():
                 return pa.chunked_array([values.astype(np.int64)])
-        return column if pa.types.is_integer(column.type) else self._texts(column, name)
+        is_integer = pa.types.is_integer(column.type)
+        return column if is_integer else self._cast(name, pa.string(), "texts in UTF-8")
 
-    def _texts(self, column: pa.ChunkedArray, name: str) -> pa.ChunkedArray:
-        try:
-            return column.cast(pa.string())
+    def _cast(self, name: str, kind: pa.DataType, need: str) -> pa.ChunkedArray:
+        try:  # integers of 64 bits may be rounded
+            return self.table[name].cast(kind, safe=not pa.types.is_floating(kind))
         except (pa.ArrowException, ValueError) as error:
-            what = f"column {name!r} is {column.type}, need texts ({error})"
-            raise self.fault(what, "write the file in UTF-8") from error
+            what = f"column {name!r} is {self.table[name].type}, need {need}"
+            raise self.fault(what) from error
 
     def categories(
         self, track_ids: NDArray[Any], track: IntArray
@@ -398,16 +391,10 @@ class _TableFile(SourceFile):
         else:
             values = self.table[column.name]
             if not pa.types.is_dictionary(values.type):
-                values = self._texts(values, column.name)
+                values = self._cast(column.name, pa.string(), "texts in UTF-8")
             found, codes = dictionary_codes(values)
             names = [*map(str, found.to_pylist()), ""]
         plain = [normalise_category(name) for name in names]
         known = [self.columns_of.kinds.get(name, name) for name in plain]
         distinct, place = np.unique(known, return_inverse=True)
         return place[codes], tuple(distinct.tolist())
-
-
-def _floats(column: pa.ChunkedArray) -> FloatArray:
-    """(A,) numbers that may be written; NaN where there is none."""
-    values: FloatArray = column.cast(pa.float64(), safe=False).to_numpy()  # ns have 64 bits
-    return values if values.flags.writeable else values.copy()
