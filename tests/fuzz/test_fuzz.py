@@ -137,6 +137,11 @@ def _packed(data):
     return change
 
 
+def _repeated(path):
+    table = pq.read_table(path)
+    pq.write_table(pa.concat_tables([table] * 700), path)
+
+
 DIGITS = "9" * 5_000
 STRANGE = {
     "av2": [
@@ -168,6 +173,7 @@ STRANGE = {
     ],
     "experiment": [
         ("scores", "scores.parquet", partial(_twice, name="score")),
+        ("scores", "scores.parquet", _repeated),
         ("metric", "metric.parquet", _whole(DEEP)),
         ("log", "log.msgpack.xz", _xz(b"\xc6\xff\xff\xff\xff")),
         ("log", "log.msgpack.xz", _xz(b"\x91" * 20_000 + b"\x90")),
