@@ -62,7 +62,7 @@ def _best_shift(road: VectorMap, points: FloatArray) -> tuple[FloatArray, float]
     num_map = np.ceil((high - low) / cell).astype(np.int64) + 1
     index = np.floor((points - points_low) / cell).astype(np.int64)
     inside = index[(index < num_map).all(axis=1)]
-    grid = np.indices(num_map).reshape(2, -1).T
+    grid = np.indices(num_map.tolist()).reshape(2, -1).T
     centers = low + (grid + 0.5) * cell
     area = are_drivable(road, np.ascontiguousarray(centers)).reshape(num_map)
     counts = np.zeros(num_map)
