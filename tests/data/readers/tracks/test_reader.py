@@ -162,6 +162,16 @@ def test_velocities_and_headings_that_are_not_given_follow_from_the_places(town)
     assert bare.warnings["tracks without size (that of their kind)"] == len(bare.track_ids)
 
 
+def test_a_track_with_an_impossible_velocity_gets_that_of_its_places(town):
+    fast = town[0]["vx_mps"].copy()
+    fast[100] = 1e30
+    samples, before = _samples(town[0], vx_mps=fast), _samples(town[0])
+    assert np.abs(samples.velocities).max() < 60.0
+    assert samples.warnings["tracks whose stored velocity does not fit (derived)"] == 1
+    same = samples.track != samples.track_ids.tolist().index(town[0]["track"][100])
+    np.testing.assert_array_equal(samples.velocities[same], before.velocities[same])
+
+
 @pytest.mark.parametrize("hz", [2.0, 4.0, 10.0, 12.5, 29.97, 100.0])
 def test_fitted_velocities_of_a_parabola_are_exact(hz):
     time = np.arange(round(3 * hz)) / hz
