@@ -185,19 +185,17 @@ def overlap_partners(
     nuPlan rule 451: with the recorded sizes, and tracks of all categories. Only rows of the
     `candidates` (N,) are looked at.
     """
-    sizes = recording.sizes[recording.track, :2]
+    track, none = recording.track, len(recording.track_ids)
     poses = np.column_stack([recording.xy, recording.raw_headings])
-    boxes = shapely.polygons(boxes_to_corners(poses, sizes))
-    none, wanted = len(recording.track_ids), candidates[recording.track]
-    partner = np.full(len(boxes), none)
+    corners = boxes_to_corners(poses, recording.sizes[track, :2])
+    partner = np.full(len(track), none)
     for rows in np.split(recording.by_frame, recording.frame_ptr[1:-1]):
-        asked = rows[wanted[rows]]
-        one, other = shapely.STRtree(boxes[rows]).query(boxes[asked], predicate="intersects")
-        one, other = asked[one], rows[other]
+        boxes, asked = shapely.polygons(corners[rows]), np.flatnonzero(candidates[track[rows]])
+        one, other = shapely.STRtree(boxes).query(boxes[asked], predicate="intersects")
+        one = asked[one]
         one, other = one[one != other], other[one != other]
-        if len(one):
-            much = shapely.area(shapely.intersection(boxes[one], boxes[other])) > max_overlap
-            np.minimum.at(partner, one[much], recording.track[other[much]])
+        much = shapely.area(shapely.intersection(boxes[one], boxes[other])) > max_overlap
+        np.minimum.at(partner, rows[one[much]], track[rows[other[much]]])
     return np.where(partner == none, -1, partner)
 
 
