@@ -24,7 +24,7 @@ from track_files import export_town, write_tracks
 from worlds import cruise_scenario
 
 from shiftsim.data.readers.dsc3d import convert_dsc3d
-from shiftsim.data.readers.tracks.inspection import convert_tracks, inspect_tracks
+from shiftsim.data.readers.tracks.reader import TracksReader, convert_tracks
 from shiftsim.data.recording import visible_columns
 from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import ScenarioStore
@@ -101,7 +101,7 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
 
     def convert_table() -> None:
         shutil.rmtree(folder / "own", ignore_errors=True)
-        convert_tracks(inspect_tracks(table, town[1], city="roundabout"), folder / "own")
+        convert_tracks(TracksReader(table, town[1], city="roundabout"), folder / "own")
         check_store(folder / "own")
 
     def drive_edited() -> None:

@@ -7,27 +7,18 @@ taken as truth, heading through the rotation matrix.
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from scipy.spatial.transform import Rotation
 
-from shiftsim.data.readers.build import (
-    dictionary_codes,
-    find_pause,
-    find_twice,
-    track_categories,
-)
+from shiftsim.data.readers.build import Frames, dictionary_codes, find_pause, make_samples
 from shiftsim.data.readers.codes import CATEGORIES, normalise_category
 from shiftsim.data.readers.files import SourceFile
-from shiftsim.data.readers.motion import (
-    believed_velocities,
-    held_headings,
-    track_ends,
-    track_medians,
-)
+from shiftsim.data.readers.motion import track_medians
 from shiftsim.data.readers.samples import TrackSamples
 from shiftsim.errors import ConversionError
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
@@ -44,7 +35,6 @@ _BOXES = {
 }
 _FRAMES = {"frame_id": pa.float64(), "time": pa.timestamp("us", "UTC")}
 _MAX_VELOCITY_ERROR = 0.5  # m/s, median of a track; beyond it the stored velocity is not believed
-_MAX_SPEED = 200.0  # m/s along an axis
 _EPS = 1e-9  # s
 # Far beyond any recording: what exceeds them is damaged or hostile.
 _MAX_TRACKS = 100_000
@@ -118,64 +108,45 @@ def read_recording(
         return np.column_stack([file.values(table, name) for name in names])
 
     row_frames, ids = matrix("frame_id", "track_id").astype(np.int64).T
-    order = np.lexsort((row_frames, ids))
-    track_ids, track = np.unique(ids[order], return_inverse=True)
-    row_frames = row_frames[order]
     frame = np.searchsorted(frames, row_frames)
     missing = row_frames[frames[np.minimum(frame, len(frames) - 1)] != row_frames]
     if len(missing):
-        what = f"frame_id {missing[0]} is not listed in frames.parquet"
+        what = f"frame_id {np.sort(missing)[0]} is not listed in frames.parquet"
         raise file.fault(f"{what} ({len(missing)} such rows)")
+    track_ids, track = np.unique(ids, return_inverse=True)
     num_tracks, most = len(track_ids), int(np.bincount(frame).max())
     file.require_that(num_tracks <= _MAX_TRACKS, f"{num_tracks} tracks, more than {_MAX_TRACKS}")
     file.require_that(most <= _MAX_AT_ONCE, f"{most} boxes in one frame, more than {_MAX_AT_ONCE}")
-    time = clock[frame]
-    if fault := find_twice(track_ids, track, time * 1e6):
-        raise file.fault(*fault)
-    dimensions = matrix(*DIMENSION)[order]
+    dimensions = matrix(*DIMENSION)
     bad = dimensions[~(dimensions > 0).all(axis=1)]
     file.require_that(
         not len(bad), f"a box has the dimensions {bad[:1].tolist()}; all must be positive"
     )
-    sizes = track_medians(dimensions, track)
-    varying = np.unique(track[(np.abs(dimensions - sizes[track]) > 1e-3).any(axis=1)])
+    sizes = track_medians(dimensions, track)[track]
+    varying = np.unique(track[(np.abs(dimensions - sizes) > 1e-3).any(axis=1)])
     warnings["tracks of varying size (median taken)"] += len(varying)
     found, codes = dictionary_codes(table["category"])
     given = {normalise_category(k): normalise_category(v) for k, v in (category_map or {}).items()}
     categories = [normalise_category(str(category)) for category in found.to_pylist()]
-    names = track_categories(
-        str(file.path),
-        codes[order],
-        [given.get(category, category) for category in categories],
-        track,
-        CATEGORIES,
-        warnings,
+    angles, up = rotation_angles(matrix(*ROTATION))
+    time_us = stamps[0] + np.rint(clock * 1e6).astype(np.int64)
+    samples = make_samples(
+        name,
+        time_us=time_us[frame],
+        ids=ids,
+        category=codes,
+        categories=[given.get(category, category) for category in categories],
+        xy=matrix(*POSITION[:2]) + 0.5 * sizes[:, 2:] * up[:, :2],  # nuPlan rule 461
+        headings=np.ascontiguousarray(angles[:, 0]),
+        velocities=matrix(*VELOCITY) if set(VELOCITY) <= set(table.column_names) else None,
+        sizes=sizes,
+        kind_of=CATEGORIES,
+        frames=Frames(time_us, clock, site.period),
+        velocity_rule=_by_error,
+        where=str(file.path),
         remedy="map it: --category NAME=… with one of",
     )
-    angles, up = rotation_angles(matrix(*ROTATION)[order])
-    yaw = np.ascontiguousarray(angles[:, 0])
-    xy = matrix(*POSITION[:2])[order] + 0.5 * sizes[track, 2:] * up[:, :2]  # nuPlan rule 461
-    stored = matrix(*VELOCITY)[order] if set(VELOCITY) <= set(table.column_names) else None
-    derived = _central_differences(xy, time, track)
-    contradicts = None if stored is None else _contradicts(stored, derived, track)
-    velocities = believed_velocities(stored, derived, contradicts, track, warnings)
-    return TrackSamples(
-        name=name,
-        start_us=int(stamps[0]),
-        period=site.period,
-        clock=clock,
-        frame=frame,
-        track=track,
-        xy=xy,
-        raw_headings=yaw,
-        headings=held_headings(yaw, velocities, time, track, warnings),
-        velocities=velocities,
-        track_ids=track_ids,
-        categories=names,
-        kinds=np.array([CATEGORIES[name] for name in names], np.int64),
-        sizes=sizes,
-        warnings=dict(+warnings),
-    )
+    return replace(samples, warnings=dict(+(warnings + Counter(samples.warnings))))
 
 
 def rotation_angles(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -183,16 +154,11 @@ def rotation_angles(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
 
     `rotation` is (A, 3) axis times angle, object to local frame [rad].
     """
-    angle = np.linalg.norm(rotation, axis=1)
-    x, y, z = rotation.T
-    sine = np.sinc(angle / np.pi)  # sin(a) / a
-    rest = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2  # (1 - cos(a)) / a^2
-    cos = np.cos(angle)
-    yaw = np.arctan2(z * sine + x * y * rest, cos + x * x * rest)
-    pitch = -np.arcsin(np.clip(x * z * rest - y * sine, -1.0, 1.0))
-    up = np.stack([y * sine + x * z * rest, y * z * rest - x * sine, cos + z * z * rest], axis=1)
-    roll = np.arctan2(x * sine + y * z * rest, up[:, 2])
-    return np.stack([yaw, pitch, roll], axis=1), up
+    matrix = Rotation.from_rotvec(rotation).as_matrix()
+    yaw = np.arctan2(matrix[:, 1, 0], matrix[:, 0, 0])
+    pitch = -np.arcsin(np.clip(matrix[:, 2, 0], -1.0, 1.0))
+    roll = np.arctan2(matrix[:, 2, 1], matrix[:, 2, 2])
+    return np.stack([yaw, pitch, roll], axis=1), matrix[:, :, 2]
 
 
 def _read_frames(file: Dsc3dFile, apart: int) -> tuple[IntArray, IntArray]:
@@ -209,19 +175,14 @@ def _read_frames(file: Dsc3dFile, apart: int) -> tuple[IntArray, IntArray]:
     return ids, stamps
 
 
-def _central_differences(xy: FloatArray, time: FloatArray, track: IntArray) -> FloatArray:
-    """(A, 2) difference of the neighbouring rows of the same track, one-sided at its ends."""
-    index = np.arange(len(track))
-    before = np.where(np.r_[False, track[1:] == track[:-1]], index - 1, index)
-    after = np.where(np.r_[track[1:] == track[:-1], False], index + 1, index)
+def _by_error(
+    stored: FloatArray, xy: FloatArray, time: FloatArray, track: IntArray, _period: float
+) -> tuple[FloatArray, BoolArray]:
+    """Differences of the neighbouring rows, one-sided at the ends of a track; nuPlan rule 459."""
+    index, same = np.arange(len(track)), track[1:] == track[:-1]
+    before, after = index - np.r_[False, same], index + np.r_[same, False]
     span = np.maximum(time[after] - time[before], _EPS)
-    return (xy[after] - xy[before]) / span[:, None]
-
-
-def _contradicts(stored: FloatArray, derived: FloatArray, track: IntArray) -> BoolArray:
-    """(N,) whether the stored velocities of a track contradict its positions (nuPlan rule 459)."""
-    error = np.hypot(*(derived - stored).T)
-    wrong = track_medians(error, track) >= _MAX_VELOCITY_ERROR
-    wrong &= np.diff(track_ends(track)) > 1  # a single row has nothing to compare with
-    wrong[track[np.abs(stored).max(axis=1) > _MAX_SPEED]] = True
-    return wrong
+    derived = (xy[after] - xy[before]) / span[:, None]
+    wrong = track_medians(np.hypot(*(derived - stored).T), track) >= _MAX_VELOCITY_ERROR
+    wrong &= np.bincount(track) > 1  # a single row has nothing to compare with
+    return derived, wrong

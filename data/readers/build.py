@@ -5,9 +5,9 @@ be is an error; what can be repaired is repaired and counted.
 """
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -31,18 +31,42 @@ from shiftsim.data.readers.samples import (
     sample_run,
 )
 from shiftsim.errors import ConversionError
-from shiftsim.kernels import FloatArray, IntArray
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.world.state import AgentKind
 
 MAX_PAUSE_S = 3600.0  # s without a row of any object within one recording
 MAX_SPAN_S = 1e5  # s from the first row to the last one
+_MAX_SPEED = 200.0  # m/s along an axis; a track with a faster row is not believed
+
+
+class Frames(NamedTuple):
+    """The frames of a recording, where its source lists them, those without objects included."""
+
+    time_us: IntArray  # (F,) time stamps, ascending [us]
+    clock: FloatArray  # (F,) time since the first one [s]
+    period: float  # nominal time between frames [s]
+
+
+# (A, 2) velocities by the positions and (N,) whether the stored ones of a track contradict them,
+# from stored velocities, places, times, tracks and the period of the rows
+VelocityRule = Callable[
+    [FloatArray, FloatArray, FloatArray, IntArray, float], tuple[FloatArray, BoolArray]
+]
+
+
+def by_share_of_speed(
+    stored: FloatArray, xy: FloatArray, time: FloatArray, track: IntArray, period: float
+) -> tuple[FloatArray, BoolArray]:
+    """The rule for tables: slopes of parabolas; errors of 10 % of the speed contradict."""
+    derived = fitted_velocities(xy, time, track, period)
+    return derived, contradiction(stored, derived, time, track)[0]
 
 
 def make_samples(
     name: str,
     *,
     time_us: IntArray,
-    ids: NDArray[Any],
+    ids: Any,
     category: IntArray,
     categories: Sequence[str] = tuple(KIND_NAMES),
     xy: FloatArray,
@@ -50,6 +74,10 @@ def make_samples(
     velocities: FloatArray | None = None,
     sizes: FloatArray | None = None,
     kind_of: Mapping[str, AgentKind] = CATEGORIES | KIND_NAMES,
+    frames: Frames | None = None,
+    velocity_rule: VelocityRule = by_share_of_speed,
+    where: str = "",
+    remedy: str = "map it to one of",
 ) -> TrackSamples:
     """A recording from its columns. A rows, one per object and time, in any order.
 
@@ -63,52 +91,56 @@ def make_samples(
         headings: (A,) [rad]; the direction of motion where it is not given, or NaN.
         velocities: (A, 2) in the frame of `xy` [m/s], NaN where unknown. Derived from the positions
             where they are not given, and for tracks where they contradict the positions.
-        sizes: (A, 2) length, width [m]; the usual size of a kind (`SIZES`) where it is not given,
-            NaN or 0. A track gets the median.
+        sizes: (A, 2 or 3) length, width, height [m]; the usual size of a kind (`SIZES`) where it is
+            not given, NaN or 0. A track gets the median.
         kind_of: AgentKind by name of a category.
+        frames: The frames that the rows belong to; those at which there is a row by default.
+        velocity_rule: Which velocities are believed.
+        where: The file, for messages; the name of the recording by default.
+        remedy: What to do about an unknown category, before the list of those known.
 
     Raises:
         ConversionError: A value is not finite, a category is unknown, or an object has two rows at
             one time. Nothing is seen for an hour, or the rows span more than a day.
     """
-    warnings: Counter[str] = Counter()
-    for what, bad in (
-        ("position", int((~np.isfinite(xy)).sum())),
-        ("heading", 0 if headings is None else int(np.isinf(headings).sum())),
-    ):
-        if bad:
+    where, warnings = where or name, Counter[str]()
+    headings = np.full(len(xy), np.nan) if headings is None else headings
+    velocities = np.full((len(xy), 2), np.nan) if velocities is None else velocities
+    sizes = np.zeros((len(xy), 2)) if sizes is None else sizes
+    for what, is_bad in ("position", ~np.isfinite(xy)), ("heading", np.isinf(headings)):
+        if is_bad.any():
             raise ConversionError(
-                f"{name}: {bad} values of {what} are not finite", "leave those rows out"
+                f"{where}: {is_bad.sum()} values of {what} are not finite", "leave those rows out"
             )
-    if len(time_us) < 2 or time_us.min() == time_us.max():
+    if frames is None and (len(time_us) < 2 or time_us.min() == time_us.max()):
         raise ConversionError(
-            f"{name}: {len(time_us)} rows at one time", "give rows at two times or more"
+            f"{where}: {len(time_us)} rows at one time", "give rows at two times or more"
         )
     track_ids, track = index_ids(ids)
     order = np.lexsort((time_us, track))
     time_us, track, category, xy = time_us[order], track[order], category[order], xy[order]
-    headings, velocities, sizes = (
-        None if part is None else part[order] for part in (headings, velocities, sizes)
-    )
-    if fault := find_twice(track_ids, track, time_us) or find_pause(time_us):
-        raise ConversionError(f"{name}: {fault[0]}", fault[1])
-    stamps, frame = np.unique(time_us, return_inverse=True)
-    time = (time_us - stamps[0]) / 1e6
-    step = np.diff(time)[track[1:] == track[:-1]]
-    period = float(np.median(step)) if len(step) else ROW_S
-    names = track_categories(name, category, categories, track, kind_of, warnings)
+    headings, velocities, sizes = headings[order], velocities[order], sizes[order]
+    first_us = int(time_us.min() if frames is None else frames.time_us[0])
+    fault = find_twice(track_ids, track, (time_us - first_us) / 1e6)
+    if fault := fault or (find_pause(time_us) if frames is None else None):
+        raise ConversionError(f"{where}: {fault[0]}", fault[1])
+    if frames is None:
+        stamps, step = np.unique(time_us), np.diff(time_us)[np.diff(track) == 0]
+        period = float(np.median(step / 1e6)) if len(step) else ROW_S
+        frames = Frames(stamps, (stamps - stamps[0]) / 1e6, period)
+    frame = np.searchsorted(frames.time_us, time_us)
+    time = frames.clock[frame]
+    names = _track_categories(where, category, categories, track, kind_of, warnings, remedy)
     kinds = np.array([kind_of[category] for category in names], np.int64)
-    derived = fitted_velocities(xy, time, track, period)
-    contradicts = None
-    if velocities is not None:
-        contradicts = contradiction(velocities, derived, time, track)[0]
+    derived, contradicts = velocity_rule(velocities, xy, time, track, frames.period)
+    contradicts[track[(np.abs(velocities) > _MAX_SPEED).any(axis=1)]] = True
     velocities = believed_velocities(velocities, derived, contradicts, track, warnings)
     raw = full_headings(headings, velocities, track, warnings)
     samples = TrackSamples(
         name=name,
-        start_us=int(stamps[0]),
-        period=period,
-        clock=(stamps - stamps[0]) / 1e6,
+        start_us=first_us,
+        period=frames.period,
+        clock=frames.clock,
         frame=frame,
         track=track,
         xy=xy,
@@ -121,8 +153,8 @@ def make_samples(
         sizes=full_sizes(sizes, names, kinds, track, warnings),
         warnings=dict(+warnings),
     )
-    if float(np.median(np.diff(samples.clock))) < 0.5 * period:
-        return on_common_clock(samples)
+    if float(np.median(np.diff(frames.clock))) < 0.5 * frames.period:
+        return _on_common_clock(samples)
     return samples
 
 
@@ -148,12 +180,12 @@ def find_pause(time_us: NDArray[Any]) -> Fault:
     return None
 
 
-def find_twice(ids: NDArray[Any], track: IntArray, time_us: NDArray[Any]) -> Fault:
-    """Two rows of one object at one time; rows (A,) are sorted by track and time."""
-    twice = np.flatnonzero((np.diff(track) == 0) & (np.diff(time_us) == 0))
+def find_twice(ids: NDArray[Any], track: IntArray, time: FloatArray) -> Fault:
+    """Two rows of one object at one time [s]; rows (A,) are sorted by track and time."""
+    twice = np.flatnonzero((np.diff(track) == 0) & (np.diff(time) == 0))
     if not len(twice):
         return None
-    name, when = ids[track[twice[0]]].item(), (time_us[twice[0]] - time_us.min()) / 1e6
+    name, when = ids[track[twice[0]]].item(), time[twice[0]]
     return (
         f"object {name!r} has two rows at {when:g} s ({len(twice)} such rows): rows are repeated,"
         " or one id names two objects",
@@ -161,7 +193,7 @@ def find_twice(ids: NDArray[Any], track: IntArray, time_us: NDArray[Any]) -> Fau
     )
 
 
-def on_common_clock(samples: TrackSamples) -> TrackSamples:
+def _on_common_clock(samples: TrackSamples) -> TrackSamples:
     """The same recording with a row every 0.05 s, where objects have times of their own."""
     runs = samples.runs
     first, last = rows_between(samples.time[runs.first], samples.time[runs.last])
@@ -218,15 +250,14 @@ def dictionary_codes(column: pa.ChunkedArray) -> tuple[pa.Array, IntArray]:
     return encoded.dictionary, codes.to_numpy().astype(np.int64, copy=False)
 
 
-def track_categories(
+def _track_categories(
     where: str,
     category: IntArray,
     names: Sequence[str],
     track: IntArray,
     known: Collection[str],
     warnings: Counter[str],
-    *,
-    remedy: str = "map it to one of",
+    remedy: str,
 ) -> tuple[str, ...]:
     """N most frequent category of every track; `category` (A,) are indices of `names`.
 
@@ -247,35 +278,31 @@ def track_categories(
 
 
 def full_headings(
-    headings: FloatArray | None, velocities: FloatArray, track: IntArray, warnings: Counter[str]
+    headings: FloatArray, velocities: FloatArray, track: IntArray, warnings: Counter[str]
 ) -> FloatArray:
     """(A,) headings; where not given the direction of motion, at standstill the last or next."""
-    if headings is None:
-        return headings_of_motion(velocities, track, warnings)
     given = np.isfinite(headings)
     if given.all():
         return headings
-    warnings["rows without heading (direction of motion)"] += int((~given).sum())
+    if given.any():
+        warnings["rows without heading (direction of motion)"] += int((~given).sum())
     ways = np.where(given[:, None], unit_vectors(headings), velocities)
     return np.where(given, headings, headings_of_motion(ways, track, warnings))
 
 
 def full_sizes(
-    sizes: FloatArray | None,
+    sizes: FloatArray,
     categories: Sequence[str],
     kinds: IntArray,
     track: IntArray,
     warnings: Counter[str],
 ) -> FloatArray:
-    """(N, 2) median of the sizes of every track; where it has none, that of its category."""
+    """(N, 2 or 3) median of the sizes of every track; where it has none, that of its category."""
     each = zip(categories, kinds.tolist(), strict=True)
     usual = np.array([LARGE.get(name) or SIZES[AgentKind(kind)] for name, kind in each])
-    medians = np.zeros_like(usual)
-    if sizes is not None:
-        known = (sizes > 0.0).all(axis=1)  # rows without a size say nothing of it
-        if known.any():
-            found = track_medians(sizes[known], track[known])
-            medians[: len(found)] = found
-    lacking = ~np.all(medians > 0.0, axis=1)
+    known = (sizes > 0.0).all(axis=1)  # rows without a size say nothing of it
+    medians = track_medians(sizes[known], track[known], len(usual))
+    lacking = ~(medians > 0.0).all(axis=1)
     warnings["tracks without size (that of their kind)"] += int(lacking.sum())
-    return np.where(np.expand_dims(lacking, 1), usual, medians)
+    medians[lacking, :2] = usual[lacking]
+    return medians

@@ -18,7 +18,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any
 
 from shiftsim._version import __version__
 from shiftsim.data.readers.reader import Reader
@@ -46,16 +47,10 @@ Make = Callable[[], Callable[[str], Any]]
 Executor = Callable[[Make, Sequence[str]], Iterable[Any]]
 
 
-class _Outcome(NamedTuple):
-    task: str
-    result: Any
-    death: str = ""
-
-
-def serial_map(make: Make, tasks: Sequence[str]) -> Iterator[_Outcome]:
+def serial_map(make: Make, tasks: Sequence[str]) -> Iterator[SimpleNamespace]:
     """What `Executor` means, in this process."""
     function = make()
-    yield from (_Outcome(task, function(task)) for task in tasks)
+    yield from (SimpleNamespace(task=task, result=function(task), death="") for task in tasks)
 
 
 @dataclass

@@ -64,26 +64,23 @@ class Dsc3dReader(Reader):
         self.name = site or src.resolve().name
         self.source = self.download.folder
         path = find_map(self.download, map_path)
-        self.site: BuiltMap = self._map(path)
-        self.settings = {
-            "site": [self.name, *self.download.offset.tolist()],
-            "rate": [self.download.frame_rate, self.download.frame_distance],
-            "config": asdict(self.config),
-            "map": digest(path),
-        }
-
-    def _map(self, path: Path) -> BuiltMap:
         drive = read_opendrive(path)
         _check_georeference(drive, self.download)
         x, y, *_ = drive.offset or (0.0, 0.0)
         place = self.download.offset
-        return opendrive_site(
+        self.site: BuiltMap = opendrive_site(
             drive,
             name=self.name,
             offset=(float(place[0]) - x, float(place[1]) - y),  # the header's is applied
             epsg=self.download.epsg,
             country=self.config.country,
         )
+        self.settings = {
+            "site": [self.name, *self.download.offset.tolist()],
+            "rate": [self.download.frame_rate, self.download.frame_distance],
+            "config": asdict(self.config),
+            "map": digest(path),
+        }
 
     def recordings(self) -> Sequence[str]:
         """Names as listed in `data_meta.json`."""
@@ -219,16 +216,14 @@ def find_map(site: Site, given: Path | None = None) -> Path:
 
 def _check_georeference(drive: OpenDrive, site: Site) -> None:
     """Refuse a map whose own georeference contradicts that of the annotations."""
-    offset = drive.offset or (0.0, 0.0, 0.0, 0.0)
-    if drive.geo_reference is None:
-        own = offset[:2]
-        if own == (0.0, 0.0):
-            return
-    else:
+    own = (drive.offset or (0.0, 0.0))[:2]
+    if drive.geo_reference is None and own == (0.0, 0.0):
+        return
+    if drive.geo_reference is not None:
         try:
             crs = pyproj.CRS.from_user_input(drive.geo_reference)
             to_utm = pyproj.Transformer.from_crs(crs, site.epsg, always_xy=True)
-            own = to_utm.transform(offset[0], offset[1])
+            own = to_utm.transform(*own)
         except pyproj.exceptions.ProjError:
             return  # not a projection: the map counts as local
     if not np.hypot(own[0] - site.offset[0], own[1] - site.offset[1]) <= _MAX_FRAME_SHIFT:

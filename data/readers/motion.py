@@ -7,9 +7,10 @@ from collections import Counter
 from itertools import pairwise
 
 import numpy as np
+from scipy import ndimage
 
-from shiftsim.geometry.boxes import wrap_angle
-from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.geometry.boxes import wrap_angles
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 
 _HALF_WINDOW = 0.25  # s on each side of a fit
 _EPS = 1e-6  # s
@@ -24,22 +25,19 @@ def track_ends(track: IntArray) -> IntArray:
     return np.searchsorted(track, np.arange(int(track[-1]) + 2))
 
 
-def track_medians(values: FloatArray, track: IntArray) -> FloatArray:
-    """(N,) or (N, D) median of the rows of each track; values (A,) or (A, D), track (A,) sorted."""
+def track_medians(values: FloatArray, track: IntArray, num_tracks: int = 0) -> FloatArray:
+    """(N,) or (N, D) median of the rows of each track: values (A,) or (A, D), track (A,).
+
+    NaN for a track without rows; a NaN among the values counts as larger than all numbers. There
+    are `num_tracks` tracks, or as many as have rows.
+    """
     if values.ndim == 2:
-        return np.column_stack([track_medians(column, track) for column in values.T])
-    return np.array(
-        [median(values[low:high]) for low, high in pairwise(track_ends(track).tolist())]
-    )
-
-
-def median(values: FloatArray) -> float:
-    """Median of values (n,); NaN of none, and NaN counts as larger than all numbers."""
-    if not len(values):
-        return float("nan")
-    low, high = (len(values) - 1) // 2, len(values) // 2
-    ranked = np.partition(values, (low, high))
-    return 0.5 * float(ranked[low] + ranked[high])
+        return np.column_stack([track_medians(part, track, num_tracks) for part in values.T])
+    present = np.unique(track)
+    medians = np.full(num_tracks or int(present[-1]) + 1, np.nan)
+    if len(present):
+        medians[present] = ndimage.median(values, track, present)
+    return medians
 
 
 def unit_vectors(headings: FloatArray) -> FloatArray:
@@ -55,7 +53,36 @@ def fitted_velocities(
     Where frames are farther apart, through the neighbours. A row without one has velocity 0.
     """
     half = max(_HALF_WINDOW, 1.5 * period) + _EPS
-    return _fit(np.ascontiguousarray(xy), time, track_ends(track), half)
+    low, high = np.empty_like(track), np.empty_like(track)  # the rows of each fit
+    for first, stop in pairwise(track_ends(track).tolist()):
+        times = time[first:stop]
+        low[first:stop] = first + np.searchsorted(times, times - half)
+        high[first:stop] = first + np.searchsorted(times, times + half, side="right")
+    count = high - low
+    s, y = np.zeros((5, len(time))), np.zeros((3, 2, len(time)))  # sums of t^i, and of t^i (dx, dy)
+    rows = np.flatnonzero(count > 1)
+    other = low[rows]
+    while len(rows):
+        t, way = (time[other] - time[rows]) / half, (xy[other] - xy[rows]).T
+        power = np.ones_like(t)
+        for degree in range(5):
+            s[degree, rows] += power
+            if degree < 3:
+                y[degree][:, rows] += power * way
+            power = power * t
+        is_more = other + 1 < high[rows]
+        rows, other = rows[is_more], other[is_more] + 1
+    a, b, c = y
+    with np.errstate(divide="ignore", invalid="ignore"):  # rows without neighbours, or at one time
+        line = (b * s[0] - a * s[1]) / (s[2] * s[0] - s[1] * s[1]) / half
+        # second of three normal equations, by Cramer's rule
+        determinant = s[0] * (s[2] * s[4] - s[3] * s[3])
+        determinant -= s[1] * (s[1] * s[4] - s[3] * s[2])
+        determinant += s[2] * (s[1] * s[3] - s[2] * s[2])
+        part = s[0] * (b * s[4] - s[3] * c) - a * (s[1] * s[4] - s[3] * s[2])
+        part += s[2] * (s[1] * c - b * s[2])
+        parabola = part / determinant / half
+    return np.ascontiguousarray(np.where(count < 2, 0.0, np.where(count == 2, line, parabola)).T)
 
 
 def contradiction(
@@ -66,26 +93,21 @@ def contradiction(
     They do where the median over the track differs by more than 10 % of the median speed and 0.3
     m/s; the first and the last second are left out of tracks that are longer.
     """
-    ends = track_ends(track).tolist()
-    wrong, share = np.zeros(len(ends) - 1, np.bool_), np.zeros(len(ends) - 1)
-    for number, (low, high) in enumerate(pairwise(ends)):
-        times = time[low:high]
-        if len(times) and times[-1] - times[0] > 3.0 * _END:
-            high = low + int(np.searchsorted(times, times[-1] - _END, side="right"))
-            low += int(np.searchsorted(times, times[0] + _END))
-        if low >= high:  # nothing to compare
-            continue
-        error = median(np.hypot(*(stored[low:high] - derived[low:high]).T))
-        speed = median(np.hypot(*derived[low:high].T))
-        wrong[number] = not error <= max(_LEAST_ERROR, MAX_SHARE * speed)
-        share[number] = error / max(speed, _SLOW)
-    return wrong, share
+    ends, num_tracks = track_ends(track), int(track[-1]) + 1
+    begin, end = time[ends[track]], time[ends[track + 1] - 1]
+    inner = (time >= begin + _END) & (time <= end - _END) | (end - begin <= 3.0 * _END)
+    which = track[inner]
+    error = track_medians(np.hypot(*(stored - derived)[inner].T), which, num_tracks)
+    speed = track_medians(np.hypot(*derived[inner].T), which, num_tracks)
+    is_known = np.bincount(which, minlength=num_tracks) > 0
+    wrong = is_known & ~(error <= np.maximum(_LEAST_ERROR, MAX_SHARE * speed))
+    return wrong, np.where(is_known, error / np.maximum(speed, _SLOW), 0.0)
 
 
 def believed_velocities(
-    stored: FloatArray | None,
+    stored: FloatArray,
     derived: FloatArray,
-    contradicts: BoolArray | None,
+    contradicts: BoolArray,
     track: IntArray,
     warnings: Counter[str],
 ) -> FloatArray:
@@ -93,17 +115,11 @@ def believed_velocities(
 
     `contradicts` (N,) marks the tracks whose stored velocities contradict their positions.
     """
-    num_tracks = int(track[-1]) + 1
-    if stored is None or contradicts is None:
-        warnings["tracks without stored velocity (derived)"] += num_tracks
-        return derived
-    lacking = np.zeros(num_tracks, np.bool_)
+    lacking = np.zeros(int(track[-1]) + 1, np.bool_)
     lacking[track[~np.isfinite(stored).all(axis=1)]] = True
     warnings["tracks without stored velocity (derived)"] += int(lacking.sum())
     wrong = contradicts & ~lacking
     warnings["tracks whose stored velocity does not fit (derived)"] += int(wrong.sum())
-    if not (lacking | wrong).any():
-        return stored
     return np.where((lacking | wrong)[track][:, None], derived, stored)
 
 
@@ -132,79 +148,14 @@ def held_headings(
     warnings: Counter[str],
 ) -> FloatArray:
     """Headings; where a standing object's spins, the one before (nuPlan rule 460)."""
-    source = np.arange(len(yaw))
-    held = _hold(yaw, velocities, time, track, source)
-    warnings["rows with a heading that spins at standstill (held)"] += held
-    return yaw[source]
-
-
-@kernel
-def _hold(
-    yaw: FloatArray, velocities: FloatArray, time: FloatArray, track: IntArray, source: IntArray
-) -> int:
-    """Replace the rows `source` (A,) of headings where they spin; how many these are."""
-    held, before = 0, -1  # row before the first that spins
-    was_standing = False
-    for row in range(len(yaw)):
-        is_standing = np.hypot(velocities[row, 0], velocities[row, 1]) < _SLOW
-        if row == 0 or track[row] != track[row - 1]:
-            before, was_standing = -1, is_standing
-            continue
-        if not (is_standing and was_standing):
-            before = -1
-        if is_standing and before < 0:
-            turn = abs(wrap_angle(yaw[row] - yaw[row - 1]))
-            if turn > _MAX_STANDING_TURN * (time[row] - time[row - 1]):
-                before = row - 1
-        if before >= 0:
-            source[row] = before
-            held += 1
-        was_standing = is_standing
-    return held
-
-
-@kernel
-def _fit(xy: FloatArray, time: FloatArray, ends: IntArray, half: float) -> FloatArray:
-    out = np.zeros((len(time), 2))
-    s, y = np.zeros(5), np.zeros((3, 2))
-    for track in range(len(ends) - 1):
-        low = high = ends[track]
-        for row in range(ends[track], ends[track + 1]):
-            while time[low] < time[row] - half:
-                low += 1
-            while high < ends[track + 1] and time[high] <= time[row] + half:
-                high += 1
-            if high - low < 2:
-                continue
-            s[:] = 0.0
-            y[:] = 0.0
-            for other in range(low, high):
-                t = (time[other] - time[row]) / half
-                dx, dy = xy[other, 0] - xy[row, 0], xy[other, 1] - xy[row, 1]
-                power = 1.0
-                for degree in range(5):
-                    s[degree] += power
-                    if degree < 3:
-                        y[degree, 0] += power * dx
-                        y[degree, 1] += power * dy
-                    power *= t
-            if high - low == 2:  # a line
-                span = s[2] * s[0] - s[1] * s[1]
-                for axis in range(2):
-                    out[row, axis] = (y[1, axis] * s[0] - y[0, axis] * s[1]) / span / half
-                continue
-            # second of three normal equations, by Cramer's rule
-            determinant = (
-                s[0] * (s[2] * s[4] - s[3] * s[3])
-                - s[1] * (s[1] * s[4] - s[3] * s[2])
-                + s[2] * (s[1] * s[3] - s[2] * s[2])
-            )
-            for axis in range(2):
-                a, b, c = y[0, axis], y[1, axis], y[2, axis]
-                part = (
-                    s[0] * (b * s[4] - s[3] * c)
-                    - a * (s[1] * s[4] - s[3] * s[2])
-                    + s[2] * (s[1] * c - b * s[2])
-                )
-                out[row, axis] = part / determinant / half
-    return out
+    stands = np.hypot(*velocities.T) < _SLOW
+    same = np.r_[False, track[1:] == track[:-1]]
+    rest = np.cumsum(~(same & stands & np.r_[False, stands[:-1]]))  # number of its standstill
+    turn = np.abs(wrap_angles(np.diff(yaw, prepend=yaw[0])))
+    spins = same & stands & (turn > _MAX_STANDING_TURN * np.diff(time, prepend=time[0]))
+    number, first = np.unique(rest[spins], return_index=True)
+    since = np.full(rest[-1] + 1, len(yaw))  # the row from which on its heading is held
+    since[number] = np.flatnonzero(spins)[first]
+    is_held = np.arange(len(yaw)) >= since[rest]
+    warnings["rows with a heading that spins at standstill (held)"] += int(is_held.sum())
+    return yaw[np.where(is_held, since[rest] - 1, np.arange(len(yaw)))]

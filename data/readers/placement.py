@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from scipy import signal
 
 from shiftsim.geometry.polylines import project_on_polyline
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
@@ -37,6 +38,12 @@ def place_on_map(road: VectorMap, points: FloatArray, enough: float) -> Placemen
     return Placement(len(points), number, shift, best)
 
 
+def extent_of(road: VectorMap) -> tuple[FloatArray, FloatArray]:
+    """(2,) lowest and (2,) highest x, y of the lanes and connectors of a map [m]."""
+    bounds = road.edges.polygons.bounds
+    return bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)
+
+
 def are_drivable(road: VectorMap, points: FloatArray) -> BoolArray:
     """(n,) whether points (n, 2) are on a lane, a connector or another drivable polygon."""
     on_edge = containing_polygons(road.edges.polygons, points, 1)[:, 0] >= 0
@@ -46,27 +53,23 @@ def are_drivable(road: VectorMap, points: FloatArray) -> BoolArray:
 
 def _best_shift(road: VectorMap, points: FloatArray) -> tuple[FloatArray, float]:
     """The shift of the points that puts most of them on drivable area, by correlating rasters."""
-    bounds = road.edges.polygons.bounds
-    if len(bounds) == 0:
+    if not len(road.edges):
         return np.zeros(2), 0.0
-    low, high = bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)
+    low, high = extent_of(road)
     points_low, points_high = points.min(axis=0), points.max(axis=0)
     extent = (high - low) + np.minimum(points_high - points_low, high - low)
     cell = max(1.0, float(np.sqrt(np.prod(extent) / _MAX_CELLS)))
     num_map = np.ceil((high - low) / cell).astype(np.int64) + 1
     index = np.floor((points - points_low) / cell).astype(np.int64)
     inside = index[(index < num_map).all(axis=1)]
-    num = 2 * num_map
-    grid = np.stack(np.meshgrid(*(np.arange(n) for n in num_map), indexing="ij"), -1)
-    centers = low + (grid.reshape(-1, 2) + 0.5) * cell
+    grid = np.indices(num_map.tolist()).reshape(2, -1).T
+    centers = low + (grid + 0.5) * cell
     area = are_drivable(road, np.ascontiguousarray(centers)).reshape(num_map)
     counts = np.zeros(num_map)
-    np.add.at(counts, (inside[:, 0], inside[:, 1]), 1.0)
-    product = np.fft.rfft2(area.astype(np.float64), num) * np.conj(np.fft.rfft2(counts, num))
-    match = np.rint(np.fft.irfft2(product, num))
-    ties = np.argwhere(match == match.max())
-    steps = np.where(ties >= num_map, ties - num, ties)
-    shifts = low + steps * cell - points_low
+    np.add.at(counts, tuple(inside.T), 1.0)
+    match = np.rint(signal.correlate(area.astype(np.float64), counts, method="fft"))
+    ties = np.argwhere(match == match.max()) - (num_map - 1)
+    shifts = low + ties * cell - points_low
     best = shifts[np.argmin(np.abs(shifts).sum(axis=1))]
     return best, float(match.max() / len(points))
 

@@ -114,14 +114,11 @@ def _path_between(road: VectorMap, start: int, goal: int) -> list[int]:
     """Blocks strictly between two blocks on the shortest way; empty where linked or too far."""
     paths = [[start]]
     for _ in range(_MAX_GAP_BLOCKS + 1):
-        grown = []
-        for path in paths:
-            for block in road.block_outgoing.at(path[-1]).tolist():
-                if block == goal:
-                    return path[1:]
-                if block not in path:
-                    grown.append([*path, block])
-        paths = grown
+        grown = [[*p, b] for p in paths for b in road.block_outgoing.at(p[-1]).tolist()]
+        for path in grown:
+            if path[-1] == goal:
+                return path[1:-1]
+        paths = [path for path in grown if path[-1] not in path[:-1]]
     return []
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from shiftsim.data.recording import EgoTrace, Recording
 from shiftsim.geometry.boxes import wrap_angles
+from shiftsim.geometry.fits import fit_weights
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world import state
 from shiftsim.world.state import LAST_AGENT_KIND, PACIFICA, Tracks, TrafficLights
@@ -218,16 +219,7 @@ def slope(values: FloatArray, dt: float) -> FloatArray:
     half = min(_HALF_WINDOW, (len(values) - 1) // 2)
     if half == 0:
         return np.gradient(values, dt) if len(values) > 1 else np.zeros(len(values))
-    offsets = np.arange(-half, half + 1.0)
-    weights = offsets / (offsets @ offsets)
-    out = np.empty(len(values))
-    out[half : len(values) - half] = np.convolve(values, weights[::-1], mode="valid")
-    fit = np.linalg.pinv(np.vander(offsets, min(3, len(offsets)), increasing=True))
-    for part, where in (
-        (values[: 2 * half + 1], slice(0, half)),
-        (values[-2 * half - 1 :], slice(len(values) - half, len(values))),
-    ):
-        _, rate, bend = fit @ part
-        at = offsets[:half] if where.start == 0 else offsets[half + 1 :]
-        out[where] = rate + 2.0 * bend * at
-    return out / dt
+    window = 2 * half + 1
+    fit = fit_weights(window, 2, 1)
+    inner = np.convolve(values, fit[half, ::-1], mode="valid")
+    return np.r_[fit[:half] @ values[:window], inner, fit[half + 1 :] @ values[-window:]] / dt

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from shiftsim.data.maps.lights import light_rows
+from shiftsim.data.readers.placement import extent_of
 from shiftsim.data.readers.reader import SourceRecording, site_map
 from shiftsim.data.readers.routes import find_route, starts_on_lane
 from shiftsim.data.readers.samples import (
@@ -106,30 +107,27 @@ def convert_recording(source: SourceRecording) -> Converted:
     traces: list[EgoTrace] = []
     scenarios: list[Window] = []
     for run, numbers in sorted(accepted.items()):
-        starts = [rows_of(windows[number].span.start_s) for number in numbers]
-        lengths = [rows_of(windows[number].span.length_s) for number in numbers]
-        trace = ego_trace(
-            samples,
-            run,
-            recording.log_name,
-            first_row=min(starts),
-            last_row=max(map(sum, zip(starts, lengths, strict=True))) + padding,
-            padding=padding,
-        )
-        results = [
-            _scenario(source, samples, config, run, number, windows[number].span, trace)
-            for number in numbers
+        spans = [windows[number].span for number in numbers]
+        first = min(rows_of(span.start_s) for span in spans)
+        last = max(rows_of(span.start_s) + rows_of(span.length_s) for span in spans) + padding
+        rows = {"first_row": first, "last_row": last, "padding": padding}
+        trace = ego_trace(samples, run, recording.log_name, **rows)
+        made = [
+            _scenario(source, samples, config, run, number, span, trace)
+            for number, span in zip(numbers, spans, strict=True)
         ]
-        rejected.update(window for window in results if isinstance(window, str))
-        usable = [window for window in results if isinstance(window, Window)]
-        if usable:
-            scenarios += usable
-            traces.append(trace)
+        rejected.update(rule for rule in made if isinstance(rule, str))
+        usable = [window for window in made if isinstance(window, Window)]
+        scenarios += usable
+        traces += [trace] * bool(usable)
     if source.lights is not None:
         lights = light_rows(source.lights, source.map.lights, recording.time_us)
         recording = replace(recording, lights=lights)
     warnings = Counter(samples.warnings) + Counter(source.warnings)
-    warnings["rows far outside the map"] += _rows_outside_map(samples, road)
+    low, high = extent_of(road)
+    places = samples.xy + samples.offset
+    is_far = (places < low - _MAP_MARGIN) | (places > high + _MAP_MARGIN)
+    warnings["rows far outside the map"] += int(is_far.any(axis=1).sum())
     summary = RecordingSummary(
         name=samples.name,
         duration_s=samples.duration,
@@ -302,10 +300,3 @@ def _scenario(
         is_short=span.is_short,
         metadata={**metadata, **source.metadata},
     )
-
-
-def _rows_outside_map(samples: TrackSamples, road: VectorMap) -> int:
-    bounds = road.edges.polygons.bounds
-    low, high = bounds[:, :2].min(axis=0) - _MAP_MARGIN, bounds[:, 2:].max(axis=0) + _MAP_MARGIN
-    places = samples.xy + samples.offset
-    return int(((places < low) | (places > high)).any(axis=1).sum())

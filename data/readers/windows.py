@@ -10,11 +10,12 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
+import shapely
 
 from shiftsim.data.readers.samples import ROW_S, TrackSamples, rows_of
 from shiftsim.errors import ConfigError, one_of
-from shiftsim.geometry.boxes import box_corners
-from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.world.ranges import SETTINGS
 
 EGO, CATEGORY, PRESENCE, SPEED, OVERLAP = "ego", "category", "presence", "speed", "overlap"
@@ -96,27 +97,21 @@ def make_config(values: Mapping[str, Any]) -> ConversionConfig:
 
 def _check_type(name: str, value: Any) -> None:
     """Types are checked strictly: TOML and Python callers get the same message."""
-    is_integer = isinstance(value, int) and not isinstance(value, bool)
-    special: dict[str, tuple[bool, str]] = {
-        "ego_categories": (isinstance(value, tuple) and _are_texts(*value), "a list of names"),
-        "category_map": (
-            isinstance(value, dict) and _are_texts(*value, *value.values()),
-            "a table of names",
-        ),
-        "country": (_are_texts(value), "a name"),
-        "route_extension_blocks": (is_integer and value >= 0, "an integer from 0 on"),
-        "max_per_window": (value is None or (is_integer and value > 0), "an integer from 1 on"),
-    }
-    is_number = (is_integer or isinstance(value, float)) and 0 <= value < np.inf
-    is_good, wanted = special.get(name, (is_number, "a number from 0 on"))
+    count = value if isinstance(value, int) and not isinstance(value, bool) else -1
+    is_number = count >= 0 or (isinstance(value, float) and 0 <= value < np.inf)
+    texts = [*value, *getattr(value, "values", list)()] if isinstance(value, tuple | dict) else [0]
+    are_texts = all(isinstance(text, str) for text in texts)
+    is_good, wanted = {
+        "ego_categories": (isinstance(value, tuple) and are_texts, "a list of names"),
+        "category_map": (isinstance(value, dict) and are_texts, "a table of names"),
+        "country": (isinstance(value, str), "a name"),
+        "route_extension_blocks": (count >= 0, "an integer from 0 on"),
+        "max_per_window": (value is None or count > 0, "an integer from 1 on"),
+    }.get(name, (is_number, "a number from 0 on"))
     if not is_good:
         raise ConfigError(f"{name} is {value!r}; it must be {wanted}")
-    if name in SETTINGS and value is not None and not SETTINGS[name].holds(float(value)):
+    if name in SETTINGS and value is not None and not SETTINGS[name].holds(value):
         raise ConfigError(f"{name} is {value!r}; it must be within {SETTINGS[name]}")
-
-
-def _are_texts(*values: object) -> bool:
-    return all(isinstance(value, str) for value in values)
 
 
 @dataclass(frozen=True)
@@ -190,98 +185,22 @@ def overlap_partners(
     nuPlan rule 451: with the recorded sizes, and tracks of all categories. Only rows of the
     `candidates` (N,) are looked at.
     """
-    return _first_overlaps(
-        recording.xy,
-        recording.raw_headings,
-        np.ascontiguousarray(recording.sizes[:, :2]),
-        recording.track,
-        recording.by_frame,
-        recording.frame_ptr,
-        candidates,
-        max_overlap,
-    )
+    track, none = recording.track, len(recording.track_ids)
+    poses = np.column_stack([recording.xy, recording.raw_headings])
+    corners = boxes_to_corners(poses, recording.sizes[track, :2])
+    partner = np.full(len(track), none)
+    for rows in np.split(recording.by_frame, recording.frame_ptr[1:-1]):
+        boxes, asked = shapely.polygons(corners[rows]), np.flatnonzero(candidates[track[rows]])
+        one, other = shapely.STRtree(boxes).query(boxes[asked], predicate="intersects")
+        one = asked[one]
+        one, other = one[one != other], other[one != other]
+        much = shapely.area(shapely.intersection(boxes[one], boxes[other])) > max_overlap
+        np.minimum.at(partner, rows[one[much]], track[rows[other[much]]])
+    return np.where(partner == none, -1, partner)
 
 
 def _median_of_three(values: FloatArray, track: IntArray) -> FloatArray:
     """Median of each row and its neighbours of the same track; the ends keep their value."""
-    out = values.copy()
-    inner = np.flatnonzero(track[2:] == track[:-2]) + 1
-    before, here, after = values[inner - 1], values[inner], values[inner + 1]
-    low, high = np.minimum(before, here), np.maximum(before, here)
-    out[inner] = np.maximum(low, np.minimum(high, after))
+    out, inner = values.copy(), np.flatnonzero(track[2:] == track[:-2]) + 1
+    out[inner] = np.median([values[inner - 1], values[inner], values[inner + 1]], axis=0)
     return out
-
-
-@kernel
-def _first_overlaps(
-    centers: FloatArray,
-    headings: FloatArray,
-    sizes: FloatArray,
-    track: IntArray,
-    by_frame: IntArray,
-    frame_ptr: IntArray,
-    asked: BoolArray,
-    max_overlap: float,
-) -> IntArray:
-    """(A,) first track in the same frame whose box shares more than `max_overlap` with the row's.
-
-    Boxes are centers (A, 2 or 3), headings (A,) and the sizes (N, 2) of their tracks (A,);
-    `by_frame` (A,) are the rows sorted by frame, `asked` (N,) the tracks looked at.
-    """
-    out = np.full(len(track), -1, np.int64)
-    radius = 0.5 * np.hypot(sizes[:, 0], sizes[:, 1])
-    ring, other = np.empty((4, 2)), np.empty((4, 2))
-    for frame in range(len(frame_ptr) - 1):
-        for first in range(frame_ptr[frame], frame_ptr[frame + 1]):
-            i = by_frame[first]
-            a = track[i]
-            if not asked[a]:
-                continue
-            for second in range(frame_ptr[frame], frame_ptr[frame + 1]):
-                j = by_frame[second]
-                b = track[j]
-                dx, dy = centers[j, 0] - centers[i, 0], centers[j, 1] - centers[i, 1]
-                reach = radius[a] + radius[b]
-                if j == i or dx * dx + dy * dy > reach * reach:
-                    continue
-                box_corners(0.0, 0.0, headings[i], sizes[a, 0], sizes[a, 1], ring)
-                box_corners(dx, dy, headings[j], sizes[b, 0], sizes[b, 1], other)
-                if shared_area(ring, other) > max_overlap:
-                    out[i] = b
-                    break
-    return out
-
-
-@kernel
-def shared_area(a: FloatArray, b: FloatArray) -> float:
-    """Area of the intersection of two convex rings (V, 2), both counter-clockwise [m^2]."""
-    ring = np.empty((len(a) + len(b), 2))
-    clipped = np.empty((len(a) + len(b), 2))
-    count = len(a)
-    ring[:count] = a
-    for edge in range(len(b)):
-        x, y = b[edge]
-        nx, ny = y - b[(edge + 1) % len(b), 1], b[(edge + 1) % len(b), 0] - x  # to the left
-        num_left = 0
-        for index in range(count):
-            px, py = ring[index]
-            qx, qy = ring[(index + 1) % count]
-            p, q = (px - x) * nx + (py - y) * ny, (qx - x) * nx + (qy - y) * ny
-            if p >= 0.0:
-                clipped[num_left, 0], clipped[num_left, 1] = px, py
-                num_left += 1
-            if p * q < 0.0:
-                share = p / (p - q)
-                clipped[num_left, 0], clipped[num_left, 1] = (
-                    px + share * (qx - px),
-                    py + share * (qy - py),
-                )
-                num_left += 1
-        ring, clipped, count = clipped, ring, num_left
-        if count < 3:
-            return 0.0
-    area = 0.0
-    for index in range(count):
-        following = (index + 1) % count
-        area += ring[index, 0] * ring[following, 1] - ring[following, 0] * ring[index, 1]
-    return 0.5 * area

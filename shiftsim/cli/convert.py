@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from shiftsim.data.readers.convert import ConversionReport
     from shiftsim.data.readers.reader import Reader
     from shiftsim.data.readers.scenarios import RecordingSummary
-    from shiftsim.data.readers.tracks.inspection import Inspection
+    from shiftsim.data.readers.tracks.reader import TracksReader
     from shiftsim.data.readers.windows import ConversionConfig
 
 app = new_app("Make a scenario store from recordings.", no_args_is_help=True)
@@ -169,7 +169,7 @@ def tracks(
     scenario each, with 2 s of history.
     """
     from shiftsim.data.readers.scenarios import EGO_CATEGORIES
-    from shiftsim.data.readers.tracks.inspection import convert_tracks, inspect_tracks
+    from shiftsim.data.readers.tracks.reader import TracksReader, convert_tracks
     from shiftsim.data.readers.windows import make_config
     from shiftsim.data.store.tables import picture_file
 
@@ -179,7 +179,7 @@ def tracks(
     egos = None if ego is None or "all" in ego else ego
     folder = store_path(store)
     try:
-        inspection = inspect_tracks(
+        inspection = TracksReader(
             source, map_path, city=city, overrides=overrides, hz=hz, config=config
         )
     except ConfigError as error:
@@ -220,7 +220,7 @@ def tracks(
         echo(f" next: shiftsim check {store}, then shiftsim run --planner idm --store {store}")
 
 
-def _draw_tracks(path: Path, inspection: "Inspection", store: Path | None) -> None:
+def _draw_tracks(path: Path, inspection: "TracksReader", store: Path | None) -> None:
     """The picture of map, tracks and scenarios; without matplotlib a line how to get it."""
     from shiftsim.view.tracks import save_tracks_picture
 

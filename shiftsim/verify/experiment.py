@@ -44,7 +44,7 @@ from shiftsim.verify.simulation_log import (
     find_simulation_logs,
     read_simulation_log,
 )
-from shiftsim.verify.tables import EXACT, TOLERANCE, Groups, Source, Tolerances, read_table
+from shiftsim.verify.tables import DAMAGED, EXACT, TOLERANCE, Groups, Source, Tolerances, read_table
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AX, AY, PACIFICA, Trajectory, speeds
 
@@ -190,6 +190,9 @@ def _require_numbers(table: Source, file: Path) -> None:
             table[column].astype(np.float64)
         except (TypeError, ValueError) as error:
             raise DataError(f"{file}: column {column!r}: {error}", OTHER_VERSION) from None
+    means = table.at(~np.isnan(table["num_scenarios"].astype(np.float64)))
+    if len(means.groups("scenario", "planner_name")) < means.num_rows:  # each reads all rows
+        raise DataError(f"{file}: column 'num_scenarios': a mean is there twice", DAMAGED)
 
 
 def _compare_means(table: Source) -> Source:

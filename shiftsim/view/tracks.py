@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from shiftsim.data.readers.codes import KINDS
-from shiftsim.data.readers.tracks.inspection import Inspection
+from shiftsim.data.readers.tracks.reader import TracksReader
 from shiftsim.data.readers.tracks.table import TrackTable
 from shiftsim.data.store.reading import open_store
 from shiftsim.kernels import FloatArray
@@ -24,7 +24,7 @@ _MAX_EGOS = 40
 Egos = dict[str, list[FloatArray]]  # poses (R, 3) of every scenario, by ego
 
 
-def save_tracks_picture(path: Path, inspection: Inspection, store: Path | None) -> None:
+def save_tracks_picture(path: Path, inspection: TracksReader, store: Path | None) -> None:
     """Draw map, tracks and, if a store has scenarios of them, their egos.
 
     Where the tracks are far from the map, or hardly seen beside it, both are also drawn alone.
@@ -64,7 +64,7 @@ def save_tracks_picture(path: Path, inspection: Inspection, store: Path | None) 
     save_picture(figure, path)
 
 
-def _words(inspection: Inspection, egos: Egos) -> list[str]:
+def _words(inspection: TracksReader, egos: Egos) -> list[str]:
     """What is drawn, and what is wrong with it, a line each."""
     table, diagnostics = inspection.table, inspection.diagnostics
     words = [f"{inspection.road.name}, {table.name}: {len(table.track_ids)} objects"]
@@ -75,7 +75,7 @@ def _words(inspection: Inspection, egos: Egos) -> list[str]:
     return words + [found.what for found in (*diagnostics.errors, *diagnostics.warnings)]
 
 
-def _draw_panel(axes: Any, inspection: Inspection, egos: Egos, extent: FloatArray) -> None:
+def _draw_panel(axes: Any, inspection: TracksReader, egos: Egos, extent: FloatArray) -> None:
     pad = _MARGIN * max(float((extent[2:] - extent[:2]).max()), 10.0)
     box = box_around([extent.reshape(2, 2)], pad)
     draw_map(axes, inspection.road, (), box, {"drivable": "#dcdcd8"}, {"centre": "#b8b8b2"})

@@ -5,6 +5,7 @@ import json
 import lzma
 import re
 import sqlite3
+from collections.abc import Iterable, Iterator
 from contextlib import closing
 from pathlib import Path
 from random import Random
@@ -21,9 +22,22 @@ NUMBERS = (
 )
 TEXTS = ("", " ", "x", "nan", "-1", "../..", "\u202e\U0001f697", "a" * 100_000, "9" * 5_000)
 DEEP = "[" * 20_000 + "]" * 20_000
+_MOST_VALUES = 1_000_000  # bytes of what is very long
 WHOLE = (-1, 0, 1, 127, 10**4, 2**31 - 1, 2**53 + 1, 2**63 - 1, -(2**63))
 _TOKEN = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][+-]?\d+)?")
 _QUOTED = re.compile(rb"\"[^\"\n]*\"")
+# what no library writes: in the place of these marks
+_DEEP_MARK, _LONG_MARK = "deep-mark", "long-mark"
+_IN_JSON = {_DEEP_MARK: DEEP, _LONG_MARK: "9" * 5_000}
+_IN_MSGPACK = {  # nested; lists, maps, texts and bytes of absurd lengths; an object of ours
+    _DEEP_MARK: b"\x91" * 20_000 + b"\x90",
+    _LONG_MARK: [
+        b"\xdd\xff\xff\xff\xff",
+        b"\xdf\x7f\xff\xff\xff",
+        b"\xdb\x7f\xff\xff\xff",
+        b"\xc6\xff\xff\xff\xff",
+    ],
+}
 
 
 def damage(path: Path, random: Random) -> str:
@@ -35,7 +49,8 @@ def damage(path: Path, random: Random) -> str:
     try:
         return f"{path.name}: {way(path, random) or way.__name__.strip('_')}"
     except Exception as error:  # what is damaged already cannot be damaged with care
-        return f"{path.name}: {_bytes(path, random)} ({type(error).__name__})"
+        what = _bytes(path, random) if path.stat().st_size else "nothing left"
+        return f"{path.name}: {what} ({type(error).__name__})"
 
 
 def _bytes(path: Path, random: Random) -> str:
@@ -74,7 +89,17 @@ def _text(path: Path, random: Random) -> str:
     if spot[0].startswith(b'"'):
         new = json.dumps(random.choice((*TEXTS, *map(str, NUMBERS))))
     else:
-        words = ("", "true", '"x"', "[]", "{}", "null", "1979-05-27", "9" * 5_000, DEEP)
+        words = (
+            "",
+            "true",
+            '"x"',
+            "[]",
+            "{}",
+            "null",
+            "1979-05-27",
+            *("9" * n for n in (400, 5_000)),
+            DEEP,
+        )
         new = str(random.choice((*NUMBERS, *words)))
     path.write_bytes(data[: spot.start()] + new.encode() + data[spot.end() :])
     return f"{spot[0][:40]!r} -> {new[:40]!r}"
@@ -89,6 +114,27 @@ def _lines(path: Path, random: Random) -> str:
     lines[random.randrange(len(lines) + 1) : 0] = [one] * random.randrange(3)
     path.write_bytes(b"".join(lines))
     return f"line {one[:40]!r} moved"
+
+
+def _cells(path: Path, random: Random) -> str:
+    """A column of CSV twice, away or without values; a line of very many cells, or a long one."""
+    rows = [line.split(",") for line in path.read_text("utf-8").splitlines()]
+    at = random.randrange(len(rows[0]))
+    kind = random.choice(("twice", "away", "empty", "some empty", "wide", "all wide", "long"))
+    for number, row in enumerate(rows):
+        cell = row[at]
+        if kind in ("twice", "away"):
+            row[at : at + 1] = [cell] * (2 if kind == "twice" else 0)
+        elif number and (kind == "empty" or (kind == "some empty" and random.random() < 0.1)):
+            row[at] = ""
+        elif kind == "all wide":
+            row += [f"{cell}{extra}" for extra in range(1_000)]
+    if kind == "wide":
+        random.choice(rows).extend(["1"] * 100_000)
+    elif kind == "long":
+        random.choice(rows)[at] = random.choice((DEEP, "9" * 5_000, "9" * 2_000_000, '"' + "x" * 9))
+    path.write_text("\n".join(map(",".join, rows)) + "\n", "utf-8")
+    return f"column {at} {kind}"
 
 
 def _xml(path: Path, random: Random) -> str:
@@ -124,14 +170,19 @@ def _json(path: Path, random: Random) -> str:
     lines = text.splitlines() if path.suffix == ".jsonl" else [text]
     row = random.randrange(len(lines))
     content = json.loads(lines[row])
-    what = change_value(content, random)
+    what = change_value(content, random, _IN_JSON)
     lines[row] = json.dumps(content)
+    for mark, new in _IN_JSON.items():
+        lines[row] = lines[row].replace(f'"{mark}"', new)
     path.write_text("\n".join(lines) + "\n", "utf-8")
     return what
 
 
-def change_value(content: Any, random: Random) -> str:
-    """Change or remove one value, at any depth, of plain lists and dictionaries."""
+def change_value(content: Any, random: Random, marks: Iterable[str] = ()) -> str:
+    """Change or remove one value, at any depth, of plain lists and dictionaries.
+
+    The value may be one of the `marks`, in whose place comes what plain values cannot say.
+    """
     places: list[tuple[Any, Any]] = []
 
     def visit(node: Any) -> None:
@@ -146,7 +197,9 @@ def change_value(content: Any, random: Random) -> str:
     deep: list[Any] = []
     for _ in range(90):
         deep = [deep]
-    new = random.choice((*NUMBERS, *TEXTS, None, True, [], {}, [1, "x", None], {"x": -1}, deep))
+    new = random.choice(
+        (*NUMBERS, *TEXTS, None, True, [], {}, [1, "x", None], {"x": -1}, deep, *marks, *marks)
+    )
     kind = random.random()
     if isinstance(node[key], dict) and kind > 0.7:
         new = [*node[key]]  # the names alone
@@ -252,8 +305,27 @@ def _arrow(path: Path, random: Random) -> str:
 
 def _repacked(data: bytes, random: Random) -> tuple[bytes, str]:
     content = msgpack.unpackb(data, strict_map_key=False)
-    what = change_value(content, random)
-    return msgpack.packb(content), what
+    arrays = [held for held in _maps(content) if b"__ndarray__" in held]
+    if arrays and random.random() < 0.2:
+        held, key = random.choice(arrays), random.choice((b"shape", b"dtype", b"data"))
+        held[key] = random.choice((-1, [10**9, 10**9], [-1, -1], [], "O", "<f8,<f8", b"", None))
+        return msgpack.packb(content), f"{key!r} = {held[key]!r}"
+    holder = [content]
+    what = change_value(holder, random, _IN_MSGPACK)
+    packed = b"".join(map(msgpack.packb, holder))
+    for mark, new in _IN_MSGPACK.items():
+        new = new if isinstance(new, bytes) else random.choice(new)
+        packed = packed.replace(msgpack.packb(mark), new)
+    return packed, what
+
+
+def _maps(content: Any) -> Iterator[dict[Any, Any]]:
+    """All dictionaries in plain values."""
+    if isinstance(content, dict):
+        yield content
+    if isinstance(content, dict | list):
+        for value in content.values() if isinstance(content, dict) else content:
+            yield from _maps(value)
 
 
 def _table(table: pa.Table, random: Random) -> tuple[pa.Table, str]:
@@ -262,8 +334,9 @@ def _table(table: pa.Table, random: Random) -> tuple[pa.Table, str]:
     field = table.schema.field(index)
     if kind < 0.05:
         return table.drop_columns([name]), f"{name} away"
-    if kind < 0.07:
-        return table.append_column(field, table[name]), f"{name} twice"
+    if kind < 0.09:
+        other = random.choice((table[name], pa.nulls(len(table), field.type), table[0]))
+        return table.append_column(field.name, other), f"{name} twice"
     if kind < 0.12:
         other = random.choice((pa.string(), pa.int64(), pa.float64(), pa.float32()))
         if pa.types.is_list(field.type) and random.random() < 0.7:
@@ -276,13 +349,23 @@ def _table(table: pa.Table, random: Random) -> tuple[pa.Table, str]:
             ([table[:row]], [table, table[:row]], [table[:row], table[row + 1 :]])
         )
         return pa.concat_tables(parts), "rows away or twice"
-    values = table[name].to_pylist()
+    if kind < 0.24:
+        return _long(table, index, random)
+    floats = [i for i, one in enumerate(table.schema.types) if pa.types.is_floating(one)]
+    if kind < 0.27 and floats:
+        index = random.choice(floats)
+        field, name = table.schema.field(index), table.column_names[index]
+    values = table.column(index).to_pylist()
     row = random.randrange(len(values))
     old, what = values[row], f"{name}[{row}]"
-    if kind < 0.24:
+    if kind < 0.27 and floats:
+        for other in random.sample(range(len(values)), min(3, len(values))):
+            values[other] = None
+        what = f"{name} with nulls"
+    elif kind < 0.29:
         values = [None] * len(values)
         what = f"{name} = null"
-    elif kind < 0.3:
+    elif kind < 0.33:
         values[row] = None
         what += " = null"
     elif isinstance(old, list) and old and random.random() < 0.8:
@@ -299,6 +382,31 @@ def _table(table: pa.Table, random: Random) -> tuple[pa.Table, str]:
         what += f" = {str(values[row])[:30]}"
     field = field.with_nullable(True)
     return table.set_column(index, field, pa.array(values, field.type)), what
+
+
+def _long(table: pa.Table, index: int, random: Random) -> tuple[pa.Table, str]:
+    """Very many rows, columns or items, or texts that hold what nobody nests or counts."""
+    name, field = table.column_names[index], table.schema.field(index)
+    kind = random.choice(("rows", "columns", "items"))
+    if kind == "rows":
+        times = max(_MOST_VALUES // max(table.nbytes, 1), 2)
+        return pa.concat_tables([table] * times), f"{times} times the rows"
+    if kind == "columns":
+        more = max(min(_MOST_VALUES // max(table[index].nbytes, 1), 2_000), 2)
+        for number in range(more):
+            table = table.append_column(f"{name}{number}", table[index])
+        return table, f"{more} columns more"
+    values = table.column(index).to_pylist()
+    row = random.randrange(max(len(values), 1))
+    if isinstance(values[row], list) and values[row]:
+        values[row] = values[row] * max(100_000 // len(str(values[row])), 2)
+    elif isinstance(values[row], str):
+        values[row] = random.choice(
+            (DEEP, "9" * 5_000, f'{{"x": {DEEP}}}', f'{{"x": {"9" * 5_000}}}')
+        )
+    else:
+        return table, f"{name} as it is"
+    return table.set_column(index, field, pa.array(values, field.type)), f"{name}[{row}] long"
 
 
 def _like(old: Any, random: Random) -> Any:
@@ -358,8 +466,12 @@ def _header(path: Path, random: Random) -> str:
 
 def _packed(path: Path, random: Random) -> str:
     """What an xz file holds, damaged as bytes."""
-    path.write_bytes(lzma.decompress(path.read_bytes()))
-    what = _bytes(path, random)
+    path.write_bytes(lzma.decompress(path.read_bytes()) or b"\0")
+    if ".msgpack" in path.name and random.random() < 0.3:
+        pickled, what = _repacked(path.read_bytes(), random)
+        path.write_bytes(pickled)
+    else:
+        what = _bytes(path, random)
     path.write_bytes(lzma.compress(path.read_bytes(), preset=0))
     return f"inside: {what}"
 
@@ -378,6 +490,6 @@ _WAYS: dict[str, Any] = {
     ".pth": (_checkpoint,),
     ".ckpt": (_checkpoint,),
     ".safetensors": (_header,),
-    ".csv": (_text, _text, _lines),
+    ".csv": (_text, _text, _lines, _cells, _cells),
     ".xz": (_packed,),
 }

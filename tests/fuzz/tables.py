@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 from places import GOLDEN
 
 RESULTS = GOLDEN / "nuplan_experiment/closed_loop_nonreactive_agents/simple_planner"
+LOGGED = "a00a065c00000032"  # the scenario whose log is there
 COLUMNS_TOML = """\
 hz = 12.5
 reference = "center"
@@ -76,7 +77,7 @@ def read_track_table(folder: Path) -> Any:
     from fuzz.targets import read_store
 
     from shiftsim.data.readers.scenarios import EGO_CATEGORIES
-    from shiftsim.data.readers.tracks.inspection import convert_tracks, inspect_tracks
+    from shiftsim.data.readers.tracks.reader import TracksReader, convert_tracks
     from shiftsim.data.readers.windows import ConversionConfig
     from shiftsim.errors import ConfigError, ConversionError
     from shiftsim.files import read_toml
@@ -92,7 +93,7 @@ def read_track_table(folder: Path) -> Any:
     )
     words = read_toml(said) if said.exists() else {}
     try:
-        inspection = inspect_tracks(tracks, folder / "road.xodr", overrides=words, config=short)
+        inspection = TracksReader(tracks, folder / "road.xodr", overrides=words, config=short)
         convert_tracks(inspection, folder / "store")
     except ConfigError as error:  # the command names the file
         raise ConfigError(f"{tracks}: {error.message}", error.hint) from error
@@ -104,7 +105,8 @@ def read_track_table(folder: Path) -> Any:
 
 
 def write_results(folder: Path) -> None:
-    """A table of scores, one of a metric, and a log of two samples, each as a result folder."""
+    """A table of scores, one of a metric, and a log of two samples by themselves; all together."""
+    shutil.copytree(RESULTS, folder / "whole" / RESULTS.parent.name / RESULTS.name)
     for name in ("scores", "metric", "log"):
         (folder / name).mkdir()
     shutil.copy(next(RESULTS.glob("aggregator_metric/*")), folder / "scores/scores.parquet")
@@ -114,10 +116,16 @@ def write_results(folder: Path) -> None:
 
 def read_results(folder: Path) -> Any:
     """As `shiftsim verify --experiment` does it; what is found there is compared, not used."""
-    from shiftsim.verify.experiment import _read
+    from worlds import cruise_scenario
+
+    from shiftsim.verify.experiment import _read, verify_experiment
     from shiftsim.verify.report import Report
     from shiftsim.verify.simulation_log import read_simulation_log
 
+    if (folder / RESULTS.parent.name).is_dir():
+        scene = cruise_scenario()
+        verify_experiment(folder, lambda token: scene if token == LOGGED else None)
+        return None
     report = Report()
     _read(folder, "scores", "scenario", report)
     _read(folder, "metric", "scenario_name", report)

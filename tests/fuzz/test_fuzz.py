@@ -4,6 +4,7 @@
 """
 
 import json
+import lzma
 import shutil
 import subprocess
 import sys
@@ -107,6 +108,91 @@ def test_what_was_once_a_traceback_is_refused(target, seed, file, change):
         case = shutil.copytree(folder, place / "case")
         change(next(case.rglob(file)))
         assert run_case(target, case)[0] == "refused"
+
+
+def _xz(data):
+    return lambda path: path.write_bytes(lzma.compress(data, preset=0))
+
+
+def _whole(text):
+    return lambda path: path.write_text(text)
+
+
+def _line(text):
+    """A last line more."""
+    return lambda path: path.write_text(f"{path.read_text()}{text}\n")
+
+
+def _packed(data):
+    """The first element of a map of py123d holds these bytes."""
+
+    def change(path):
+        with pa.OSFile(str(path)) as source:
+            table = pa.ipc.open_file(source).read_all()
+        cells = pa.array([data, *table["features"].to_pylist()[1:]], pa.binary())
+        table = table.set_column(table.column_names.index("features"), "features", cells)
+        with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_file(sink, table.schema) as writer:
+            writer.write_table(table)
+
+    return change
+
+
+def _repeated(path):
+    table = pq.read_table(path)
+    pq.write_table(pa.concat_tables([table] * 700), path)
+
+
+DIGITS = "9" * 5_000
+STRANGE = {
+    "av2": [
+        ("scene", "log_map_archive_*.json", _whole(DEEP)),
+        ("scene", "log_map_archive_*.json", _whole(f'{{"lane_segments": {DIGITS}}}')),
+        ("scene", "scenario_*.parquet", partial(_twice, name="heading")),
+        ("scene", "scenario_*.parquet", partial(_null, name="position_x")),
+    ],
+    "py123d": [
+        ("logs", "map.arrow", _packed(b"\x91" * 20_000 + b"\x90")),
+        ("logs", "map.arrow", _packed(b"\xdd\xff\xff\xff\xff")),
+        ("logs", "map.arrow", _packed(b"\xc6\xff\xff\xff\xff")),
+    ],
+    "tracks": [
+        ("named", "columns.toml", _whole(f"hz = {DEEP}")),
+        ("named", "columns.toml", _whole(f"hz = {DIGITS}")),
+        ("named", "columns.toml", _whole(f"shift_m = [{DIGITS[:400]}, 0]")),
+        ("named", "tracks.csv", _line("1," * 100_000)),
+        ("named", "tracks.csv", _line(",".join([DIGITS] * 10))),
+        ("levelx", "01_recordingMeta.csv", _whole(f"frameRate\n{DIGITS}\n")),
+        ("parquet", "tracks.parquet", partial(_twice, name="x")),
+        ("parquet", "tracks.parquet", partial(_null, name="x")),
+    ],
+    "store": [
+        ("toy", "store.json", _whole(DEEP)),
+        ("toy", "store.json", _whole(f'{{"version": {DIGITS}}}')),
+        ("toy", "tracks.parquet", partial(_twice, name="x_m")),
+        ("toy", "tracks.parquet", partial(_null, name="x_m")),
+    ],
+    "experiment": [
+        ("scores", "scores.parquet", partial(_twice, name="score")),
+        ("scores", "scores.parquet", _repeated),
+        ("metric", "metric.parquet", _whole(DEEP)),
+        ("log", "log.msgpack.xz", _xz(b"\xc6\xff\xff\xff\xff")),
+        ("log", "log.msgpack.xz", _xz(b"\x91" * 20_000 + b"\x90")),
+        ("whole", "closed_loop*.parquet", partial(_twice, name="score")),
+    ],
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", STRANGE)
+def test_what_no_program_writes_is_refused(target):
+    """Deep nesting, numbers of thousands of digits, nulls, columns twice, absurd lengths."""
+    with seeds_of(target) as (seeds, place):
+        for number, (seed, file, change) in enumerate(STRANGE[target]):
+            folder = next(found for found in seeds if found.name == seed)
+            case = shutil.copytree(folder, place / f"case{number}")
+            change(next(case.rglob(file)))
+            outcome = run_case(target, case)
+            assert outcome[0] == "refused", (number, outcome)
 
 
 @pytest.mark.thorough

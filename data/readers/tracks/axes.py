@@ -1,4 +1,8 @@
-"""Headings, velocities and reference points that contradict how objects move, and the remedy."""
+"""Findings about a table; headings, velocities and points that contradict how objects move."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -8,12 +12,12 @@ from shiftsim.data.readers.motion import (
     track_medians,
     unit_vectors,
 )
-from shiftsim.data.readers.tracks.findings import FAST, Diagnostics, best_guess
 from shiftsim.data.readers.tracks.map_fit import Fit
 from shiftsim.data.readers.tracks.table import TrackTable
 from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.kernels import FloatArray, IntArray
 
+FAST = 2.0  # m/s, above which a direction of motion is sure
 # share of the moving vehicles whose velocities contradict their positions; more than the first is
 # wrong if one explanation fits all of them
 LEAST_CONTRADICTING, _MAX_CONTRADICTING = 0.1, 0.5
@@ -24,12 +28,35 @@ _TURNING, _LEAST_TURN = 0.1, 0.5  # rad/s; rad over a track
 _REFERENCE = (-0.15, 0.45)  # of the length, of the point that turns without sliding
 
 
+class Finding(NamedTuple):
+    """Something that is wrong, or unusual, with a table."""
+
+    what: str  # value and limit
+    remedy: str
+
+
+@dataclass
+class Diagnostics:
+    """What was found out about a table."""
+
+    errors: list[Finding] = field(default_factory=list)  # what cannot be right
+    warnings: list[Finding] = field(default_factory=list)  # what is unusual
+    figures: dict[str, float] = field(default_factory=dict)  # numbers behind it
+
+    def error(self, what: str, remedy: str) -> None:
+        """Add something that cannot be right."""
+        self.errors.append(Finding(what, remedy))
+
+    def warn(self, what: str, remedy: str) -> None:
+        """Add something that is unusual."""
+        self.warnings.append(Finding(what, remedy))
+
+
 def check_headings(table: TrackTable, fit: Fit, out: Diagnostics) -> None:
     """Whether headings are the directions of motion."""
     rows = table.moving_rows(FAST)
-    if table.headings is not None:
-        rows = rows[np.isfinite(table.headings[rows])]
-    if table.headings is None or not len(rows):
+    rows = rows[np.isfinite(table.headings[rows])]
+    if not len(rows):
         return
     column = table.columns.found["heading"]
     motion = fit.turned(table.derived[rows])
@@ -55,7 +82,7 @@ def check_headings(table: TrackTable, fit: Fit, out: Diagnostics) -> None:
             quarter - heading
         ),
     }
-    best, errors = best_guess(guesses, lambda angles: np.abs(wrap_angles(angles - direction)))
+    best, errors = _best_guess(guesses, lambda angles: np.abs(wrap_angles(angles - direction)))
     out.figures["heading_error_rad"] = errors[""]
     if errors[""] > _MAX_HEADING:
         fits = best and errors[best] < _MAX_HEADING
@@ -78,7 +105,7 @@ def check_headings(table: TrackTable, fit: Fit, out: Diagnostics) -> None:
 def check_velocities(table: TrackTable, fit: Fit, out: Diagnostics) -> None:
     """Whether velocities are those of the positions."""
     stored, rows = table.velocities, table.moving_rows(FAST)
-    if stored is None or not len(rows):
+    if not len(rows) or np.isnan(stored).all():
         return
     moving = np.unique(table.track[rows])
     derived = fit.turned(table.derived)
@@ -106,13 +133,13 @@ def check_velocities(table: TrackTable, fit: Fit, out: Diagnostics) -> None:
             f"the second looks mirrored: [columns] vy = '-{y}'": given * [1, -1],
             f"the first looks mirrored: [columns] vx = '-{x}'": given * [-1, 1],
         }
-        if table.headings is not None and np.isfinite(table.headings[rows]).all():
+        if np.isfinite(table.headings[rows]).all():
             cos, sin = unit_vectors(table.headings[rows]).T
             along, across = given.T
             in_map = np.column_stack([along * cos - across * sin, along * sin + across * cos])
             guesses[f"they look like those along and across the vehicle; {leave_out}"] = in_map
     guesses["scaled"] = given / max(ratio, 1e-9)
-    _, errors = best_guess(guesses, lambda velocities: np.hypot(*(velocities - motion).T) / speed)
+    _, errors = _best_guess(guesses, lambda velocities: np.hypot(*(velocities - motion).T) / speed)
     is_uniform = errors.pop("scaled") < _MAX_VELOCITY
     best = min(errors, key=lambda guess: errors[guess])
     is_known = best != "" and errors[best] < _MAX_VELOCITY
@@ -134,7 +161,7 @@ def check_reference(table: TrackTable, out: Diagnostics) -> None:
 
     A point d ahead of the rear axle moves sideways with d times the yaw rate.
     """
-    if table.headings is None or table.sizes is None or table.columns.reference:
+    if table.columns.reference:
         return
     number = len(table.track_ids)
     known = table.is_vehicle & np.isfinite(table.headings)
@@ -174,7 +201,14 @@ def check_reference(table: TrackTable, out: Diagnostics) -> None:
 
 def _turns(table: TrackTable, rows: IntArray) -> FloatArray:
     """(n,) by how much the heading of a row differs from the one before of its object [rad]."""
-    assert table.headings is not None
     before = np.maximum(rows - 1, 0)
     before = np.where(table.track[before] == table.track[rows], before, rows)
     return np.nan_to_num(wrap_angles(table.headings[rows] - table.headings[before]))
+
+
+def _best_guess(
+    guesses: Mapping[str, FloatArray], errors_of: Callable[[FloatArray], FloatArray]
+) -> tuple[str, dict[str, float]]:
+    """The guess whose values have the least median error, and that error of every guess."""
+    errors = {guess: float(np.median(errors_of(values))) for guess, values in guesses.items()}
+    return min(errors, key=lambda guess: errors[guess]), errors

@@ -44,6 +44,7 @@ _ROLES = {
     "speed": ("velocity", "speed v vel velocity vvel absvelocity vehiclespeed"),
 }
 ROLES = tuple(_ROLES)
+QUANTITIES = {role: quantity for role, (quantity, _) in _ROLES.items()}
 # what a unit is multiplied by to become ours
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3},  # to us
@@ -100,7 +101,7 @@ class Column:
 
     def factor(self, role: str) -> float:
         """What values are multiplied by to become ours."""
-        return self.sign * UNITS.get(_ROLES[role][0], {}).get(self.unit, 1.0)
+        return self.sign * UNITS.get(QUANTITIES[role], {}).get(self.unit, 1.0)
 
     @property
     def words(self) -> str:
@@ -121,7 +122,7 @@ class Columns:
 
     def unit_factors(self, role: str) -> dict[str, float]:
         """By unit, what the values of a column are multiplied by if they are in that one."""
-        units, unit_now = UNITS[_ROLES[role][0]], self.found[role].unit
+        units, unit_now = UNITS[QUANTITIES[role]], self.found[role].unit
         return {unit: factor / units[unit_now] for unit, factor in units.items()}
 
 
@@ -134,29 +135,25 @@ def recognise(names: Sequence[str], overrides: Mapping[str, Any], where: str) ->
     """
     for key in overrides:
         one_of("setting", key, _SETTINGS)
-    by_name: dict[str, list[tuple[str, str]]] = {}
-    for name in names:
-        base, unit = _split_unit(name)
-        by_name.setdefault(base, []).append((name, unit))
-    fitting_layouts = [n for n, (m, _) in _LAYOUTS.items() if all(w in by_name for w in m.split())]
-    layout = fitting_layouts[0] if fitting_layouts else ""
+    split = [(*_split_unit(name), name) for name in names]
+    words = {word for word, *_ in split}
+    layout = next((n for n, (marks, _) in _LAYOUTS.items() if words >= {*marks.split()}), "")
     given = _LAYOUTS[layout][1] if layout else {}
     usual = _USUAL | given.get("units", {})
     found = {}
     for role, (quantity, known) in _ROLES.items():
-        for word in known.split():
-            fitting = [(n, u) for n, u in by_name.get(word, []) if not u or u in UNITS[quantity]]
-            if fitting:
-                name, unit = fitting[0]
-                found[role] = Column(name, unit or usual.get(quantity, ""))
-                break
+        surest, units = known.split(), UNITS.get(quantity, {})
+        fitting = [s for s in split if s[0] in surest and (not s[1] or s[1] in units)]
+        if fitting:
+            _, unit, name = min(fitting, key=lambda one: surest.index(one[0]))
+            found[role] = Column(name, unit or usual.get(quantity, ""))
     named = {r: n for r, n in given.get("columns", {}).items() if n.lstrip("-") in names}
-    found |= _named_columns(named | overrides.get("columns", {}), found, names, usual, where)
+    found |= _named_columns(named | _table(overrides, "columns"), found, names, usual, where)
     found = {role: column for role, column in found.items() if column.name or column.constant}
     for quantity, unit in _table(overrides, "units").items():
         one_of("unit of", quantity, tuple(UNITS))
         unit = one_of(f"unit of {quantity}", _SPELLINGS.get(unit, unit), UNITS[quantity])
-        for role in [r for r in found if _ROLES[r][0] == quantity]:
+        for role in [r for r in found if QUANTITIES[r] == quantity]:
             found[role] = replace(found[role], unit=unit)
     _require_columns(found, names, where)
     for column in found.values():
@@ -166,12 +163,12 @@ def recognise(names: Sequence[str], overrides: Mapping[str, Any], where: str) ->
                 "give each a name of its own",
             )
     shift = overrides.get("shift_m", (0.0, 0.0))
-    if len(shift) != 2 or not all(isinstance(v, int | float) for v in shift):
+    if not isinstance(shift, list | tuple) or [_within(v, 1e9) for v in shift] != [True, True]:
         raise ConfigError(f"shift_m is {shift!r}", "shift_m = [x, y] in metres")
     hz = overrides.get("hz", 1.0)
-    if not isinstance(hz, int | float) or not 0.0 < hz < np.inf:
+    if not _within(hz, 1e9) or hz <= 0.0:
         raise ConfigError(f"hz is {hz!r}", "hz = 25, or --hz 25")
-    reference = overrides.get("reference", given.get("reference", ""))
+    reference = str(overrides.get("reference", given.get("reference", "")))
     if reference:
         one_of("reference", reference, ("center", "front", "rear", "corner"))
     told = SAME | given.get("kinds", {}) | _table(overrides, "kinds")
@@ -202,7 +199,7 @@ def _named_columns(
     out = {}
     for role, text in overrides.items():
         one_of("column", role, ROLES)
-        usual = units.get(_ROLES[role][0], "")
+        usual = units.get(QUANTITIES[role], "")
         if text.startswith("="):
             out[role] = Column("", usual, constant=text[1:])
             continue
@@ -240,6 +237,10 @@ def _require_columns(found: Mapping[str, Column], names: Sequence[str], where: s
             " (pyproj), and give x and y in metres"
         )
     raise ConversionError(f"{where} has {' and '.join(what)}; it has {', '.join(names)}", hint)
+
+
+def _within(value: object, most: float) -> bool:
+    return isinstance(value, int | float) and abs(value) <= most
 
 
 def _table(overrides: Mapping[str, Any], key: str) -> dict[str, str]:

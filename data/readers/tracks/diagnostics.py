@@ -10,12 +10,13 @@ from shiftsim.data.readers.build import find_pause, find_twice
 from shiftsim.data.readers.codes import KINDS
 from shiftsim.data.readers.motion import contradiction
 from shiftsim.data.readers.tracks.axes import (
+    FAST,
     LEAST_CONTRADICTING,
+    Diagnostics,
     check_headings,
     check_reference,
     check_velocities,
 )
-from shiftsim.data.readers.tracks.findings import FAST, Diagnostics
 from shiftsim.data.readers.tracks.map_fit import MIN_ALONG, Fit, fit_map
 from shiftsim.data.readers.tracks.table import TrackTable
 from shiftsim.errors import listed
@@ -89,7 +90,7 @@ def _check_times(table: TrackTable, out: Diagnostics) -> bool:
             f"each of the {len(table.track_ids)} objects has one row only",
             "check the column of ids: an object needs the same id in all its rows",
         )
-    elif fault := find_twice(table.track_ids, table.track, table.time_us):
+    elif fault := find_twice(table.track_ids, table.track, table.time):
         out.error(*fault)
     elif is_usual(period):
         if fault := find_pause(table.time_us):
@@ -201,7 +202,7 @@ def _check_map(table: TrackTable, road: VectorMap, min_share: float, out: Diagno
     stored, moving, fast = table.velocities, table.moving_rows(_MOVING), table.moving_rows(FAST)
     # another unit of length would show elsewhere, too
     is_metric = table.vehicle_size is not None and _is_usual(*table.vehicle_size)
-    if is_metric and stored is not None and len(fast):
+    if is_metric and np.isfinite(stored).any() and len(fast):
         wrong, _ = contradiction(stored, table.derived, table.time, table.track)
         is_metric = bool(wrong[table.track[fast]].mean() <= LEAST_CONTRADICTING)
     else:
@@ -279,8 +280,6 @@ def _is_usual(length: float, width: float) -> bool:
 
 def _check_sizes(table: TrackTable, out: Diagnostics) -> None:
     sizes = table.sizes
-    if sizes is None:
-        return
     large = np.flatnonzero((sizes[:, 0] > _LONGEST) | (sizes[:, 1] > _WIDEST))
     if 0 < len(large) < 0.5 * len(sizes):
         row = large[0]

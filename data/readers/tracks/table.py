@@ -31,7 +31,7 @@ from shiftsim.data.readers.motion import (
     track_medians,
     unit_vectors,
 )
-from shiftsim.data.readers.tracks.columns import Column, Columns, recognise
+from shiftsim.data.readers.tracks.columns import QUANTITIES, Column, Columns, recognise
 from shiftsim.errors import ConfigError, ConversionError
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.world.state import AgentKind
@@ -39,7 +39,6 @@ from shiftsim.world.state import AgentKind
 _DELIMITERS = ",;\t|"
 _MAX_ROWS = 40_000  # that statistics look at
 _IN_US = Column("", "us")
-_FIELDS = {"x": "position", "y": "position", "heading": "heading"}
 
 
 @dataclass(frozen=True)
@@ -55,9 +54,9 @@ class TrackTable:
     category: IntArray  # (A,) index into `categories`
     categories: tuple[str, ...]  # normalised names
     xy: FloatArray  # (A, 2) [m]
-    headings: FloatArray | None  # (A,) [rad], NaN where not given
-    velocities: FloatArray | None  # (A, 2) [m/s]
-    sizes: FloatArray | None  # (A, 2) length, width [m]
+    headings: FloatArray  # (A,) [rad], NaN where not given
+    velocities: FloatArray  # (A, 2) [m/s], NaN where not given
+    sizes: FloatArray  # (A, 2) length, width [m], NaN where not given
     origin: tuple[float, float] | None = None  # of the positions, where a file beside tells it [m]
 
     @cached_property
@@ -99,8 +98,6 @@ class TrackTable:
     @cached_property
     def vehicle_size(self) -> tuple[float, float] | None:
         """Length and width of the median vehicle [m], where vehicles have sizes."""
-        if self.sizes is None:
-            return None
         known = track_medians(self.sizes, self.track)[np.unique(self.track[self.is_vehicle])]
         known = known[(known > 0).all(axis=1)]
         if not len(known):
@@ -139,21 +136,15 @@ def read_tracks(
     category, categories = file.categories(track_ids, track)
     order = np.lexsort((time_us, track))
 
-    def stacked(*roles: str) -> FloatArray | None:
-        """(A, number of roles) their values, or nothing where one is missing."""
+    def stacked(*roles: str) -> FloatArray:
+        """(A, number of roles) their values; NaN where one is missing."""
         if not all(role in columns.found for role in roles):
-            return None
-        values = np.column_stack([file.values(role)[order] for role in roles])
-        return None if np.isnan(values).all() else values
+            return np.full((len(order), len(roles)), np.nan)
+        return np.column_stack([file.values(role)[order] for role in roles])
 
-    xy, heading = stacked("x", "y"), stacked("heading")
-    headings = None if heading is None else heading[:, 0]
-    size, velocity = stacked("length", "width"), stacked("vx", "vy")
-    speed = stacked("speed") if velocity is None else None
-    assert xy is not None  # `recognise` has found them
-    xy += columns.shift
-    if speed is not None and headings is not None:
-        velocity = speed * unit_vectors(headings)
+    headings, velocities = stacked("heading")[:, 0], stacked("vx", "vy")
+    if np.isnan(velocities).all():
+        velocities = stacked("speed") * unit_vectors(headings)
     table = TrackTable(
         paths[0].name.partition(".")[0],
         columns,
@@ -163,10 +154,10 @@ def read_tracks(
         track_ids,
         category[order],
         categories,
-        xy,
+        stacked("x", "y") + columns.shift,
         headings,
-        velocity,
-        size,
+        velocities,
+        stacked("length", "width"),
         file.origin,
     )
     return replace(table, xy=_centers(table))
@@ -175,7 +166,8 @@ def read_tracks(
 def _centers(table: TrackTable) -> FloatArray:
     """(A, 2) middles of the boxes, of whose positions the columns tell which point they are [m]."""
     reference, found = table.columns.reference, table.columns.found
-    if reference in ("", "center") or find_twice(table.track_ids, table.track, table.time_us):
+    twice = find_twice(table.track_ids, table.track, table.time)
+    if reference in ("", "center") or twice:
         return table.xy
     names = [table.categories[code] for code in table.category[table.ends[:-1]].tolist()]
     kinds = np.array([KINDS.get(name, AgentKind.VEHICLE) for name in names], np.int64)
@@ -232,33 +224,34 @@ class _TableFile(SourceFile):
         """
         try:
             if self.path.suffix.lower() in (".parquet", ".pq"):
-                return pq.read_table(self.path, use_threads=False)
-            with pa.input_stream(str(self.path), compression="detect") as stream:
-                lines = stream.read(1 << 16).decode("utf-8-sig", "replace").splitlines()[:2]
-            if not lines:
-                raise ConversionError(f"{self.path} is empty", "export the tracks again")
-            source: Path | io.BytesIO = self.path
-            delimiter = max(_DELIMITERS, key=lines[0].count)
-            if delimiter not in lines[0] and len(lines[0].split()) > 1:  # any number of spaces
-                with pa.input_stream(str(self.path), compression="detect") as stream:
-                    rows = [b",".join(row.split()) for row in stream.read().splitlines()]
-                source, lines = io.BytesIO(b"\n".join(rows)), [rows[0].decode("utf-8", "replace")]
-            is_named = self._is_named(lines[0].split(delimiter), header)
-            has_comma = delimiter != "," and "," in lines[-1] and "." not in lines[-1]
-            return pc.read_csv(
-                source,
-                read_options=pc.ReadOptions(
-                    use_threads=False,
-                    column_names=header,
-                    skip_rows=int(is_named and header is not None),
-                ),
-                parse_options=pc.ParseOptions(delimiter=delimiter),
-                convert_options=pc.ConvertOptions(decimal_point="," if has_comma else "."),
-            )
+                table = pq.read_table(self.path, use_threads=False)
+            else:
+                table = self._read_csv(header)
+            self.require_that(table.column_names, "it has no columns")  # all names are UTF-8
+            return table
         except (OSError, pa.ArrowException, ValueError) as error:
-            raise self.fault(
-                f"not readable ({error})", "give CSV in UTF-8, or Parquet (.parquet)"
-            ) from error
+            remedy = "give CSV in UTF-8, or Parquet (.parquet)"
+            raise self.fault(f"not readable ({error})", remedy) from error
+
+    def _read_csv(self, header: object) -> pa.Table:
+        with pa.input_stream(str(self.path), compression="detect") as stream:
+            data = stream.read()
+        lines = data[: 1 << 16].decode("utf-8-sig", "replace").splitlines()[:2]
+        if not lines:
+            raise ConversionError(f"{self.path} is empty", "export the tracks again")
+        delimiter = max(_DELIMITERS, key=lines[0].count)
+        if delimiter not in lines[0] and len(lines[0].split()) > 1:  # any number of spaces
+            data = b"\n".join(b",".join(row.split()) for row in data.splitlines())
+            lines = [",".join(lines[0].split())]
+        skipped = int(self._is_named(lines[0].split(delimiter), header) and header is not None)
+        has_comma = delimiter != "," and "," in lines[-1] and "." not in lines[-1]
+        read = pc.ReadOptions(use_threads=False, column_names=header, skip_rows=skipped)
+        return pc.read_csv(
+            io.BytesIO(data),
+            read_options=read,
+            parse_options=pc.ParseOptions(delimiter=delimiter),
+            convert_options=pc.ConvertOptions(decimal_point="," if has_comma else "."),
+        )
 
     def _is_named(self, cells: list[str], header: object) -> bool:
         """Whether the first line of a file are names, not numbers."""
@@ -280,9 +273,7 @@ class _TableFile(SourceFile):
     def _read_beside(self, overrides: dict[str, Any], names: list[str]) -> None:
         """Origin, rate and kinds from levelXdata's files; what the user gives goes first."""
         stem = self.path.stem.removesuffix("tracks")
-        rates, kinds = (
-            self.path.with_name(f"{stem}{part}Meta.csv") for part in ("recording", "tracks")
-        )
+        rates, kinds = (self.path.with_name(f"{stem}{p}Meta.csv") for p in ("recording", "tracks"))
         file = rates
         try:
             if rates.is_file():
@@ -291,8 +282,7 @@ class _TableFile(SourceFile):
                 if "xUtmOrigin" in meta:
                     self.origin = float(meta["xUtmOrigin"][0]), float(meta["yUtmOrigin"][0])
             file = kinds
-            has_kinds = {"class", "kind"} & {name.lower() for name in names}
-            if kinds.is_file() and not has_kinds:
+            if kinds.is_file() and not {"class", "kind"} & {*map(str.lower, names)}:
                 found = pc.read_csv(kinds).to_pydict()
                 ids = found["trackId" if "trackId" in found else "id"]
                 self.kinds = dict(zip(ids, map(str, found["class"]), strict=True))
@@ -309,22 +299,18 @@ class _TableFile(SourceFile):
             except ValueError:
                 what = f"column {role!r} is {column.constant!r} for all rows"
                 raise ConfigError(what, f"{role} = '=NUMBER'") from None
-        try:
-            values = _floats(self.table[column.name])
-        except (pa.ArrowException, ValueError) as error:
-            kind = self.table[column.name].type
-            raise self.fault(f"column {column.name!r} is {kind}, need numbers") from error
+        values = self._cast(column.name, pa.float64(), "numbers").to_numpy().copy()
         needed = role in ("x", "y")
-        bad = np.flatnonzero(~np.isfinite(values) if needed else np.isinf(values))
-        if len(bad):
-            raise self.fault(
-                f"column {column.name!r} holds {len(bad)} values that are"
-                f" {'empty or ' * needed}not finite, the first in data row {bad[0] + 1}",
-                f"leave these {'rows out of the file' if needed else 'values empty'}",
-            )
+        self._refuse(
+            column,
+            ~np.isfinite(values) if needed else np.isinf(values),
+            f"are {'empty or ' * needed}not finite",
+            f"leave these {'rows out of the file' if needed else 'values empty'}",
+        )
         values *= column.factor(role)
-        if role in _FIELDS:
-            self.require(_FIELDS[role], values[np.isfinite(values)], f"column {column.name!r}")
+        if QUANTITIES[role] in ("position", "heading"):
+            kept = values[np.isfinite(values)]
+            self.require(QUANTITIES[role], kept, f"column {column.name!r}")
         return np.pi / 2 - values if column.unit == "compass" else values
 
     def times(self) -> tuple[IntArray, float | None]:
@@ -350,21 +336,22 @@ class _TableFile(SourceFile):
             elif pa.types.is_string(values.type):  # a clock: 09:00:00.033
                 dates = pa.compute.binary_join_element_wise("1970-01-01T", values, "")
                 values, column = dates.cast(pa.timestamp("us")).cast(pa.int64()), _IN_US
-            stamps = _floats(values)
+            stamps = values.cast(pa.float64(), safe=False).to_numpy().copy()  # ns have 64 bits
         except (pa.ArrowException, ValueError) as error:
             what = f"column {column.name!r} is {values.type}, need times"
             hint = "give seconds, 13:02:03.040, or dates with times: 2024-05-01T13:02:03.040"
             raise self.fault(what, hint) from error
         stamps *= 1e6 if is_frame else column.factor(role)
         stamps /= rate if is_frame and rate else 1.0
-        bad = np.flatnonzero(~(np.abs(stamps) < 2.0**55))
-        if len(bad):
-            raise self.fault(
-                f"column {column.name!r} holds {len(bad)} values that are no times, the first"
-                f" in data row {bad[0] + 1}",
-                "check its unit: [units] time = 's', 'ms', 'us' or 'ns'; leave empty rows out",
-            )
+        remedy = "check its unit: [units] time = 's', 'ms', 'us' or 'ns'; leave empty rows out"
+        self._refuse(column, ~(np.abs(stamps) < 2.0**55), "are no times", remedy)
         return np.rint(stamps).astype(np.int64), rate if is_frame else None
+
+    def _refuse(self, column: Column, is_bad: BoolArray, what: str, remedy: str) -> None:
+        """Raise an error that tells how many rows of a column are bad, and which is the first."""
+        if is_bad.any():
+            what = f"holds {is_bad.sum()} values that {what}, the first in data row"
+            raise self.fault(f"column {column.name!r} {what} {is_bad.argmax() + 1}", remedy)
 
     def ids(self) -> pa.ChunkedArray:
         """Integers or texts."""
@@ -382,7 +369,15 @@ class _TableFile(SourceFile):
             values = column.to_numpy()
             if (values == np.rint(values)).all():
                 return pa.chunked_array([values.astype(np.int64)])
-        return column if pa.types.is_integer(column.type) else column.cast(pa.string())
+        is_integer = pa.types.is_integer(column.type)
+        return column if is_integer else self._cast(name, pa.string(), "texts in UTF-8")
+
+    def _cast(self, name: str, kind: pa.DataType, need: str) -> pa.ChunkedArray:
+        try:  # integers of 64 bits may be rounded
+            return self.table[name].cast(kind, safe=not pa.types.is_floating(kind))
+        except (pa.ArrowException, ValueError) as error:
+            what = f"column {name!r} is {self.table[name].type}, need {need}"
+            raise self.fault(what) from error
 
     def categories(
         self, track_ids: NDArray[Any], track: IntArray
@@ -396,16 +391,10 @@ class _TableFile(SourceFile):
         else:
             values = self.table[column.name]
             if not pa.types.is_dictionary(values.type):
-                values = values.cast(pa.string())
+                values = self._cast(column.name, pa.string(), "texts in UTF-8")
             found, codes = dictionary_codes(values)
             names = [*map(str, found.to_pylist()), ""]
         plain = [normalise_category(name) for name in names]
         known = [self.columns_of.kinds.get(name, name) for name in plain]
         distinct, place = np.unique(known, return_inverse=True)
         return place[codes], tuple(distinct.tolist())
-
-
-def _floats(column: pa.ChunkedArray) -> FloatArray:
-    """(A,) numbers that may be written; NaN where there is none."""
-    values: FloatArray = column.cast(pa.float64(), safe=False).to_numpy()  # ns have 64 bits
-    return values if values.flags.writeable else values.copy()

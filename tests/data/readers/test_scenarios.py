@@ -8,12 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shiftsim.data.readers.annotations import read_recording
+from shiftsim.data.readers.build import make_samples
 from shiftsim.data.readers.dsc3d import convert_dsc3d, open_site
 from shiftsim.data.readers.samples import ego_states, resample, slope
 from shiftsim.data.readers.windows import (
     ConversionConfig,
     evaluate_windows,
-    shared_area,
+    overlap_partners,
     window_spans,
 )
 from shiftsim.data.store.reading import ScenarioStore
@@ -89,10 +90,23 @@ def test_two_cars_of_one_window_are_both_egos(tmp_path):
     st.tuples(*[st.floats(-3, 3)] * 2, st.floats(-4, 4), *[st.floats(0.3, 6)] * 2),
     st.tuples(*[st.floats(-3, 3)] * 2, st.floats(-4, 4), *[st.floats(0.3, 6)] * 2),
 )
-def test_shared_area_agrees_with_shapely(a, b):
-    rings = [boxes_to_corners(np.array(box[:3]), np.array(box[3:])) for box in (a, b)]
-    expected = shapely.Polygon(rings[0]).intersection(shapely.Polygon(rings[1])).area
-    assert shared_area(*rings) == pytest.approx(expected, abs=1e-9)
+def test_boxes_overlap_where_they_share_more_than_the_limit(a, b):
+    box = np.array([a, b] * 2)
+    samples = make_samples(
+        "r",
+        time_us=np.array([0, 0, 50_000, 50_000]),
+        ids=np.array([1, 2] * 2),
+        category=np.zeros(4, np.int64),
+        xy=box[:, :2],
+        headings=box[:, 2],
+        sizes=box[:, 3:],
+    )
+    rings = [boxes_to_corners(row[:3], row[3:]) for row in box[:2]]
+    area = shapely.Polygon(rings[0]).intersection(shapely.Polygon(rings[1])).area
+    both = np.ones(2, np.bool_)
+    assert (overlap_partners(samples, both, area + 1e-6) == -1).all()
+    if area > 1e-5:
+        assert overlap_partners(samples, both, area - 1e-6).tolist() == [1, 1, 0, 0]
 
 
 def test_the_heading_is_interpolated_the_short_way_round(tmp_path):

@@ -342,6 +342,27 @@ def test_a_missing_column_is_named(name, town, tmp_path):
     assert "--" in error.value.hint
 
 
+def test_a_name_with_a_unit_where_none_belongs_is_not_known(town, tmp_path):
+    changed = {"kind": None, "kind [s]": town[0]["kind"]}
+    with pytest.raises(ConversionError, match="known as 'kind'"):
+        read_tracks(write_tracks(tmp_path / "t.csv", town[0], **changed))
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [("width_m", "not readable"), (",car,", "'kind' is binary"), (",pedestrian,", "'kind' is bin")],
+)
+def test_bytes_that_are_no_text_are_named(text, what, town, tmp_path):
+    path = write_tracks(tmp_path / "t.csv", town[0])
+    data = path.read_bytes().replace(b'"', b"")
+    assert text.encode() in data
+    path.write_bytes(
+        data.replace(text.encode(), text.encode()[:1] + b"\xff" + text.encode()[-1:], 1)
+    )
+    with pytest.raises(ConversionError, match=what):
+        read_tracks(path)
+
+
 def test_columns_of_longitude_and_latitude_are_refused(town, tmp_path):
     changed = {"x_m": None, "y_m": None, "lon": town[0]["x_m"], "lat": town[0]["y_m"]}
     with pytest.raises(ConversionError) as error:
@@ -416,7 +437,12 @@ def test_repeated_rows_are_named(town, tmp_path):
         ({"kinds": {"1": "tank"}}, "kind 'tank' unknown"),
         ({"column": {}}, "setting 'column' unknown"),
         ({"shift_m": [1]}, "shift_m"),
+        ({"shift_m": [10**400, 0]}, "shift_m"),
+        ({"shift_m": 5}, "shift_m is 5"),
         ({"reference": "axle"}, "reference 'axle' unknown"),
+        ({"reference": 5}, "reference '5' unknown"),
+        ({"columns": ["x_m"]}, "columns is"),
+        ({"hz": 10**400}, "hz is"),
     ],
 )
 def test_what_is_said_wrongly_is_named(overrides, what, town, tmp_path):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from shiftsim.cli import main
-from shiftsim.data.readers.tracks.inspection import convert_tracks, inspect_tracks
+from shiftsim.data.readers.tracks.reader import TracksReader, convert_tracks
 from shiftsim.errors import ConversionError
 from shiftsim.files import read_toml
 
@@ -102,7 +102,7 @@ def _inspect(cases: Path, tables: str, columns=None):
     paths = [cases / name for name in tables.split()]
     (road,) = paths[0].parent.glob("*.xodr")
     overrides = read_toml(paths[0].parent / columns) if isinstance(columns, str) else columns
-    return inspect_tracks(paths, road, overrides=overrides)
+    return TracksReader(paths, road, overrides=overrides)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -155,7 +155,7 @@ def test_all_columns_that_are_missing_are_named_at_once(cases, tmp_path):
     (tmp_path / "t.csv").write_text("a,x,b\nk,2.0,3\n")
     (road,) = (cases / "b7_songdo").glob("*.xodr")
     with pytest.raises(ConversionError) as error:
-        inspect_tracks(tmp_path / "t.csv", road)
+        TracksReader(tmp_path / "t.csv", road)
     assert "'id', 'y', 'kind' and neither a time nor a frame; it has a, x, b" in str(error.value)
     assert "id = 'NAME', y = 'NAME', kind = 'NAME', time = 'NAME'" in error.value.hint
 

@@ -1,11 +1,11 @@
 """A file of tracks and an OpenDRIVE map to scenarios of a store.
 
-First both are inspected (`inspect_tracks`), so that even what is wrong can be drawn; then the
+The reader looks for what cannot be right, so that even what is wrong can be drawn; then the
 scenarios are made.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,11 @@ from shiftsim.data.maps.opendrive.reading import read_opendrive
 from shiftsim.data.readers.build import make_samples
 from shiftsim.data.readers.codes import KINDS
 from shiftsim.data.readers.convert import ConversionReport, convert
+from shiftsim.data.readers.placement import extent_of
 from shiftsim.data.readers.reader import Reader, SourceRecording, opendrive_site
 from shiftsim.data.readers.scenarios import EGO_CATEGORIES
+from shiftsim.data.readers.tracks.axes import Diagnostics
 from shiftsim.data.readers.tracks.diagnostics import diagnose
-from shiftsim.data.readers.tracks.findings import Diagnostics
 from shiftsim.data.readers.tracks.table import TrackTable, read_tracks
 from shiftsim.data.readers.windows import ConversionConfig
 from shiftsim.data.store.map import read_map_file
@@ -29,23 +30,46 @@ from shiftsim.kernels import FloatArray
 from shiftsim.world.map import VectorMap
 
 
-@dataclass
-class Inspection(Reader):
-    """Tracks and map, and what cannot be right about them: a source of one recording."""
+class TracksReader(Reader):
+    """Tracks and map, read, and what cannot be right about them: a source of one recording.
 
-    source: Path  # the file of tracks
-    map_path: Path
-    table: TrackTable
-    site: BuiltMap
-    diagnostics: Diagnostics
-    config: ConversionConfig
+    Args:
+        tracks: CSV or Parquet file, one row per object and time; several make one recording.
+        map_path: OpenDRIVE file.
+        city: Name of the map in the store; that of the file by default.
+        overrides: Names, units and kinds (`columns.recognise`).
+        hz: Frames per second, for time given in frames.
+        config: Thresholds.
+
+    Raises:
+        ConversionError: A file cannot be read.
+        ConfigError: An override does not fit the file.
+    """
+
     egos: Sequence[str] | None = None  # ids of the egos; None for every vehicle that can be one
-    more: Sequence[Path] = ()  # files of the same recording
 
-    def __post_init__(self) -> None:
-        columns = asdict(self.table.columns) | {"hz": self.table.hz}
-        self.name = self.road.name
-        self.settings = {"egos": self.egos, "config": asdict(self.config), "columns": columns}
+    def __init__(
+        self,
+        tracks: Path | Sequence[Path],
+        map_path: Path,
+        *,
+        city: str | None = None,
+        overrides: Mapping[str, Any] | None = None,
+        hz: float | None = None,
+        config: ConversionConfig | None = None,
+    ) -> None:
+        self.config = config = config or ConversionConfig(ego_categories=EGO_CATEGORIES)
+        self.paths = [tracks] if isinstance(tracks, Path) else tracks
+        self.source, self.map_path = self.paths[0], map_path
+        table = read_tracks(self.paths, overrides=overrides, hz=hz)
+        drive, self.name = read_opendrive(map_path), city or map_path.stem
+        self.site: BuiltMap = opendrive_site(drive, name=self.name, country=config.country)
+        if table.origin and "shift_m" not in (overrides or {}):
+            table = _at_origin(table, self.road, table.origin)
+        self.table, self.diagnostics = table, diagnose(table, self.road, config.min_drivable_share)
+        _note_inputs(self.paths, table, self.diagnostics)
+        columns = asdict(table.columns) | {"hz": table.hz}
+        self.settings: dict[str, Any] = {"config": asdict(config), "columns": columns, "egos": None}
 
     @property
     def road(self) -> VectorMap:
@@ -58,7 +82,7 @@ class Inspection(Reader):
 
     def files(self, recording: str) -> Sequence[Path]:
         """The table and the map."""
-        return [self.source, *self.more, self.map_path]
+        return [*self.paths, self.map_path]
 
     def read(self, recording: str) -> SourceRecording:
         """The recording."""
@@ -86,45 +110,9 @@ class Inspection(Reader):
         )
 
 
-def inspect_tracks(
-    tracks: Path | Sequence[Path],
-    map_path: Path,
-    *,
-    city: str | None = None,
-    overrides: Mapping[str, Any] | None = None,
-    hz: float | None = None,
-    config: ConversionConfig | None = None,
-) -> Inspection:
-    """Read a file of tracks and its map, and find out whether they can be right.
-
-    Args:
-        tracks: CSV or Parquet file, one row per object and time; several make one recording.
-        map_path: OpenDRIVE file.
-        city: Name of the map in the store; that of the file by default.
-        overrides: Names, units and kinds (`columns.recognise`).
-        hz: Frames per second, for time given in frames.
-        config: Thresholds.
-
-    Raises:
-        ConversionError: A file cannot be read.
-        ConfigError: An override does not fit the file.
-    """
-    config = config or ConversionConfig(ego_categories=EGO_CATEGORIES)
-    files = [tracks] if isinstance(tracks, Path) else tracks
-    table = read_tracks(files, overrides=overrides, hz=hz)
-    drive = read_opendrive(map_path)
-    site = opendrive_site(drive, name=city or map_path.stem, country=config.country)
-    if table.origin and "shift_m" not in (overrides or {}):
-        table = _at_origin(table, site.road, table.origin)
-    diagnostics = diagnose(table, site.road, config.min_drivable_share)
-    _note_inputs(files, table, diagnostics)
-    return Inspection(files[0], map_path, table, site, diagnostics, config, more=files[1:])
-
-
 def _at_origin(table: TrackTable, road: VectorMap, origin: tuple[float, float]) -> TrackTable:
     """Tracks moved by the origin of their frame, where that brings them nearer to the map."""
-    bounds, middle = road.edges.polygons.bounds, np.median(table.xy, axis=0)
-    low, high = bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)
+    middle, (low, high) = np.median(table.xy, axis=0), extent_of(road)
 
     def gap(place: FloatArray) -> float:
         return float(np.hypot(*(place - np.clip(place, low, high))))
@@ -152,15 +140,12 @@ def _note_inputs(files: Sequence[Path], table: TrackTable, out: Diagnostics) -> 
 
 
 def convert_tracks(
-    inspection: Inspection,
-    store: Path,
-    *,
-    egos: Sequence[str] | None = None,
+    reader: TracksReader, store: Path, *, egos: Sequence[str] | None = None
 ) -> ConversionReport:
-    """Add inspected tracks to a store, made if needed; what it held of the recording is replaced.
+    """Add tracks to a store, made if needed; what it held of the recording is replaced.
 
     Args:
-        inspection: Tracks and map.
+        reader: Tracks and map.
         store: Folder of the store.
         egos: Ids of the egos; every vehicle that can be one by default.
 
@@ -168,7 +153,7 @@ def convert_tracks(
         ConversionError: Something cannot be right, or no scenario is left.
         DataError: The store has another map of that name.
     """
-    errors, road = inspection.diagnostics.errors, inspection.road
+    errors, road = reader.diagnostics.errors, reader.road
     if errors:
         raise ConversionError(
             "; ".join(error.what for error in errors), "; ".join(error.remedy for error in errors)
@@ -182,4 +167,5 @@ def convert_tracks(
             raise ConversionError(
                 f"store {store} has another map named {road.name!r}", "name this one: --city NAME"
             )
-    return convert(replace(inspection, egos=egos), store)
+    reader.egos = reader.settings["egos"] = egos
+    return convert(reader, store)

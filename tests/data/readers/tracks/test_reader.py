@@ -18,7 +18,7 @@ from shiftsim.data.readers.build import make_samples
 from shiftsim.data.readers.dsc3d import convert_dsc3d
 from shiftsim.data.readers.motion import fitted_velocities
 from shiftsim.data.readers.scenarios import make_scenarios
-from shiftsim.data.readers.tracks.inspection import convert_tracks, inspect_tracks
+from shiftsim.data.readers.tracks.reader import TracksReader, convert_tracks
 from shiftsim.data.readers.tracks.table import read_tracks
 from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import open_store
@@ -65,7 +65,7 @@ def _samples(columns, **changed):
 
 def test_a_table_gives_the_scenarios_of_the_same_recording_in_dsc3d(towns, town, tmp_path):
     table = write_tracks(tmp_path / "t.csv", town[0])
-    report = convert_tracks(inspect_tracks(table, town[1], city=TOWN), tmp_path / "own")
+    report = convert_tracks(TracksReader(table, town[1], city=TOWN), tmp_path / "own")
     convert_dsc3d(towns / TOWN, tmp_path / "theirs", site=TOWN)
     own, theirs = open_store(tmp_path / "own"), open_store(tmp_path / "theirs")
     assert report.accepted == len(own) == len(theirs) > 0
@@ -162,6 +162,16 @@ def test_velocities_and_headings_that_are_not_given_follow_from_the_places(town)
     assert bare.warnings["tracks without size (that of their kind)"] == len(bare.track_ids)
 
 
+def test_a_track_with_an_impossible_velocity_gets_that_of_its_places(town):
+    fast = town[0]["vx_mps"].copy()
+    fast[100] = 1e30
+    samples, before = _samples(town[0], vx_mps=fast), _samples(town[0])
+    assert np.abs(samples.velocities).max() < 60.0
+    assert samples.warnings["tracks whose stored velocity does not fit (derived)"] == 1
+    same = samples.track != samples.track_ids.tolist().index(town[0]["track"][100])
+    np.testing.assert_array_equal(samples.velocities[same], before.velocities[same])
+
+
 @pytest.mark.parametrize("hz", [2.0, 4.0, 10.0, 12.5, 29.97, 100.0])
 def test_fitted_velocities_of_a_parabola_are_exact(hz):
     time = np.arange(round(3 * hz)) / hz
@@ -209,7 +219,7 @@ def test_files_of_levelxdata_need_nothing_said(town, tmp_path):
     kinds = {"trackId": tracks, "class": c["kind"][first]}
     pc.write_csv(pa.table(kinds), tmp_path / "07_tracksMeta.csv")
     pc.write_csv(pa.table({"frameRate": [12.5]}), tmp_path / "07_recordingMeta.csv")
-    inspection = inspect_tracks(tmp_path / "07_tracks.csv", town[1])
+    inspection = TracksReader(tmp_path / "07_tracks.csv", town[1])
     assert inspection.diagnostics.errors == []
     assert inspection.table.hz == 12.5
     names = np.array(inspection.table.categories)[inspection.table.category]
@@ -217,7 +227,7 @@ def test_files_of_levelxdata_need_nothing_said(town, tmp_path):
 
 
 def test_a_recording_that_is_converted_again_takes_the_place_of_the_old_one(town, tmp_path):
-    inspection = inspect_tracks(write_tracks(tmp_path / "t.csv", town[0]), town[1])
+    inspection = TracksReader(write_tracks(tmp_path / "t.csv", town[0]), town[1])
     before = convert_tracks(inspection, tmp_path / "s")
     store = open_store(tmp_path / "s")
     ego = store.window(store.tokens[-1]).ego
@@ -227,7 +237,7 @@ def test_a_recording_that_is_converted_again_takes_the_place_of_the_old_one(town
     assert {store.window(token).ego for token in store.tokens} == {ego}
     assert len(store) == report.accepted
     assert check_store(tmp_path / "s") == []
-    other = inspect_tracks(tmp_path / "t.csv", export_town(tmp_path, "junction")[1], city="map")
+    other = TracksReader(tmp_path / "t.csv", export_town(tmp_path, "junction")[1], city="map")
     other.diagnostics.errors.clear()
     with pytest.raises(ConversionError, match="another map named 'map'"):
         convert_tracks(other, tmp_path / "s")
