@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import shapely
 
-from shiftsim.data.synthetic.agents import SIZES, STEP, Driver, Path, Pedestrian, arc_at, shifted
+from shiftsim.data.synthetic.agents import SIZES, Driver, Path, Pedestrian, arc_at, shifted
+from shiftsim.data.synthetic.roads import STEP
 from shiftsim.data.synthetic.routes import RandomRoutes
 from shiftsim.data.synthetic.town import Town
 from shiftsim.data.synthetic.traffic import Box, Traffic
@@ -145,8 +146,7 @@ def _queue(
 
 def _is_red(town: Town, entry: str) -> bool:
     """Whether a street has a light that is red at time 0."""
-    connectors = town.connectors.items()
-    numbers = {number for (_, name, _, _), (number, _) in connectors if name == entry}
+    numbers = {road.id for turn, road in town.connectors.items() if turn.street == entry}
     return any(
         numbers & group and lights.status(phase, 0.0) == LightStatus.RED
         for lights in town.lights
