@@ -10,10 +10,10 @@ import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias, get_args, get_origin
+from typing import Any, NamedTuple, TypeAlias
 
 from shiftsim.errors import ConfigError, one_of
-from shiftsim.files import DEFAULT_STORE
+from shiftsim.files import DEFAULT_STORE, make_table
 
 Value: TypeAlias = bool | int | float | str | list[Any]
 
@@ -142,9 +142,16 @@ class RunConfig:
     allow_partial: bool = _setting(False, "Print a labelled mean over what finished.")
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            _check(item.name, getattr(self, item.name), item.type, item.metadata["option"])
-        for name in ("planners", "noise", "seeds"):
+        for name in ("planners", "noise", "metrics", "checkpoints", "seeds"):
+            values = getattr(self, name)
+            if len(set(values)) != len(values):
+                raise ConfigError(
+                    f"{name} {list(values)!r}: a value is listed twice",
+                    hint="give each planner a `name` of its own" if name == "planners" else "",
+                )
+        if not self.planners:
+            raise ConfigError("no planner", hint="name one, for example --planner idm")
+        for name in ("noise", "seeds"):
             if not getattr(self, name):
                 raise ConfigError(f"{name} is empty", hint=f"give at least one value for {name}")
         if any(not 0 <= seed <= MAX_SEED for seed in self.seeds):
@@ -174,35 +181,15 @@ class RunConfig:
         return {name: list(v) if isinstance(v, tuple) else v for name, v in out.items()}
 
 
-def _check(name: str, value: Any, kind: Any, option: Option) -> None:
-    """Types are checked strictly: TOML and Python callers get the same message."""
-    if get_origin(kind) is tuple:
-        kind = get_args(kind)[0]
-        good = isinstance(value, tuple) and all(_is_a(item, kind) for item in value)
-        wanted = f"a list of {kind.__name__}"
-    elif get_origin(kind) is dict:
-        good = isinstance(value, dict) and all(isinstance(v, dict) for v in value.values())
-        wanted = "a table of arguments per planner"
-    else:
-        good, wanted = _is_a(value, kind), kind.__name__
-    if not good:
-        raise ConfigError(f"{name} is {value!r}; it must be {wanted}")
-    if isinstance(value, tuple) and len(set(value)) != len(value):
-        raise ConfigError(
-            f"{name} {list(value)!r}: a value is listed twice",
-            hint="give each planner a `name` of its own" if name == "planners" else "",
-        )
-    if option.choices:
-        one_of(name, value.partition(":")[0], option.choices)
+def _check(name: str, value: Any, where: str) -> None:
+    """Refuse what is not among the choices of an option, or out of its range."""
     from shiftsim.world.ranges import SETTINGS  # not needed to show the options
 
+    option = next(item.metadata["option"] for item in fields(RunConfig) if item.name == name)
+    if option.choices:
+        one_of(f"{where}: {name}", value.partition(":")[0], option.choices)
     if name in SETTINGS and not SETTINGS[name].low <= value <= SETTINGS[name].high:
-        raise ConfigError(f"{name} is {value!r}; it must be within {SETTINGS[name]}")
-
-
-def _is_a(value: object, kind: type) -> bool:
-    kinds = (int, float) if kind is float else (kind,)
-    return isinstance(value, kinds) and (kind is bool or not isinstance(value, bool))
+        raise ConfigError(f"{where}: {name} is {value!r}; it must be within {SETTINGS[name]}")
 
 
 def make_config(values: Mapping[str, Any], *, where: str = "run") -> RunConfig:
@@ -211,23 +198,7 @@ def make_config(values: Mapping[str, Any], *, where: str = "run") -> RunConfig:
     Raises:
         ConfigError: A name is unknown, or a value is wrong.
     """
-    known = {item.name for item in fields(RunConfig)}
-    plain: dict[str, Any] = {
-        name: tuple(value)
-        if isinstance(value, list)
-        else os.fspath(value)
-        if isinstance(value, os.PathLike)
-        else value
-        for name, value in values.items()
-    }
-    try:
-        for name in values:
-            one_of("setting", name, known)
-        if "planners" not in values:
-            raise ConfigError("no planner", hint="name one, for example --planner idm")
-        return RunConfig(**plain)
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error.message}", hint=error.hint) from error
+    return make_table(RunConfig, values, where, _check)
 
 
 def parse_argument(text: str, planners: tuple[str, ...]) -> tuple[str, str, Value]:
