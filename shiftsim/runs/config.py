@@ -70,7 +70,8 @@ class Option(NamedTuple):
     parse: Callable[[str], Any] | None = None  # makes the value from the text of the command line
 
 
-def _setting(default: Any, help: str, *flags: str, **more: Any) -> Any:
+def setting(default: Any, help: str, *flags: str, **more: Any) -> Any:
+    """A field of settings that is an option of the command line, too."""
     return field(default=default, metadata={"option": Option(help, flags, **more)})
 
 
@@ -83,63 +84,63 @@ class RunConfig:
     `batch_size` may differ in the last digits.
     """
 
-    planners: tuple[str, ...] = _setting(
+    planners: tuple[str, ...] = setting(
         (), "Name, ./file.py:Class or [nuplan:]package.module:Class; repeatable.", "--planner", "-p"
     )
-    noise: tuple[str, ...] = _setting(
+    noise: tuple[str, ...] = setting(
         ("none",), "none, awgn-low … ou-high, all; repeatable. [none]", "--noise", "-n"
     )
-    seeds: tuple[int, ...] = _setting(
+    seeds: tuple[int, ...] = setting(
         (0,), "Noise seeds, such as 0,1,2 or 0-2. [0]", parse=parse_seeds
     )
-    store: str = _setting(DEFAULT_STORE, "Name or folder. [demo]", "--store", "-s")
-    split: str = _setting("", "Name or file (.toml, .txt). [whole store]")
-    limit: int = _setting(0, "Only the first N scenarios.")
-    all_scenarios: bool = _setting(False, "Also the scenarios that the filter dropped.", "--all")
-    edits: str = _setting("", "File (.toml) of edits; only what they make is run.")
-    traffic: str = _setting(
+    store: str = setting(DEFAULT_STORE, "Name or folder. [demo]", "--store", "-s")
+    split: str = setting("", "Name or file (.toml, .txt). [whole store]")
+    limit: int = setting(0, "Only the first N scenarios.")
+    all_scenarios: bool = setting(False, "Also the scenarios that the filter dropped.", "--all")
+    edits: str = setting("", "File (.toml) of edits; only what they make is run.")
+    traffic: str = setting(
         "nonreactive",
         "nonreactive (nr), reactive (r), constant-velocity, or package.module:Model. [nonreactive]",
     )
-    controller: str = _setting(
+    controller: str = setting(
         "lqr",
         "lqr, perfect or log-playback. [lqr]",
         choices=("lqr", "perfect", "log-playback"),
     )
-    thresholds: str = _setting("nuplan", "nuplan or deepplan. [nuplan]")
+    thresholds: str = setting("nuplan", "nuplan or deepplan. [nuplan]")
     planner_args: dict[str, dict[str, Value]] = field(
         default_factory=dict,
         metadata={
             "option": Option("key=value, or PLANNER.key=value; repeatable.", ("--planner-arg",))
         },
     )
-    metrics: tuple[str, ...] = _setting(
+    metrics: tuple[str, ...] = setting(
         (), "Own metric as package.module:function; repeatable.", "--metric"
     )
-    checkpoints: tuple[str, ...] = _setting(
+    checkpoints: tuple[str, ...] = setting(
         (), "PATH, official or shiftsim; or PLANNER=…; repeatable.", "--checkpoint"
     )
-    device: str = _setting("cpu", "cpu, cuda or auto. [cpu]", choices=("cpu", "cuda", "auto"))
-    batch_size: int = _setting(1, "Scenarios per forward pass of a network. [1]")
-    isolate: bool = _setting(False, "Every planner in a process of its own.")
-    planner_python: str = _setting("", "Interpreter for isolated planners of your own.")
-    strict: bool = _setting(False, "Fail where a planner falls back.")
-    open_loop: bool = _setting(False, "Also nuPlan's open-loop scores of every planner.")
-    out: str = _setting("", "Run folder. [runs/<id>]")
-    workers: int = _setting(0, "Worker processes. [auto]", parse=parse_workers)
-    timeout: float = _setting(0.0, "Seconds that one scenario may take; a hung one is killed.")
-    resume: bool = _setting(False, "Finish an interrupted or killed run.")
-    retry_failed: bool = _setting(False, "Finish a run, and do again what failed.")
-    shard: str = _setting("", "Only the part i/n of the tasks; see merge.")
-    executor: str = _setting(
+    device: str = setting("cpu", "cpu, cuda or auto. [cpu]", choices=("cpu", "cuda", "auto"))
+    batch_size: int = setting(1, "Scenarios per forward pass of a network. [1]")
+    isolate: bool = setting(False, "Every planner in a process of its own.")
+    planner_python: str = setting("", "Interpreter for isolated planners of your own.")
+    strict: bool = setting(False, "Fail where a planner falls back.")
+    open_loop: bool = setting(False, "Also nuPlan's open-loop scores of every planner.")
+    out: str = setting("", "Run folder. [runs/<id>]")
+    workers: int = setting(0, "Worker processes. [auto]", parse=parse_workers)
+    timeout: float = setting(0.0, "Seconds that one scenario may take; a hung one is killed.")
+    resume: bool = setting(False, "Finish an interrupted or killed run.")
+    retry_failed: bool = setting(False, "Finish a run, and do again what failed.")
+    shard: str = setting("", "Only the part i/n of the tasks; see merge.")
+    executor: str = setting(
         "processes", "processes or dask. [processes]", choices=("processes", "dask")
     )
-    scheduler: str = _setting("", "Address of the dask scheduler.")
-    save_rollouts: str = _setting(
+    scheduler: str = setting("", "Address of the dask scheduler.")
+    save_rollouts: str = setting(
         "all", "all, failed (score 0) or none. [all]", choices=("all", "failed", "none")
     )
-    bundle: bool = _setting(False, "Copy the scenarios used into the run folder.")
-    allow_partial: bool = _setting(False, "Print a labelled mean over what finished.")
+    bundle: bool = setting(False, "Copy the scenarios used into the run folder.")
+    allow_partial: bool = setting(False, "Print a labelled mean over what finished.")
 
     def __post_init__(self) -> None:
         for name in ("planners", "noise", "metrics", "checkpoints", "seeds"):
