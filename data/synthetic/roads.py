@@ -73,7 +73,8 @@ class RoadSpec:
     @cached_property
     def records(self) -> list[tuple[float, tuple[float, ...], Piece]]:
         """Where each piece begins along the road [m], the pose there, and the piece."""
-        begin, pose, out = 0.0, self.start, []
+        begin, out = 0.0, list[tuple[float, tuple[float, ...], Piece]]()
+        pose: tuple[float, ...] = self.start
         for piece in self.pieces:
             out.append((begin, pose, piece))
             begin, pose = begin + piece.length, _end(piece, pose)

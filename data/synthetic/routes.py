@@ -125,13 +125,12 @@ def make_path(town: Town, route: Route) -> Path:
         parts += [line, connector.line] if connector else [line]
         limits += [leg.street.limit, connector.limit_kmh] if connector else [leg.street.limit]
     path = path_along(parts, limits)
-    crossings = tuple(
-        (leg.street.crossing_name(number), *sorted(arc_at(path.points, x) for x in places))
-        for leg, _, lane, *_ in stages
-        for number, ends in enumerate(leg.street.crossings)
-        for places in [leg.centers(lane, ends)]
-    )
-    path = replace(path, crossings=crossings, is_parking=route.bay is not None)
+    crossings = []
+    for leg, _, lane, *_ in stages:
+        for number, ends in enumerate(leg.street.crossings):
+            first, last = sorted(arc_at(path.points, x) for x in leg.centers(lane, ends))
+            crossings.append((leg.street.crossing_name(number), first, last))
+    path = replace(path, crossings=tuple(crossings), is_parking=route.bay is not None)
     path = _with_zones(path, [x for stage in stages for x in _zones(path, stage)])
     if route.is_bicycle:
         speed = np.minimum(path.speed, _CYCLING)

@@ -70,7 +70,7 @@ def write_part(folder: Path, states: Iterable[State]) -> None:
             ends.append(ends[-1] + file.write(picture))
             rows.append(row)
     columns = zip(_COLUMNS, zip(*rows, strict=True), strict=True)
-    numbers = {name: np.array(column) for name, column in columns}
+    numbers: dict[str, Any] = {name: np.array(column) for name, column in columns}
     np.savez(partial / _NUMBERS, ends=np.array(ends), **numbers)
     partial.rename(folder)
 
