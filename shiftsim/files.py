@@ -13,19 +13,25 @@ import sys
 import tempfile
 import tomllib
 import traceback
-from collections.abc import Iterator, Sequence
+import types
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
 from importlib import import_module
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from types import ModuleType
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeAlias, TypeVar, Union, get_args, get_origin
 
-from shiftsim.errors import ConfigError, DataError
+from shiftsim.errors import ConfigError, DataError, one_of
 
 PACKAGE = Path(__file__).parent
 DEFAULT_STORE = "demo"
+_KINDS = {float: "a number", int: "an integer", str: "a text", bool: "true or false"}
+_T = TypeVar("_T")
+# raises an error where a value of the right type is wrong; gets its name, the value, where it is
+Check: TypeAlias = Callable[[str, Any, str], None]
 _IMPORT = re.compile(
     r"\n *(?:from shiftsim\.([\w.]+) import (?:\(([^)]*)\)|([^\n(]+))|import shiftsim\.([\w.]+))"
 )
@@ -178,6 +184,64 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(
             f"{str(path)!r} is not TOML: {error}", hint="repair the line named above"
         ) from error
+
+
+def make_table(cls: type[_T], table: Any, where: str, check: Check = lambda *_: None) -> _T:
+    """A dataclass from plain values, such as those of TOML or JSON: its fields are their keys.
+
+    Lists become tuples, and tables dataclasses; one table where a list is wanted is a list of one.
+    Types are checked strictly, but that an integer is a number, and a path a text.
+
+    Raises:
+        ConfigError: A key is unknown or missing, or a value is of another type.
+    """
+    if not isinstance(table, Mapping):
+        raise ConfigError(f"{where}: {table!r} is not a table")
+    known = {item.name: item for item in fields(cls)}  # type: ignore[arg-type]
+    for name in table:
+        one_of(f"{where}: key", str(name), known)
+    for name, item in known.items():
+        if name not in table and item.default is MISSING and item.default_factory is MISSING:
+            raise ConfigError(f"{where}: {name} is missing")
+    values = {n: _value(known[n].type, table[n], n, where, check) for n in known if n in table}
+    try:
+        return cls(**values)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error.message}", error.hint) from error
+
+
+def _value(kind: Any, value: Any, name: str, where: str, check: Check) -> Any:
+    """A value as the type annotation `kind` has it."""
+    if get_origin(kind) in (Union, types.UnionType):
+        kind, *others = (choice for choice in get_args(kind) if choice is not types.NoneType)
+        if value is None or others:
+            return value
+    if kind is Any or (is_dataclass(kind) and type(value) is kind):
+        return value
+    if is_dataclass(kind):
+        return make_table(kind, value, f"{where}, {name}", check)  # type: ignore[arg-type]
+    origin, kinds, is_table = get_origin(kind), get_args(kind), isinstance(value, Mapping)
+    what = f"{where}: {name} is {value!r}; it must be"
+    if origin is tuple:
+        listed = [value] if is_table or is_dataclass(value) else value
+        if not isinstance(listed, (list, tuple)):
+            raise ConfigError(f"{what} a list")
+        each = [kinds[0]] * len(listed) if kinds[-1] is Ellipsis else kinds
+        if len(each) != len(listed):
+            raise ConfigError(f"{where}: {name} has {len(listed)} values, not {len(each)}")
+        pairs = zip(each, listed, strict=True)
+        return tuple(_value(kind, item, name, where, check) for kind, item in pairs)
+    if origin is not None:
+        if not is_table:
+            raise ConfigError(f"{what} a table")
+        return {k: _value(kinds[1], item, name, where, check) for k, item in value.items()}
+    if kind is str and isinstance(value, os.PathLike):
+        value = os.fspath(value)
+    wanted = (int, float) if kind is float else kind
+    if not isinstance(value, wanted) or (isinstance(value, bool) and kind is not bool):
+        raise ConfigError(f"{what} {_KINDS[kind]}")
+    check(name, value, where)
+    return float(value) if kind is float else value
 
 
 def import_named(module: str) -> ModuleType:

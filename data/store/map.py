@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from shiftsim.data.store.schema import list_of
+from shiftsim.data.store.schema import list_of, make_schema
 from shiftsim.data.store.tables import REPAIR
 from shiftsim.errors import DataError
 from shiftsim.files import atomic_write
@@ -46,45 +46,41 @@ _ARRAYS = {
     "stop_kinds": ("stop_polygons", _I64, ""),
 }
 _NUMBERS = ("epsg", "num_lanes", "num_roadblocks")
-_UNITS = {"xy": "_m", "bounds": "_m", "grid": "_m", "arc": "_m", "speed_limits": "_mps"}
-_PARTS = {  # columns of arrays of several axes, and of floats
-    "xy": pa.list_(pa.field("item", _F64, nullable=False), 2),
-    "bounds": pa.list_(pa.field("item", _F64, nullable=False), 4),
-    "grid": _F64,
-    "arc": _F64,
-}
-
-
 _KINDS: dict[str, Any] = {  # what has several arrays each
     **dict.fromkeys(LAYERS, Polygons),
     **dict.fromkeys(_LINES, Polylines),
     **dict.fromkeys(_LISTS, Lists),
 }
+_PARTS = {  # arrays of floats of these: unit and type of the column; all others are indices
+    "xy": ("_m", pa.list_(pa.field("item", _F64, nullable=False), 2)),
+    "bounds": ("_m", pa.list_(pa.field("item", _F64, nullable=False), 4)),
+    "grid": ("_m", _F64),
+    "arc": ("_m", _F64),
+}
 
 
-def _parts(name: str) -> list[str]:
-    """Columns of the arrays of a field."""
-    return [f"{name}_{part}{_UNITS.get(part, '')}" for part in _KINDS[name]._fields]
+def _parts(name: str) -> dict[str, pa.DataType]:
+    """Columns of the arrays of a field, and the types of their items."""
+    found = {part: _PARTS.get(part, ("", _I64)) for part in _KINDS[name]._fields}
+    return {f"{name}_{part}{unit}": kind for part, (unit, kind) in found.items()}
 
 
-def _columns() -> dict[str, pa.DataType]:
-    """Type of the items of every list column."""
-    out: dict[str, pa.DataType] = {}
-    for name, kind in _KINDS.items():
-        types = [_PARTS.get(part, _I64) for part in kind._fields]
-        out |= zip(_parts(name), types, strict=True)
-    out |= {f"{name}{_UNITS.get(name, '')}": kind for name, (_, kind, _) in _ARRAYS.items()}
-    out |= dict.fromkeys([f"{name}_ids" for name in LAYERS], _TEXT)
-    out |= {"left_boundary_ids": _TEXT, "right_boundary_ids": _TEXT}
-    return out | {"flaws": _TEXT, "flaw_counts": _I64}
+def _array(name: str) -> str:
+    """Column of an array with a value per object."""
+    return f"{name}_mps" if name == "speed_limits" else name
 
 
-SCHEMA = pa.schema(
-    [
-        pa.field("name", _TEXT, nullable=False),
-        *(pa.field(name, _I64, nullable=False) for name in _NUMBERS),
-        *(pa.field(name, list_of(kind), nullable=False) for name, kind in _columns().items()),
-    ]
+_COLUMNS = {  # type of the items of every list column
+    **{column: kind for name in _KINDS for column, kind in _parts(name).items()},
+    **{_array(name): kind for name, (_, kind, _) in _ARRAYS.items()},
+    **{f"{name}_ids": _TEXT for name in (*LAYERS, "left_boundary", "right_boundary")},
+    "flaws": _TEXT,
+    "flaw_counts": _I64,
+}
+SCHEMA = make_schema(
+    name=_TEXT,
+    **dict.fromkeys(_NUMBERS, _I64),
+    **{name: list_of(kind) for name, kind in _COLUMNS.items()},
 )
 
 
@@ -96,7 +92,7 @@ def write_map(path: Path, road: VectorMap) -> None:
     """
     require_sound(road, str(path))
     values: dict[str, Any] = {name: getattr(road, name) for name in ("name", *_NUMBERS)}
-    values |= {f"{name}{_UNITS.get(name, '')}": getattr(road, name) for name in _ARRAYS}
+    values |= {_array(name): getattr(road, name) for name in _ARRAYS}
     for name in _KINDS:
         value = getattr(road, name)
         if isinstance(value, Layer):
@@ -176,7 +172,7 @@ def _assemble(values: dict[str, Any]) -> VectorMap:
         parts[name] = kind(*(values[column] for column in _parts(name)))
         if name in LAYERS:
             parts[name] = Layer(values[f"{name}_ids"], parts[name])
-    parts |= {name: values[f"{name}{_UNITS.get(name, '')}"] for name in _ARRAYS}
+    parts |= {name: values[_array(name)] for name in _ARRAYS}
     pairs = zip(values["left_boundary_ids"], values["right_boundary_ids"], strict=True)
     flaws = dict(zip(values["flaws"], values["flaw_counts"].tolist(), strict=True))
     return VectorMap(boundary_ids=tuple(pairs), flaws=flaws, **parts)

@@ -9,13 +9,13 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from shiftsim.data.store.tables import REVIEW
-from shiftsim.errors import DataError
-from shiftsim.files import atomic_write, read_json_lines, safe_join
+from shiftsim.errors import ConfigError, DataError, one_of
+from shiftsim.files import atomic_write, make_table, read_json_lines, safe_join
 from shiftsim.world.map import VectorMap
 
 ACCEPT, REJECT, UNDECIDED = "accept", "reject", ""
@@ -113,23 +113,14 @@ def parse_review(values: Any, where: str) -> Review:
     Raises:
         DataError: They are none.
     """
-    names = [item.name for item in fields(Review)]
-    if not isinstance(values, dict) or set(values) - set(names) or "token" not in values:
-        raise DataError(f"{where}: not a review", hint=f"its fields are {', '.join(names)}")
-    route = values.get("route")
-    texts = [value for name, value in values.items() if name != "route"]
-    good_route = route is None or (
-        isinstance(route, list) and bool(route) and all(isinstance(item, str) for item in route)
-    )
-    if not all(isinstance(text, str) for text in texts) or not good_route:
-        raise DataError(
-            f"{where}: a field has a wrong type",
-            hint="route is a list of roadblock ids or null, everything else a text",
-        )
-    if values.get("decision", "") not in _DECISIONS:
-        what = f"{where}: decision {values['decision']!r}"
-        raise DataError(what, hint="accept, reject, or nothing")
-    return Review(**{**values, "route": None if route is None else tuple(route)})
+    try:
+        review = make_table(Review, values, where)
+        one_of(f"{where}: decision", review.decision, _DECISIONS)
+    except ConfigError as error:
+        raise DataError(error.message, error.hint or "correct or remove that line") from error
+    if review.route == ():
+        raise DataError(f"{where}: the route is empty", "leave it out, or list its roadblocks")
+    return review
 
 
 def write_reviews(store: Path, reviews: Reviews) -> Path:

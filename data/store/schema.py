@@ -24,7 +24,8 @@ FRAME_BLOCK = 2048  # rows per row group of frames and ego states
 _F64, _I64, _I32, _I8 = pa.float64(), pa.int64(), pa.int32(), pa.int8()
 
 
-def _schema(**columns: pa.DataType) -> pa.Schema:
+def make_schema(**columns: pa.DataType) -> pa.Schema:
+    """A schema without missing values."""
     return pa.schema([pa.field(name, kind, nullable=False) for name, kind in columns.items()])
 
 
@@ -33,7 +34,7 @@ def list_of(kind: pa.DataType) -> pa.DataType:
     return pa.list_(pa.field("item", kind, nullable=False))
 
 
-SCENARIOS = _schema(
+SCENARIOS = make_schema(
     token=pa.string(),  # id, unique in the store
     type=pa.string(),  # scenario type
     city=pa.string(),  # map name
@@ -55,9 +56,9 @@ SCENARIOS = _schema(
 # columns that a `Window` has under the same names
 SAME = ("token", "ego", "first_row", "last_row", "row_step", "is_short")
 
-FRAMES = _schema(row=_I32, time_us=_I64)  # times never decrease; increase over iterations
+FRAMES = make_schema(row=_I32, time_us=_I64)  # times never decrease; increase over iterations
 
-LIGHTS = _schema(
+LIGHTS = make_schema(
     row=_I32,  # row of the recording
     light=_I32,  # number of the light: one connector may have several
     connector=pa.string(),  # id of the lane connector
@@ -66,7 +67,7 @@ LIGHTS = _schema(
 
 MOTION = ("x_m", "y_m", "heading_rad", "vx_mps", "vy_mps")  # of a box's centre, in the map frame
 BOX = (*MOTION, "length_m", "width_m")
-TRACKS = _schema(
+TRACKS = make_schema(
     row=_I32,  # row of the recording
     track=_I32,  # number of the track: those of one row are in the order of the source
     token=pa.string(),  # id of the track
@@ -88,4 +89,4 @@ EGO_COLUMNS = (
     "yaw_rate_radps",
     "yaw_accel_radps2",
 )
-EGO = _schema(row=_I32, **dict.fromkeys(EGO_COLUMNS, _F64))
+EGO = make_schema(row=_I32, **dict.fromkeys(EGO_COLUMNS, _F64))

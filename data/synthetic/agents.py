@@ -7,9 +7,9 @@ from math import cos, hypot, sin
 
 import numpy as np
 
+from shiftsim.data.synthetic.roads import STEP
 from shiftsim.kernels import FloatArray
 
-STEP = 0.5  # m between the points of a line
 WALKING = 1.35  # m/s
 _SMOOTHING = 2.5  # m, how far a driver rounds off the corners of the lane centres
 _LATERAL_ACCEL = 1.8  # m/s^2, comfortable in curves

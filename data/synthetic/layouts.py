@@ -268,9 +268,9 @@ def _rounding(rng: np.random.Generator) -> float:
 def _random_lights(town: Town, junction: int, rng: np.random.Generator) -> Lights:
     """Lights of a junction, at which streets that face each other are green together."""
     roads: dict[str, set[int]] = {}
-    for (at, street, _, _), (number, _) in town.connectors.items():
-        if at == junction:
-            roads.setdefault(street, set()).add(number)
+    for turn, road in town.connectors.items():
+        if turn.junction == junction:
+            roads.setdefault(turn.street, set()).add(road.id)
     entering = [Leg(town.streets[x], town.streets[x].junctions[0] != junction) for x in roads]
     phases = _phases({x.street.name: float(x.pose(1, at_end=True)[2]) for x in entering})
     crossings = {

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import shapely
 
-from shiftsim.data.synthetic.agents import SIZES, STEP, Driver, Path, Pedestrian, arc_at, shifted
+from shiftsim.data.synthetic.agents import SIZES, Driver, Path, Pedestrian, arc_at, shifted
+from shiftsim.data.synthetic.roads import STEP
 from shiftsim.data.synthetic.routes import RandomRoutes
 from shiftsim.data.synthetic.town import Town
 from shiftsim.data.synthetic.traffic import Box, Traffic
@@ -145,8 +146,7 @@ def _queue(
 
 def _is_red(town: Town, entry: str) -> bool:
     """Whether a street has a light that is red at time 0."""
-    connectors = town.connectors.items()
-    numbers = {number for (_, name, _, _), (number, _) in connectors if name == entry}
+    numbers = {road.id for turn, road in town.connectors.items() if turn.street == entry}
     return any(
         numbers & group and lights.status(phase, 0.0) == LightStatus.RED
         for lights in town.lights
@@ -268,15 +268,11 @@ def touching(boxes: list[Box], parked: FloatArray, drivers: list[Driver]) -> set
 
 def _pairs(now: FloatArray, moving: int) -> list[tuple[int, int]]:
     """Pairs of rows i < j that touch, of which the first is one of those that may move."""
-    gap = np.hypot(*np.moveaxis(now[:moving, None, 2:4] - now[None, :, 2:4], -1, 0))
-    reach = 0.5 * np.hypot(now[:, 5], now[:, 6])
-    i, j = np.nonzero(gap < reach[:moving, None] + reach + 2.0 * _MARGIN)
-    counts = (j > i) & ((now[i, 5] >= _ON_FOOT) | (now[j, 5] >= _ON_FOOT))
-    i, j = i[counts], j[counts]
     sizes = now[:, 5:7] + np.where(now[:, 1:2] == _PARKED, 0.0, _MARGIN)
     shapes = shapely.polygons(boxes_to_corners(now[:, 2:5], sizes))
-    meet = shapely.intersects(shapes[i], shapes[j])
-    return list(zip(i[meet].tolist(), j[meet].tolist(), strict=True))
+    i, j = shapely.STRtree(shapes).query(shapes[:moving], predicate="intersects")
+    counts = (j > i) & ((now[i, 5] >= _ON_FOOT) | (now[j, 5] >= _ON_FOOT))
+    return sorted(zip(i[counts].tolist(), j[counts].tolist(), strict=True))
 
 
 def _blamed(one: int, two: int, drivers: list[Driver]) -> int:

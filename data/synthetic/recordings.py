@@ -225,9 +225,8 @@ def _lit_connectors(
 ) -> Iterator[tuple[int, Lights, int]]:
     """Connectors of the map that have a light, whose lights, and their phase."""
     ends = {
-        number: np.concatenate([line[0], line[-1]])
-        for number, spec in town.connecting.items()
-        for line in [spec.center_of(-1, np.array([0.0, spec.length]))[:, :2] + offset]
+        spec.id: (spec.center_of(-1, np.array([0.0, spec.length]))[:, :2] + offset).ravel()
+        for spec in town.connectors.values()
     }
     numbers, places = list(ends), np.array(list(ends.values()))
     for edge in range(road.num_lanes, len(road.edges)):

@@ -6,11 +6,13 @@ is sampled from the same pieces that go into the file.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from shiftsim.kernels import FloatArray
 
+STEP = 0.5  # m between the points of a line
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 
@@ -68,23 +70,39 @@ class RoadSpec:
         """Length of the reference line [m]."""
         return sum(piece.length for piece in self.pieces)
 
+    @cached_property
+    def records(self) -> list[tuple[float, tuple[float, ...], Piece]]:
+        """Where each piece begins along the road [m], the pose there, and the piece."""
+        begin, out = 0.0, list[tuple[float, tuple[float, ...], Piece]]()
+        pose: tuple[float, ...] = self.start
+        for piece in self.pieces:
+            out.append((begin, pose, piece))
+            begin, pose = begin + piece.length, _end(piece, pose)
+        return out
+
+    @cached_property
+    def line(self) -> FloatArray:
+        """(n, 2) centre of the only lane of a connecting road, `STEP` apart."""
+        return self.center_of(-1, np.arange(0.0, self.length, STEP))[:, :2]
+
     @property
     def incoming(self) -> tuple[int, int | None]:
         """Road before a connecting road, and its lane."""
         assert self.predecessor is not None
         return self.predecessor[1], self.lanes[0].predecessor
 
+    @property
+    def lane_behind(self) -> int:
+        """Lane behind a connecting road, from 1 on, counted from the middle of the street."""
+        return abs(self.lanes[0].successor or 0)
+
     def at(self, s: FloatArray, t: FloatArray | float = 0.0) -> FloatArray:
         """(n, 3) x [m], y [m], heading [rad] at road coordinates (s, t)."""
         out = np.empty((len(s), 3))
-        begin, pose = 0.0, self.start
-        last = len(self.pieces) - 1
-        for number, piece in enumerate(self.pieces):
-            end = begin + piece.length
-            inside = (s >= begin) & ((s < end) | (number == last))
+        for begin, pose, piece in self.records:
+            is_last = begin == self.records[-1][0]
+            inside = (s >= begin) & ((s < begin + piece.length) | is_last)
             out[inside] = _along(piece, pose, np.minimum(s[inside] - begin, piece.length))
-            pose = tuple(_along(piece, pose, np.array([piece.length]))[0].tolist())
-            begin = end
         out[:, 0] -= t * np.sin(out[:, 2])
         out[:, 1] += t * np.cos(out[:, 2])
         return out
@@ -129,9 +147,9 @@ def _turn(turn: float, tangent: float, ease: bool) -> list[Piece]:
         curvature = float(np.sign(turn) / radius)
         return [Piece(float(radius * abs(turn)), curvature, curvature)]
     unit = [Piece(1.0, 0.0, turn / 2), Piece(1.0, turn / 2, turn / 2), Piece(1.0, turn / 2, 0.0)]
-    pose = (0.0, 0.0, 0.0)
+    pose: tuple[float, ...] = (0.0, 0.0, 0.0)
     for piece in unit:
-        pose = tuple(_along(piece, pose, np.array([piece.length]))[0].tolist())
+        pose = _end(piece, pose)
     scale = float(tangent * 2 * np.cos(turn / 2) / np.hypot(pose[0], pose[1]))
     return [Piece(p.length * scale, p.start / scale, p.end / scale) for p in unit]
 
@@ -154,6 +172,11 @@ def _cubic_arc(c: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
         c[1] + 2 * c[2] * at + 3 * c[3] * at**2, c[5] + 2 * c[6] * at + 3 * c[7] * at**2
     )
     return p, np.r_[0.0, np.cumsum(rate @ _WEIGHTS * 0.5 * p[1])]
+
+
+def _end(piece: Piece, pose: Sequence[float]) -> tuple[float, ...]:
+    """The pose at the end of a piece that starts at `pose`."""
+    return tuple(_along(piece, pose, np.array([piece.length]))[0].tolist())
 
 
 def _along(piece: Piece, pose: Sequence[float], d: FloatArray) -> FloatArray:
@@ -205,12 +228,9 @@ def _xml(tag: str, attributes: Mapping[str, object], *children: str) -> str:
 
 def _road_xml(road: RoadSpec) -> str:
     geometry = []
-    begin, pose = 0.0, road.start
-    for piece in road.pieces:
-        place = dict(zip(("s", "x", "y", "hdg"), (begin, *pose), strict=True))
-        geometry.append(_xml("geometry", {**place, "length": piece.length}, _shape_xml(piece)))
-        pose = tuple(_along(piece, pose, np.array([piece.length]))[0].tolist())
-        begin += piece.length
+    for begin, (x, y, heading), piece in road.records:
+        place = {"s": begin, "x": x, "y": y, "hdg": heading, "length": piece.length}
+        geometry.append(_xml("geometry", place, _shape_xml(piece)))
     ends = []
     for name, end in (("predecessor", road.predecessor), ("successor", road.successor)):
         if end:

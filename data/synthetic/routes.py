@@ -1,20 +1,14 @@
 """Random routes through a town, from the streets that lead into it, and the paths along them."""
 
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from shiftsim.data.synthetic.agents import (
-    STEP,
-    Path,
-    Zone,
-    arc_at,
-    brake_in_time,
-    path_along,
-    shifted,
-)
-from shiftsim.data.synthetic.town import Leg, Street, Town
+from shiftsim.data.synthetic.agents import Path, Zone, arc_at, brake_in_time, path_along, shifted
+from shiftsim.data.synthetic.roads import STEP, RoadSpec
+from shiftsim.data.synthetic.town import Leg, Street, Town, Turn
 from shiftsim.kernels import FloatArray
 
 _CHANGING = 70.0  # m, shortest street to change lanes on
@@ -28,11 +22,10 @@ _NARROW_SPEED, _NARROW_RAMP = 5.5, 12.0  # m/s, m
 
 
 class Route(NamedTuple):
-    """The streets that somebody follows, and where they change lanes."""
+    """What somebody follows: turns from street to street, and lanes."""
 
     lane: int  # on the first street, from 1 on, counted from the middle
-    streets: tuple[str, ...]  # names
-    lane_changes: tuple[int, ...]  # lane that is changed to on each street, 0 for none
+    turns: tuple[Turn, ...]  # each on the lane on which the street is left
     bay: int | None = None  # parking space of the last street in which it ends
     is_bicycle: bool = False  # whether it keeps to the right
 
@@ -51,56 +44,49 @@ class RandomRoutes:
     def path(self, entry: str, category: str) -> Path | None:
         """The path of a random route from an entry; None where none was found."""
         for _ in range(_TRIES):
-            route = self._draw(entry, category)
+            route = self._draw(entry, is_bicycle=category == "bicycle")
             if route is not None:
                 if route not in self._paths:
                     self._paths[route] = make_path(self.town, route)
                 return self._paths[route]
         return None
 
-    def _draw(self, entry: str, category: str) -> Route | None:
+    def _draw(self, entry: str, *, is_bicycle: bool) -> Route | None:
         """A random route; None where it ends at a dead end."""
         rng, town = self.rng, self.town
         street = town.streets[entry]
         lane = first_lane = int(rng.integers(1, street.lanes + 1))
-        names, lane_changes = [entry], []
+        turns: list[Turn] = []
         junction = street.junctions[0]
-        is_bicycle = category == "bicycle"
         while junction:
-            ahead = self._ahead(junction, street, set(names))
-            is_long = street.length >= _CHANGING
+            ahead: dict[str, list[Turn]] = {}  # turns from the lanes of the street, by the next one
+            seen, is_long = {entry, *(x.target for x in turns)}, street.length >= _CHANGING
+            for turn in town.connectors:
+                if turn[:2] == (junction, street.name) and turn.target not in seen:
+                    ahead.setdefault(turn.target, []).append(turn)
             if not is_long or is_bicycle:
-                ahead = {name: lanes for name, lanes in ahead.items() if lane in lanes}
+                ahead = {k: found for k, found in ahead.items() if lane in {x.lane for x in found}}
             if not ahead:
                 return None
             weights = np.array([self.likes[name] for name in ahead])
             target = str(rng.choice(list(ahead), p=weights / weights.sum()))
-            lanes = sorted(ahead[target], key=lambda x: (abs(x - lane), x))
-            changes = lanes[0] != lane or (len(lanes) > 1 and is_long and rng.random() < _CHANGES)
-            if changes:
-                near = [x for x in lanes if abs(x - lane) == 1]
+            found = sorted(ahead[target], key=lambda x: (abs(x.lane - lane), x.lane))
+            turn = found[0]
+            if turn.lane != lane or (len(found) > 1 and is_long and rng.random() < _CHANGES):
+                near = [x for x in found if abs(x.lane - lane) == 1]
                 if not near:
                     return None
-                lane = near[0]
-            lane_changes.append(lane if changes else 0)
-            _, lane = town.connectors[junction, street.name, lane, target]
+                turn = near[0]
+            turns.append(turn)
+            lane = town.connectors[turn].lane_behind
             street = town.streets[target]
-            names.append(target)
             is_forward = junction == street.junctions[0]
             if target in town.bays and street.junctions[1] and rng.random() < _PARKS:
                 bay = self._bay(street, is_forward=is_forward)
                 if bay is not None:
-                    return Route(first_lane, tuple(names), (*lane_changes, 0), bay)
+                    return Route(first_lane, tuple(turns), bay)
             junction = street.junctions[is_forward]
-        return Route(first_lane, tuple(names), (*lane_changes, 0), is_bicycle=is_bicycle)
-
-    def _ahead(self, junction: int, street: Street, seen: set[str]) -> dict[str, list[int]]:
-        """Lanes of a street that lead through a junction, by the next street."""
-        ahead: dict[str, list[int]] = {}
-        for at, name, lane, target in self.town.connectors:
-            if at == junction and name == street.name and target not in seen:
-                ahead.setdefault(target, []).append(lane)
-        return ahead
+        return Route(first_lane, tuple(turns), is_bicycle=is_bicycle)
 
     def _bay(self, street: Street, *, is_forward: bool) -> int | None:
         """A free parking space of a car park, on the right of the way where there is one."""
@@ -110,89 +96,84 @@ class RandomRoutes:
         return int(self.rng.choice(right or free)) if free else None
 
 
+# a street of a route, the lanes at its begin and its end, the road behind it, and the next street
+_Stage: TypeAlias = tuple[Leg, int, int, RoadSpec | None, Leg | None]
+
+
+def _stages(town: Town, route: Route) -> Iterator[_Stage]:
+    lane = route.lane
+    for turn in route.turns:
+        street, onward = town.streets[turn.street], town.streets[turn.target]
+        leg = Leg(street, turn.junction == street.junctions[1])
+        target = Leg(onward, turn.junction == onward.junctions[0])
+        connector = town.connectors[turn]
+        yield leg, lane, turn.lane, connector, target
+        lane = connector.lane_behind
+    yield target, lane, lane, None, None
+
+
 def make_path(town: Town, route: Route) -> Path:
     """The path of a route, with its zones and crossings."""
-    parts, limits, zones, crossings = [], [], [], []
-    lane = route.lane
-    first, second = (town.streets[name] for name in route.streets[:2])
-    leg = Leg(first, first.junctions[1] in (set(second.junctions) - {0}))
-    for number, name in enumerate(route.streets):
-        street = town.streets[name]
-        line, origin = leg.centers(lane), f"{name}{lane}"
-        if route.lane_changes[number]:
-            line = _change_lanes(line, leg.centers(route.lane_changes[number]))
-            lane = route.lane_changes[number]
-        is_last = number == len(route.streets) - 1
-        if is_last and route.bay is not None:
-            line = _into_bay(line, town.bays[name][route.bay])
-        parts.append(line)
-        limits.append(street.limit)
-        crossings += [
-            (street.crossing_name(n), *leg.centers(lane, ends))
-            for n, ends in enumerate(street.crossings)
-        ]
-        if street.narrow:
-            begin, end = leg.centers(lane, street.narrow)
-            zones.append((_narrow_zone(leg), begin, end, 2.0, street.swings[not leg.is_forward]))
-        if is_last:
-            break
-        onward = town.streets[route.streets[number + 1]]
-        connector, to_lane = town.connectors[leg.enters, name, lane, onward.name]
-        target, inner = Leg(onward, leg.enters == onward.junctions[0]), town.connecting[connector]
-        turn = leg.turn_to(target)
-        rank = (0 if street.is_main else 2) + (turn > 0.5 and not street.is_one_way)
-        points = inner.center_of(-1, np.arange(0.0, inner.length, STEP))[:, :2]
-        parts.append(points)
-        limits.append(min(street.limit, onward.limit))
-        zone = Zone(connector, rank, origin)
-        swing = _WIDE if turn < -0.5 and not street.is_one_way else 0.0
-        zones.append((zone, points[0], points[-1], street.stop, swing))
-        leg, lane = target, to_lane
+    stages = list(_stages(town, route))
+    parts, limits = [], []
+    for leg, lane, last_lane, connector, _ in stages:
+        line = leg.centers(lane)
+        if last_lane != lane:
+            line = _change_lanes(line, leg.centers(last_lane))
+        if connector is None and route.bay is not None:
+            line = _into_bay(line, town.bays[leg.street.name][route.bay])
+        parts += [line, connector.line] if connector else [line]
+        limits += [leg.street.limit, connector.limit_kmh] if connector else [leg.street.limit]
     path = path_along(parts, limits)
-    path = _with_places(path, zones, crossings, is_parking=route.bay is not None)
+    crossings = []
+    for leg, _, lane, *_ in stages:
+        for number, ends in enumerate(leg.street.crossings):
+            first, last = sorted(arc_at(path.points, x) for x in leg.centers(lane, ends))
+            crossings.append((leg.street.crossing_name(number), first, last))
+    path = replace(path, crossings=tuple(crossings), is_parking=route.bay is not None)
+    path = _with_zones(path, [x for stage in stages for x in _zones(path, stage)])
     if route.is_bicycle:
         speed = np.minimum(path.speed, _CYCLING)
         path = replace(shifted(path, _CYCLING_ASIDE), speed=speed)
     return path
 
 
-def _with_places(
-    path: Path,
-    zones: list[tuple[Zone, FloatArray, FloatArray, float, float]],
-    crossings: list[tuple[str, FloatArray, FloatArray]],
-    *,
-    is_parking: bool,
-) -> Path:
-    """A path with its zones and crossings, narrow places driven past with care."""
+def _zones(path: Path, stage: _Stage) -> Iterator[tuple[Zone, float]]:
+    """Zones on a street and behind it, and how far to the left vehicles swing there [m]."""
+    leg, lane, last_lane, connector, target = stage
+    street = leg.street
+
+    def place(number: int, rank: int, origin: str, ends: FloatArray, stop: float) -> Zone:
+        entry, leave = arc_at(path.points, ends[0]), arc_at(path.points, ends[-1])
+        between = [x for x in path.crossings if entry - stop - 0.5 < x[1] and x[2] < entry]
+        crosswalk = between[-1][0] if between else ""
+        return Zone(number, rank, origin, entry, leave, entry - stop, crosswalk)
+
+    if street.narrow:
+        ahead, back = street.swings
+        goes_first = leg.is_forward if ahead == back else (ahead < back) == leg.is_forward
+        number, origin = -2 * street.id - leg.is_forward, f"{street.name}{'<>'[leg.is_forward]}"
+        ends = leg.centers(last_lane, street.narrow)
+        yield place(number, 1 - goes_first, origin, ends, 2.0), (back, ahead)[leg.is_forward]
+    if connector and target:
+        turn = leg.turn_to(target)
+        rank = (0 if street.is_main else 2) + (turn > 0.5 and not street.is_one_way)
+        zone = place(connector.id, rank, f"{street.name}{lane}", connector.line, street.stop)
+        yield zone, _WIDE if turn < -0.5 and not street.is_one_way else 0.0
+
+
+def _with_zones(path: Path, zones: list[tuple[Zone, float]]) -> Path:
+    """A path with zones in which vehicles swing out; narrow places are driven past with care."""
     arc = STEP * np.arange(len(path.points))
     aside, speed = np.zeros(len(arc)), path.speed
-    places, placed_zones = [], []
-    for name, *ends in crossings:
-        first, last = sorted(arc_at(path.points, end) for end in ends)
-        places.append((name, first, last))
-    for zone, begin, end, stop, swing in zones:
-        entry, leave = arc_at(path.points, begin), arc_at(path.points, end)
-        between = [x for x in places if entry - stop - 0.5 < x[1] and x[2] < entry]
-        crosswalk = between[-1][0] if between else ""
-        zone = replace(zone, entry=entry, exit=leave, stop=entry - stop, crosswalk=crosswalk)
-        placed_zones.append(zone)
-        if swing or zone.id < 0:
-            outside = np.maximum(np.maximum(entry - arc, arc - leave), 0.0) / _NARROW_RAMP
-            share = np.clip(1.0 - outside, 0.0, 1.0)
-            aside += swing * share * share * (3.0 - 2.0 * share)
+    for zone, swing in zones:
+        outside = np.maximum(np.maximum(zone.entry - arc, arc - zone.exit), 0.0) / _NARROW_RAMP
+        share = np.clip(1.0 - outside, 0.0, 1.0)
+        aside += swing * share * share * (3.0 - 2.0 * share)
         if zone.id < 0:
             speed = np.where(share > 0.5, np.minimum(speed, _NARROW_SPEED), speed)
     path = shifted(replace(path, speed=brake_in_time(speed)), aside)
-    order = tuple(sorted(placed_zones, key=lambda zone: zone.entry))
-    return replace(path, zones=order, crossings=tuple(places), is_parking=is_parking)
-
-
-def _narrow_zone(leg: Leg) -> Zone:
-    number = -2 * leg.street.id - leg.is_forward
-    name = f"{leg.street.name}{'>' if leg.is_forward else '<'}"
-    ahead, back = leg.street.swings
-    goes_first = leg.is_forward if ahead == back else (ahead < back) == leg.is_forward
-    return Zone(number, 1 - goes_first, name)
+    return replace(path, zones=tuple(sorted((x for x, _ in zones), key=lambda zone: zone.entry)))
 
 
 def _change_lanes(first: FloatArray, second: FloatArray) -> FloatArray:

@@ -4,11 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import permutations, product
+from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.data.synthetic.agents import STEP, Walk, arc_at, resample
+from shiftsim.data.synthetic.agents import Walk, arc_at, resample
 from shiftsim.data.synthetic.roads import (
+    STEP,
     CrosswalkSpec,
     LaneSpec,
     Piece,
@@ -140,11 +142,6 @@ class Leg:
     is_forward: bool
 
     @property
-    def leaves(self) -> int:
-        """Junction it comes from."""
-        return self.street.junctions[not self.is_forward]
-
-    @property
     def enters(self) -> int:
         """Junction it leads to."""
         return self.street.junctions[self.is_forward]
@@ -175,15 +172,22 @@ class Leg:
         return float((turn + np.pi) % (2 * np.pi) - np.pi)
 
 
+class Turn(NamedTuple):
+    """A way through a junction."""
+
+    junction: int
+    street: str  # that it comes from
+    lane: int  # on which it leaves that street
+    target: str  # the street that it leads to
+
+
 @dataclass
 class Town:
     """A generated town."""
 
     name: str  # of the town
     streets: dict[str, Street] = field(default_factory=dict)  # by name
-    connecting: dict[int, RoadSpec] = field(default_factory=dict)  # roads of junctions, by id
-    # connecting road and lane behind it by junction, street, lane, next street
-    connectors: dict[tuple[int, str, int, str], tuple[int, int]] = field(default_factory=dict)
+    connectors: dict[Turn, RoadSpec] = field(default_factory=dict)  # roads of junctions
     # connecting roads and narrow places that cannot be used at once
     conflicts: set[tuple[int, int]] = field(default_factory=set)
     walks: list[Walk] = field(default_factory=list)
@@ -193,7 +197,7 @@ class Town:
     def xml(self) -> str:
         """The OpenDRIVE file of its roads."""
         streets = [street.road for street in self.streets.values()]
-        return town_xml(self.name, [*streets, *self.connecting.values()])
+        return town_xml(self.name, [*streets, *self.connectors.values()])
 
     def parked(self) -> FloatArray:
         """(n, 3) poses of parked cars."""
@@ -215,16 +219,12 @@ def build_town(name: str, streets: Sequence[Street]) -> Town:
     legs = [Leg(street, True) for street in streets]
     legs += [Leg(street, False) for street in streets if not street.is_one_way]
     for source, target in product(legs, legs):
-        meet = source.enters and source.enters == target.leaves
+        meet = source.enters and source.enters == target.street.junctions[not target.is_forward]
         if meet and source.street is not target.street:
             _connect(town, source, target)
-    lines = {
-        number: road.center_of(-1, np.arange(0.0, road.length, STEP))[:, :2]
-        for number, road in town.connecting.items()
-    }
-    for a, b in permutations(town.connecting.values(), 2):
+    for a, b in permutations(town.connectors.values(), 2):
         if a.junction == b.junction and a.incoming != b.incoming:
-            gaps = np.hypot(*np.moveaxis(lines[a.id][:, None] - lines[b.id], -1, 0))
+            gaps = np.hypot(*np.moveaxis(a.line[:, None] - b.line, -1, 0))
             if gaps.min() < _CLOSE:
                 town.conflicts.add((a.id, b.id))
     for street in streets:
@@ -250,7 +250,7 @@ def _connect(town: Town, source: Leg, target: Leg) -> None:
         start = source.pose(from_lane, at_end=True).tolist()
         end = target.pose(to_lane, at_end=False).tolist()
         lanes = source.lane_id(from_lane), target.lane_id(to_lane)
-        town.connecting[number] = RoadSpec(
+        town.connectors[Turn(source.enters, a.name, from_lane, b.name)] = RoadSpec(
             number,
             (start[0], start[1], start[2]),
             connect(start, end, ease=turn > 0.0 and not a.is_one_way),
@@ -260,7 +260,6 @@ def _connect(town: Town, source: Leg, target: Leg) -> None:
             predecessor=("road", a.id, "end" if source.is_forward else "start"),
             successor=("road", b.id, "start" if target.is_forward else "end"),
         )
-        town.connectors[source.enters, a.name, from_lane, b.name] = (number, to_lane)
 
 
 def _add_walks(town: Town, street: Street) -> None:

@@ -11,7 +11,8 @@ from math import cos, hypot, inf, pi, sin, sqrt
 
 import numpy as np
 
-from shiftsim.data.synthetic.agents import STEP, WALKING, Driver, Pedestrian, Zone, arc_at
+from shiftsim.data.synthetic.agents import WALKING, Driver, Pedestrian, Zone, arc_at
+from shiftsim.data.synthetic.roads import STEP
 from shiftsim.data.synthetic.town import Town
 from shiftsim.kernels import FloatArray
 

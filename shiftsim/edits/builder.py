@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.edits.places import EgoPath, ego_path
+from shiftsim.edits.places import EgoPath, ego_path, poses_along
 from shiftsim.edits.spec import Edit, edited_id
 from shiftsim.errors import ConfigError, listed
 from shiftsim.geometry.boxes import boxes_to_corners
@@ -239,11 +239,3 @@ class ScenarioBuilder:
             velocities=speed * np.stack([np.cos(headings), np.sin(headings)], -1)[:, None],
             behaviors=behavior,
         )
-
-
-def poses_along(xy: FloatArray, arc: FloatArray, along: FloatArray) -> FloatArray:
-    """(N, 3) poses at arc lengths (N,) of a line with vertices (K, 2) and arc lengths (K,) [m]."""
-    steps = np.diff(xy, axis=0)
-    segment = np.clip(np.searchsorted(arc, along, side="right") - 1, 0, len(steps) - 1)
-    x, y = (np.interp(along, arc, xy[:, column]) for column in (0, 1))
-    return np.column_stack([x, y, np.arctan2(steps[segment, 1], steps[segment, 0])])

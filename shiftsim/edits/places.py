@@ -98,19 +98,13 @@ def _lanes_ahead(scenario: Scenario, path: FloatArray) -> FloatArray:
 
 def nearest_edge(road: VectorMap, x: float, y: float, heading: float) -> int | None:
     """The lane, else the connector, that holds a point and whose heading is nearest; or None."""
-    edges = road.lanes_at(x, y) or road.connectors_at(x, y)
-    turns = (abs(wrap_angle(edge_heading(road, edge, x, y) - heading)) for edge in edges)
-    return min(zip(turns, edges, strict=True), default=(0.0, None))[1]
-
-
-def edge_heading(road: VectorMap, edge: int, x: float, y: float) -> float:
-    """Heading of a baseline at the projection of a point [rad]."""
-    line = road.baselines.at(edge)
-    arc = road.baselines.arc[road.baselines.ptr[edge] : road.baselines.ptr[edge + 1]]
-    index = int(np.searchsorted(arc, road.progress_on(edge, x, y), side="right"))
-    index = min(max(index, 1), len(line) - 1)
-    step = line[index] - line[index - 1]
-    return float(np.arctan2(step[1], step[0]))
+    turns: list[tuple[float, int]] = []
+    for edge in road.lanes_at(x, y) or road.connectors_at(x, y):
+        arc = road.baselines.arc[road.baselines.ptr[edge] : road.baselines.ptr[edge + 1]]
+        along = np.array([road.progress_on(edge, x, y)])
+        there = float(poses_along(road.baselines.at(edge), arc, along)[0, 2])
+        turns.append((abs(wrap_angle(there - heading)), edge))
+    return min(turns, default=(0.0, None))[1]
 
 
 def require_on_map(road: VectorMap, pose: FloatArray, what: str) -> None:
@@ -125,3 +119,11 @@ def require_on_map(road: VectorMap, pose: FloatArray, what: str) -> None:
             f"{what} at ({pose[0]:.1f}, {pose[1]:.1f}) is {distance:.0f} m from any lane",
             hint="check the frame of the place: metres of the map, or at = {ahead_m, left_m}",
         )
+
+
+def poses_along(xy: FloatArray, arc: FloatArray, along: FloatArray) -> FloatArray:
+    """(N, 3) poses at arc lengths (N,) of a line with vertices (K, 2) and arc lengths (K,) [m]."""
+    steps = np.diff(xy, axis=0)
+    segment = np.clip(np.searchsorted(arc, along, side="right") - 1, 0, len(steps) - 1)
+    x, y = (np.interp(along, arc, xy[:, column]) for column in (0, 1))
+    return np.column_stack([x, y, np.arctan2(steps[segment, 1], steps[segment, 0])])

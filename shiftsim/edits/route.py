@@ -8,7 +8,8 @@ import numpy as np
 import shapely
 from shapely.ops import split
 
-from shiftsim.edits.builder import ScenarioBuilder, poses_along
+from shiftsim.edits.builder import ScenarioBuilder
+from shiftsim.edits.places import poses_along
 from shiftsim.edits.spec import Reroute
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import wrap_angle

@@ -7,13 +7,13 @@ calls and the checks cannot differ. `docs/edits.md` explains every key.
 import hashlib
 import json
 import math
-import types
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass
 from functools import cached_property
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any
 
-from shiftsim.errors import ConfigError, nearest, one_of
+from shiftsim.errors import ConfigError, one_of
+from shiftsim.files import make_table
 from shiftsim.world.state import AgentKind, LightStatus
 
 KINDS = tuple(kind.name.lower() for kind in AgentKind)
@@ -255,7 +255,7 @@ def make_edit(table: Mapping[str, Any], where: str) -> Edit:
     Raises:
         ConfigError: A key is unknown or missing, or a value is wrong.
     """
-    edit: Edit = _make(Edit, _renamed(table), where)
+    edit = make_table(Edit, _renamed(table), where, _check)
     where = f"{where} {edit.name!r}"
     good = edit.name and len(edit.name) <= _MAX_NAME and edit.name.replace("_", "").isalnum()
     if not good or not edit.name.isascii():
@@ -329,60 +329,14 @@ def _walk(table: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-def _make(cls: Any, table: Any, where: str) -> Any:
-    if not isinstance(table, Mapping):
-        raise ConfigError(f"{where}: {table!r} is not a table")
-    known = {item.name: item for item in fields(cls)}
-    for name in table:
-        if name not in known:
-            near = nearest(str(name), list(known))
-            hint = f"did you mean {near!r}? " if near else ""
-            hint += f"available: {', '.join(known)}"
-            raise ConfigError(f"{where}: key {name!r} unknown", hint)
-    hints = get_type_hints(cls)
-    values = {}
-    for name, item in known.items():
-        if name in table:
-            values[name] = _value(hints[name], table[name], name, where)
-        elif item.default is MISSING and item.default_factory is MISSING:
-            raise ConfigError(f"{where}: {name} is missing")
-    return cls(**values)
-
-
-def _value(kind: Any, value: Any, name: str, where: str) -> Any:
-    if get_origin(kind) in (Union, types.UnionType):
-        if value is None:
-            return None
-        kind = next(choice for choice in get_args(kind) if choice is not types.NoneType)
-    if is_dataclass(kind):
-        return value if type(value) is kind else _make(kind, value, f"{where}, {name}")
-    if get_origin(kind) is tuple:
-        return _sequence(get_args(kind), value, name, where)
-    if get_origin(kind) is not None:  # a mapping
-        return dict(value)
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
-    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-        raise ConfigError(f"{where}: {name} {value!r} is not {_KIND_WORDS[kind]}")
-    if isinstance(value, float):
+def _check(name: str, value: Any, where: str) -> None:
+    """Refuse a number that is none or negative, and a word that is not among the choices."""
+    if isinstance(value, (int, float)):
         if not math.isfinite(value) or (value < 0.0 and name not in _FREE_SIGN):
             raise ConfigError(f"{where}: {name} {value!r} is not a number that it can be")
-    if isinstance(value, str) and value and name in _CHOICES:
+    elif value and name in _CHOICES:
         one_of(f"{where}: {name}", value, _CHOICES[name])
-    return value
 
 
-def _sequence(kinds: tuple[Any, ...], value: Any, name: str, where: str) -> tuple[Any, ...]:
-    if isinstance(value, Mapping) or is_dataclass(value):
-        value = [value]  # one table stands for a list of one
-    if not isinstance(value, (list, tuple)):
-        raise ConfigError(f"{where}: {name} {value!r} is not a list")
-    if kinds[-1] is not Ellipsis and len(value) != len(kinds):
-        raise ConfigError(f"{where}: {name} has {len(value)} values, not {len(kinds)}")
-    each = [kinds[0]] * len(value) if kinds[-1] is Ellipsis else kinds
-    return tuple(_value(kind, item, name, where) for kind, item in zip(each, value, strict=True))
-
-
-_KIND_WORDS = {float: "a number", int: "an integer", str: "a text", bool: "true or false"}
 LIGHT_CODES = {name: LightStatus[name.upper()] for name in STATUSES}
 KIND_CODES = {name: AgentKind[name.upper()] for name in KINDS}

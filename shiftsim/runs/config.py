@@ -10,10 +10,10 @@ import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias, get_args, get_origin
+from typing import Any, NamedTuple, TypeAlias
 
 from shiftsim.errors import ConfigError, one_of
-from shiftsim.files import DEFAULT_STORE
+from shiftsim.files import DEFAULT_STORE, make_table
 
 Value: TypeAlias = bool | int | float | str | list[Any]
 
@@ -70,7 +70,8 @@ class Option(NamedTuple):
     parse: Callable[[str], Any] | None = None  # makes the value from the text of the command line
 
 
-def _setting(default: Any, help: str, *flags: str, **more: Any) -> Any:
+def setting(default: Any, help: str, *flags: str, **more: Any) -> Any:
+    """A field of settings that is an option of the command line, too."""
     return field(default=default, metadata={"option": Option(help, flags, **more)})
 
 
@@ -83,68 +84,75 @@ class RunConfig:
     `batch_size` may differ in the last digits.
     """
 
-    planners: tuple[str, ...] = _setting(
+    planners: tuple[str, ...] = setting(
         (), "Name, ./file.py:Class or [nuplan:]package.module:Class; repeatable.", "--planner", "-p"
     )
-    noise: tuple[str, ...] = _setting(
+    noise: tuple[str, ...] = setting(
         ("none",), "none, awgn-low … ou-high, all; repeatable. [none]", "--noise", "-n"
     )
-    seeds: tuple[int, ...] = _setting(
+    seeds: tuple[int, ...] = setting(
         (0,), "Noise seeds, such as 0,1,2 or 0-2. [0]", parse=parse_seeds
     )
-    store: str = _setting(DEFAULT_STORE, "Name or folder. [demo]", "--store", "-s")
-    split: str = _setting("", "Name or file (.toml, .txt). [whole store]")
-    limit: int = _setting(0, "Only the first N scenarios.")
-    all_scenarios: bool = _setting(False, "Also the scenarios that the filter dropped.", "--all")
-    edits: str = _setting("", "File (.toml) of edits; only what they make is run.")
-    traffic: str = _setting(
+    store: str = setting(DEFAULT_STORE, "Name or folder. [demo]", "--store", "-s")
+    split: str = setting("", "Name or file (.toml, .txt). [whole store]")
+    limit: int = setting(0, "Only the first N scenarios.")
+    all_scenarios: bool = setting(False, "Also the scenarios that the filter dropped.", "--all")
+    edits: str = setting("", "File (.toml) of edits; only what they make is run.")
+    traffic: str = setting(
         "nonreactive",
         "nonreactive (nr), reactive (r), constant-velocity, or package.module:Model. [nonreactive]",
     )
-    controller: str = _setting(
+    controller: str = setting(
         "lqr",
         "lqr, perfect or log-playback. [lqr]",
         choices=("lqr", "perfect", "log-playback"),
     )
-    thresholds: str = _setting("nuplan", "nuplan or deepplan. [nuplan]")
+    thresholds: str = setting("nuplan", "nuplan or deepplan. [nuplan]")
     planner_args: dict[str, dict[str, Value]] = field(
         default_factory=dict,
         metadata={
             "option": Option("key=value, or PLANNER.key=value; repeatable.", ("--planner-arg",))
         },
     )
-    metrics: tuple[str, ...] = _setting(
+    metrics: tuple[str, ...] = setting(
         (), "Own metric as package.module:function; repeatable.", "--metric"
     )
-    checkpoints: tuple[str, ...] = _setting(
+    checkpoints: tuple[str, ...] = setting(
         (), "PATH, official or shiftsim; or PLANNER=…; repeatable.", "--checkpoint"
     )
-    device: str = _setting("cpu", "cpu, cuda or auto. [cpu]", choices=("cpu", "cuda", "auto"))
-    batch_size: int = _setting(1, "Scenarios per forward pass of a network. [1]")
-    isolate: bool = _setting(False, "Every planner in a process of its own.")
-    planner_python: str = _setting("", "Interpreter for isolated planners of your own.")
-    strict: bool = _setting(False, "Fail where a planner falls back.")
-    open_loop: bool = _setting(False, "Also nuPlan's open-loop scores of every planner.")
-    out: str = _setting("", "Run folder. [runs/<id>]")
-    workers: int = _setting(0, "Worker processes. [auto]", parse=parse_workers)
-    timeout: float = _setting(0.0, "Seconds that one scenario may take; a hung one is killed.")
-    resume: bool = _setting(False, "Finish an interrupted or killed run.")
-    retry_failed: bool = _setting(False, "Finish a run, and do again what failed.")
-    shard: str = _setting("", "Only the part i/n of the tasks; see merge.")
-    executor: str = _setting(
+    device: str = setting("cpu", "cpu, cuda or auto. [cpu]", choices=("cpu", "cuda", "auto"))
+    batch_size: int = setting(1, "Scenarios per forward pass of a network. [1]")
+    isolate: bool = setting(False, "Every planner in a process of its own.")
+    planner_python: str = setting("", "Interpreter for isolated planners of your own.")
+    strict: bool = setting(False, "Fail where a planner falls back.")
+    open_loop: bool = setting(False, "Also nuPlan's open-loop scores of every planner.")
+    out: str = setting("", "Run folder. [runs/<id>]")
+    workers: int = setting(0, "Worker processes. [auto]", parse=parse_workers)
+    timeout: float = setting(0.0, "Seconds that one scenario may take; a hung one is killed.")
+    resume: bool = setting(False, "Finish an interrupted or killed run.")
+    retry_failed: bool = setting(False, "Finish a run, and do again what failed.")
+    shard: str = setting("", "Only the part i/n of the tasks; see merge.")
+    executor: str = setting(
         "processes", "processes or dask. [processes]", choices=("processes", "dask")
     )
-    scheduler: str = _setting("", "Address of the dask scheduler.")
-    save_rollouts: str = _setting(
+    scheduler: str = setting("", "Address of the dask scheduler.")
+    save_rollouts: str = setting(
         "all", "all, failed (score 0) or none. [all]", choices=("all", "failed", "none")
     )
-    bundle: bool = _setting(False, "Copy the scenarios used into the run folder.")
-    allow_partial: bool = _setting(False, "Print a labelled mean over what finished.")
+    bundle: bool = setting(False, "Copy the scenarios used into the run folder.")
+    allow_partial: bool = setting(False, "Print a labelled mean over what finished.")
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            _check(item.name, getattr(self, item.name), item.type, item.metadata["option"])
-        for name in ("planners", "noise", "seeds"):
+        for name in ("planners", "noise", "metrics", "checkpoints", "seeds"):
+            values = getattr(self, name)
+            if len(set(values)) != len(values):
+                raise ConfigError(
+                    f"{name} {list(values)!r}: a value is listed twice",
+                    hint="give each planner a `name` of its own" if name == "planners" else "",
+                )
+        if not self.planners:
+            raise ConfigError("no planner", hint="name one, for example --planner idm")
+        for name in ("noise", "seeds"):
             if not getattr(self, name):
                 raise ConfigError(f"{name} is empty", hint=f"give at least one value for {name}")
         if any(not 0 <= seed <= MAX_SEED for seed in self.seeds):
@@ -174,35 +182,15 @@ class RunConfig:
         return {name: list(v) if isinstance(v, tuple) else v for name, v in out.items()}
 
 
-def _check(name: str, value: Any, kind: Any, option: Option) -> None:
-    """Types are checked strictly: TOML and Python callers get the same message."""
-    if get_origin(kind) is tuple:
-        kind = get_args(kind)[0]
-        good = isinstance(value, tuple) and all(_is_a(item, kind) for item in value)
-        wanted = f"a list of {kind.__name__}"
-    elif get_origin(kind) is dict:
-        good = isinstance(value, dict) and all(isinstance(v, dict) for v in value.values())
-        wanted = "a table of arguments per planner"
-    else:
-        good, wanted = _is_a(value, kind), kind.__name__
-    if not good:
-        raise ConfigError(f"{name} is {value!r}; it must be {wanted}")
-    if isinstance(value, tuple) and len(set(value)) != len(value):
-        raise ConfigError(
-            f"{name} {list(value)!r}: a value is listed twice",
-            hint="give each planner a `name` of its own" if name == "planners" else "",
-        )
-    if option.choices:
-        one_of(name, value.partition(":")[0], option.choices)
+def _check(name: str, value: Any, where: str) -> None:
+    """Refuse what is not among the choices of an option, or out of its range."""
     from shiftsim.world.ranges import SETTINGS  # not needed to show the options
 
+    option = next(item.metadata["option"] for item in fields(RunConfig) if item.name == name)
+    if option.choices:
+        one_of(f"{where}: {name}", value.partition(":")[0], option.choices)
     if name in SETTINGS and not SETTINGS[name].low <= value <= SETTINGS[name].high:
-        raise ConfigError(f"{name} is {value!r}; it must be within {SETTINGS[name]}")
-
-
-def _is_a(value: object, kind: type) -> bool:
-    kinds = (int, float) if kind is float else (kind,)
-    return isinstance(value, kinds) and (kind is bool or not isinstance(value, bool))
+        raise ConfigError(f"{where}: {name} is {value!r}; it must be within {SETTINGS[name]}")
 
 
 def make_config(values: Mapping[str, Any], *, where: str = "run") -> RunConfig:
@@ -211,23 +199,7 @@ def make_config(values: Mapping[str, Any], *, where: str = "run") -> RunConfig:
     Raises:
         ConfigError: A name is unknown, or a value is wrong.
     """
-    known = {item.name for item in fields(RunConfig)}
-    plain: dict[str, Any] = {
-        name: tuple(value)
-        if isinstance(value, list)
-        else os.fspath(value)
-        if isinstance(value, os.PathLike)
-        else value
-        for name, value in values.items()
-    }
-    try:
-        for name in values:
-            one_of("setting", name, known)
-        if "planners" not in values:
-            raise ConfigError("no planner", hint="name one, for example --planner idm")
-        return RunConfig(**plain)
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error.message}", hint=error.hint) from error
+    return make_table(RunConfig, values, where, _check)
 
 
 def parse_argument(text: str, planners: tuple[str, ...]) -> tuple[str, str, Value]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from shiftsim.errors import CheckpointError, ConfigError, MissingExtraError
 from shiftsim.files import atomic_write, write_text
-from shiftsim.runs.config import Option
+from shiftsim.runs.config import Option, setting
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -23,11 +23,6 @@ OnMessage = Callable[[str], None]  # gets a line that says how far a training is
 Weights: TypeAlias = dict[str, "Tensor"]  # by their names in CaRL's checkpoint
 
 
-def _option(default: Any, help: str) -> Any:
-    """A setting that is an option of the command line, too."""
-    return field(default=default, metadata={"option": Option(help)})
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
     """What a training of CaRL's network depends on, and where and how it is done."""
@@ -35,18 +30,18 @@ class Settings:
     out: Path = field(
         metadata={"option": Option("Folder for networks, curves and what was collected.")}
     )
-    store: str = _option("demo", "Store by name, path or URL.")
-    split: str = _option("", "Split of the store; all its scenarios if empty.")
-    checkpoint: str = _option("", "Weights to begin with: a file, or shiftsim. Else from nothing.")
-    device: str = _option("cpu", "cpu, cuda, cuda:N or auto.")
-    seed: int = _option(0, "Of everything that is random.")
-    workers: int = _option(2, "Processes that drive, threads that train.")
-    rounds: int = _option(8, "Of collecting, training and testing.")
-    states: int = _option(360_000, "Labelled states to collect in all.")
-    samples: int = _option(1_280_000, "States to train on, each time counted.")
-    tau: float = _option(0.0, "Of the labels [s]; 0 to choose it.")
-    tests: int = _option(40, "Scenarios that each round is tested on.")
-    ppo_samples: int = _option(0, "Steps of PPO afterwards.")
+    store: str = setting("demo", "Store by name, path or URL.")
+    split: str = setting("", "Split of the store; all its scenarios if empty.")
+    checkpoint: str = setting("", "Weights to begin with: a file, or shiftsim. Else from nothing.")
+    device: str = setting("cpu", "cpu, cuda, cuda:N or auto.")
+    seed: int = setting(0, "Of everything that is random.")
+    workers: int = setting(2, "Processes that drive, threads that train.")
+    rounds: int = setting(8, "Of collecting, training and testing.")
+    states: int = setting(360_000, "Labelled states to collect in all.")
+    samples: int = setting(1_280_000, "States to train on, each time counted.")
+    tau: float = setting(0.0, "Of the labels [s]; 0 to choose it.")
+    tests: int = setting(40, "Scenarios that each round is tested on.")
+    ppo_samples: int = setting(0, "Steps of PPO afterwards.")
 
     def __post_init__(self) -> None:
         """Refuse numbers that make no training."""
@@ -74,13 +69,13 @@ class TrafficSettings:
     out: Path = field(
         metadata={"option": Option("Folder for weights, losses and how real they are.")}
     )
-    store: str = _option("demo", "Store by name, path or URL.")
-    split: str = _option("", "Split of the store; all its scenarios if empty.")
-    seed: int = _option(0, "Of everything that is random.")
-    rounds: int = _option(5, "Of collecting and training.")
-    scenarios: int = _option(150, "That each round collects from.")
-    epochs: int = _option(8, "Of each round.")
-    tests: int = _option(100, "Scenarios that the result is measured on.")
+    store: str = setting("demo", "Store by name, path or URL.")
+    split: str = setting("", "Split of the store; all its scenarios if empty.")
+    seed: int = setting(0, "Of everything that is random.")
+    rounds: int = setting(5, "Of collecting and training.")
+    scenarios: int = setting(150, "That each round collects from.")
+    epochs: int = setting(8, "Of each round.")
+    tests: int = setting(100, "Scenarios that the result is measured on.")
 
     def __post_init__(self) -> None:
         """Refuse numbers that make no training."""

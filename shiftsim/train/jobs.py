@@ -140,11 +140,12 @@ def mean_scores(
     towns: Towns, count: int, tau: float, run: RunJobs, *, by_expert: bool
 ) -> dict[str, float]:
     """Mean closed-loop score by noise, on `count` scenarios at most of towns that are left out."""
-    by_noise = [test_jobs(towns, count, noise, tau, by_expert=by_expert) for noise in TESTED]
-    done = run([job for jobs in by_noise for job in jobs])
-    halves = done[: len(by_noise[0])], done[len(by_noise[0]) :]
-    scores = [[score for driven in half for score in driven.scores] for half in halves]
-    if not all(scores):
-        failed = [text for driven in done for text in driven.failed]
-        raise DataError(f"no scenario could be driven to its end: {failed[0]}", hint=_SEE)
-    return {noise: float(np.mean(found)) for noise, found in zip(TESTED, scores, strict=True)}
+    out = {}
+    for noise in TESTED:
+        done = run(test_jobs(towns, count, noise, tau, by_expert=by_expert))
+        scores = [score for driven in done for score in driven.scores]
+        if not scores:
+            failed = [text for driven in done for text in driven.failed]
+            raise DataError(f"no scenario could be driven to its end: {failed[0]}", hint=_SEE)
+        out[noise] = float(np.mean(scores))
+    return out

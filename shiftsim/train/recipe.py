@@ -27,7 +27,7 @@ from shiftsim.train.learning import (
     from_official,
     to_official,
 )
-from shiftsim.train.states import States, read_part, write_part
+from shiftsim.train.states import States, write_part
 
 _WRITE_EVERY, _REPORT_EVERY = 120.0, 10.0  # s
 _CURVE_EVERY = 50  # steps
@@ -143,8 +143,7 @@ class Training:
 
     def _train(self) -> None:
         settings, progress, learner = self._settings, self.progress, self.learner
-        parts = [read_part(settings.part(number)) for number in range(progress.round + 1)]
-        states = States(parts)
+        states = States([settings.part(number) for number in range(progress.round + 1)])
         self._on_message(f"{self._where} training on {len(states)} states")
         reported = written = monotonic()
         before, results = progress.done, list[StepResult]()

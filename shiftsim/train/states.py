@@ -16,6 +16,7 @@ from shiftsim.planners.learned.carl.view import CHANNELS, SIZE
 from shiftsim.world.state import PACIFICA
 
 _PICTURES, _NUMBERS = "pictures.bin", "states.npz"
+_COLUMNS = ("measurements", "actions", "urgent")  # of a `State`, behind the picture
 _SHAPE = (len(CHANNELS), SIZE, SIZE)
 _CODEC = pa.Codec("zstd", 3)  # most pixels are empty: a raster takes some kilobytes
 _AX, _STEERING, _YAW_ACCEL = 4, 6, 9  # of the measurements
@@ -58,56 +59,40 @@ def mirror_measurements(measurements: Values) -> Values:
     return out
 
 
-class Part(NamedTuple):
-    """The states of one round. N states."""
-
-    pictures: NDArray[np.uint8]  # one after the other, mapped from disk
-    ends: IntArray  # (N + 1,) where each begins and the last one ends
-    measurements: Values  # (N, 10)
-    actions: Values  # (N, 2) labels
-    urgent: BoolArray  # (N,) whether the network ended with an infraction soon after
-
-
 def write_part(folder: Path, states: Iterable[State]) -> None:
-    """Write the states of one round."""
+    """Write the states of one round: pictures one after the other, and where each ends."""
     partial = folder.with_name(f".{folder.name}.tmp")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    ends, measurements, actions, urgent = [0], [], [], []
+    ends, rows = [0], []
     with (partial / _PICTURES).open("wb") as file:
-        for state in states:
-            ends.append(ends[-1] + file.write(state.picture))
-            measurements.append(state.measurements)
-            actions.append(state.action)
-            urgent.append(state.is_urgent)
-    np.savez(
-        partial / _NUMBERS,
-        ends=np.array(ends),
-        measurements=np.stack(measurements),
-        actions=np.stack(actions),
-        urgent=np.array(urgent),
-    )
+        for picture, *row in states:
+            ends.append(ends[-1] + file.write(picture))
+            rows.append(row)
+    columns = zip(_COLUMNS, zip(*rows, strict=True), strict=True)
+    numbers: dict[str, Any] = {name: np.array(column) for name, column in columns}
+    np.savez(partial / _NUMBERS, ends=np.array(ends), **numbers)
     partial.rename(folder)
 
 
-def read_part(folder: Path) -> Part:
-    """The states of one round."""
-    pictures = np.memmap(folder / _PICTURES, np.uint8, "r")
-    with np.load(folder / _NUMBERS) as numbers:
-        names = ("ends", "measurements", "actions", "urgent")
-        return Part(pictures, *(numbers[name] for name in names))
-
-
 class States:
-    """The states of all rounds so far."""
+    """The states of all rounds so far. N states.
 
-    def __init__(self, parts: Iterable[Part]) -> None:
-        self._parts = list(parts)
-        sizes = [len(part.actions) for part in self._parts]
-        self._first = np.concatenate([[0], np.cumsum(sizes)])
-        self.measurements = np.concatenate([part.measurements for part in self._parts])
-        self.actions = np.concatenate([part.actions for part in self._parts])
-        urgent = np.concatenate([part.urgent for part in self._parts])
+    Attributes:
+        measurements: (N, 10).
+        actions: (N, 2) labels.
+    """
+
+    def __init__(self, folders: Sequence[Path]) -> None:
+        """`folders` are those of `write_part`; pictures are mapped from there."""
+        parts = []
+        for folder in folders:
+            with np.load(folder / _NUMBERS) as stored:
+                parts.append([stored[name] for name in ("ends", *_COLUMNS)])
+        self._pictures = [np.memmap(folder / _PICTURES, np.uint8, "r") for folder in folders]
+        self._ends, *numbers = zip(*parts, strict=True)
+        self._first = np.cumsum([0, *(len(ends) - 1 for ends in self._ends)])
+        self.measurements, self.actions, urgent = (np.concatenate(x) for x in numbers)
         weights = importance(self.measurements, self.actions, urgent)
         self._total = np.cumsum(weights / weights.sum())
 
@@ -124,8 +109,8 @@ class States:
         out = np.empty((len(indices), *_SHAPE), np.uint8)
         for place, (index, is_mirrored) in enumerate(zip(indices.tolist(), mirrored, strict=True)):
             number = int(np.searchsorted(self._first, index, side="right")) - 1
-            part, row = self._parts[number], index - int(self._first[number])
-            raster = read_raster(part.pictures[part.ends[row] : part.ends[row + 1]])
+            begin, end = self._ends[number][index - int(self._first[number]) :][:2]
+            raster = read_raster(self._pictures[number][begin:end])
             out[place] = raster[:, ::-1] if is_mirrored else raster
         return out
 

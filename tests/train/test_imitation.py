@@ -31,7 +31,6 @@ from shiftsim.train.states import (
     compress_raster,
     importance,
     mirror_measurements,
-    read_part,
     read_raster,
     write_part,
 )
@@ -190,7 +189,7 @@ def states(tmp_path, rng):
     ]
     write_part(tmp_path / "round-00", found[:10])
     write_part(tmp_path / "round-01", found[10:])
-    made = States([read_part(tmp_path / f"round-0{number}") for number in range(2)])
+    made = States([tmp_path / f"round-0{number}" for number in range(2)])
     for index, state in enumerate(found):
         raster = read_raster(state.picture)
         both = made.rasters(np.array([index, index]), [False, True])

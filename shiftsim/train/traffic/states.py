@@ -120,25 +120,18 @@ def _labelled(
     closing[features[:, _LEADER] == 0.0, 1] = 0.0
     poses = tracks.poses[row, own]
     labels = compute_labels(recorded.select(own), row, poses, speeds, closing)
-    rests = (np.abs(speeds) < 0.2) & (np.abs(labels.accelerations) < 0.1)
-    chosen = labels.known & (~rests | (random.random(len(own)) < STANDING))
-    values = np.stack([labels.accelerations, labels.curvatures, labels.distances], axis=1)
-    return States(features[chosen].astype(np.float32), values[chosen].astype(np.float32))
-
-
-class Labels(NamedTuple):
-    """Wanted controls of agents. A agents."""
-
-    known: BoolArray  # (A,) whether there is a label
-    accelerations: FloatArray  # (A,) [m/s^2]
-    curvatures: FloatArray  # (A,) [rad/m]
-    distances: FloatArray  # (A,) to the point that is steered to [m]; 0 where the agent stays
+    rests = (np.abs(speeds) < 0.2) & (np.abs(labels[:, 0]) < 0.1)
+    chosen = ~np.isnan(labels[:, 0]) & (~rests | (random.random(len(own)) < STANDING))
+    return States(features[chosen].astype(np.float32), labels[chosen].astype(np.float32))
 
 
 def compute_labels(
     recorded: Tracks, row: int, poses: FloatArray, speeds: FloatArray, closing: FloatArray
-) -> Labels:
-    """Labels at a row of the tracks as recorded, of agents that are elsewhere by now.
+) -> FloatArray:
+    """(A, 3) labels at a row of the tracks as recorded, of agents that are elsewhere by now.
+
+    They are an acceleration [m/s^2], a curvature [rad/m] and the distance to the point that is
+    steered to [m], 0 where the agent stays; NaN where there is none.
 
     Args:
         recorded: (B, A, …) the agents as recorded.
@@ -147,22 +140,20 @@ def compute_labels(
         speeds: (A,) [m/s].
         closing: (A, 2) gap to who leads [m] and speed at which it shrinks [m/s]; inf and 0.
     """
-    known = np.zeros(len(poses), np.bool_)
-    out = np.zeros((len(poses), 3))
+    out = np.full((len(poses), 3), np.nan)
     for agent in np.flatnonzero(recorded.valid[row] & ~np.isnan(poses[:, 0])).tolist():
         valid = recorded.valid[:, agent]
         last = _last_in_a_row(valid[row:]) + row
         first = row - _last_in_a_row(valid[row::-1][: 2 * HORIZON + 1])
         if last - row >= LEAST:
             line = np.ascontiguousarray(recorded.poses[first : last + 1, agent, :2])
-            known[agent] = True
             out[agent] = _label(line, row - first, poses[agent], float(speeds[agent]))
     need = np.where(
         closing[:, 1] > 0.0, closing[:, 1] ** 2 / (2.0 * np.maximum(closing[:, 0] - 1.0, 0.2)), 0.0
     )
     out[:, 0] = np.where(need > FIRM, np.minimum(out[:, 0], -need), out[:, 0])
     out[:, :2] = np.clip(out[:, :2], LIMITS[:, 0], LIMITS[:, 1])
-    return Labels(known, *out.T)
+    return out
 
 
 def _last_in_a_row(valid: BoolArray) -> int:

@@ -9,10 +9,11 @@ from shiftsim.data.readers.annotations import read_recording
 from shiftsim.data.readers.dsc3d import open_site
 from shiftsim.data.readers.windows import overlap_partners
 from shiftsim.data.store.reading import ScenarioStore
-from shiftsim.data.synthetic.agents import STEP
 from shiftsim.data.synthetic.layouts import random_town
+from shiftsim.data.synthetic.roads import STEP
 from shiftsim.data.synthetic.routes import RandomRoutes, Route, make_path
 from shiftsim.data.synthetic.store import demo_store, write_demo
+from shiftsim.data.synthetic.town import Turn
 from shiftsim.metrics import compute_metrics
 from shiftsim.planners.registry import load_planner
 from shiftsim.runs.filter import FilterConfig, judge_scenario
@@ -135,7 +136,7 @@ def test_a_route_into_a_parking_space_ends_there():
     town = random_town("parking", "test", np.random.Generator(np.random.Philox(1)))
     junction = next(x for x in town.streets["lot"].junctions if x)
     entry = next(x.name for x in town.streets.values() if x.junctions == (junction, 0))
-    end = make_path(town, Route(1, (entry, "lot"), (0, 0), bay=4)).points[-1]
+    end = make_path(town, Route(1, (Turn(junction, entry, 1, "lot"),), bay=4)).points[-1]
     np.testing.assert_allclose(end[:2], town.bays["lot"][4][:2], atol=0.6)
     assert abs(np.sin(end[2] - town.bays["lot"][4][2])) < 0.15
 
