@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from importlib import import_module
 from types import ModuleType
 
+FAILED = "failed check: "  # begins what a report says of a map that cannot be right
 _MAX_TEXT = 100_000  # characters
 _MAX_MESSAGE = 1000  # characters
 

@@ -15,9 +15,10 @@ import shapely
 
 from shiftsim.data.maps.opendrive.areas import merge_closed
 from shiftsim.data.maps.opendrive.overlaps import subtract_overlaps
-from shiftsim.data.maps.opendrive.shapes import bend_ends, corners, lane_polygon
+from shiftsim.data.maps.opendrive.shapes import bend_ends, corners, lane_polygon, unfold_borders
 from shiftsim.data.maps.topology import Connector, Lane, LaneGraph, S
 from shiftsim.data.polygons import largest_part
+from shiftsim.errors import FAILED
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
 from shiftsim.world.map import VectorMap
@@ -185,6 +186,7 @@ class MapBuilder(ABC, Generic[S]):
     def _shape_lanes(self) -> None:
         borders = [self.shaper.joined_borders(lane.segments) for lane in self.graph.lanes]
         polygons = [lane_polygon(*pair) for pair in borders]
+        borders = [unfold_borders(*b, area) for b, area in zip(borders, polygons, strict=True)]
         self._stacked = self.stacked_lanes(polygons)
         polygons, overlaps = subtract_overlaps(polygons, self.sizes(polygons), self._stacked)
         if overlaps:
@@ -198,7 +200,8 @@ class MapBuilder(ABC, Generic[S]):
         borders = self.connector_borders(connector)
         before, after = (self._lanes[i].line for i in (connector.source, connector.target))
         line = self.shaper.baseline(connector.segments, before[-1], after[0])
-        return _Shape(*borders, bend_ends(line, before, after), lane_polygon(*borders))
+        area = lane_polygon(*borders)
+        return _Shape(*unfold_borders(*borders, area), bend_ends(line, before, after), area)
 
     def _lane_specs(self) -> Iterator[EdgeSpec]:
         lanes = self.graph.lanes
@@ -319,9 +322,9 @@ def line_faults(road: VectorMap) -> dict[str, int]:
     kinks = sum(bool((corners(line)[1] > _KINK).any()) for line in lines)
     bends = sum(bool((corners(joint)[1] > _KINK).any()) for joint in joints)
     found = {
-        f"failed check: centre line that turns by more than {_KINK:g} rad at a point": kinks,
-        f"failed check: lanes that meet at an angle of more than {_KINK:g} rad": bends,
-        f"failed check: lanes that are linked over a gap of more than {_END_GAP:g} m": sum(
+        f"{FAILED}centre line that turns by more than {_KINK:g} rad at a point": kinks,
+        f"{FAILED}lanes that meet at an angle of more than {_KINK:g} rad": bends,
+        f"{FAILED}lanes that are linked over a gap of more than {_END_GAP:g} m": sum(
             gap > _END_GAP for gap in gaps
         ),
     }

@@ -19,7 +19,8 @@ from shiftsim.data.recording import scenario as make_scenario
 from shiftsim.data.store import schema, tables
 from shiftsim.data.store.map import read_map_file
 from shiftsim.data.store.recordings import StoredRecording, ego_states, open_ego
-from shiftsim.errors import ConfigError, DataError, beginning
+from shiftsim.errors import FAILED, ConfigError, DataError, beginning
+from shiftsim.files import safe_join
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 
@@ -174,6 +175,24 @@ class ScenarioStore:
         if city not in self._maps:
             self._maps[city] = read_map_file(self.map_file(city))
         return self._maps[city]
+
+    def failed_checks(self) -> Iterator[tuple[Path, dict[str, int]]]:
+        """Reports of maps that failed checks when they were made, and which: count by kind.
+
+        Raises:
+            DataError: A report is damaged.
+        """
+        for name in tables.read_manifest(self.path)["files"]:
+            if not name.startswith(f"{tables.REPORTS}/"):
+                continue
+            path = self._fetched(safe_join(self.path, name))
+            try:
+                found = json.loads(path.read_text("utf-8")).get("map_warnings", {})
+                failed = {what: int(n) for what, n in found.items() if what.startswith(FAILED)}
+            except (OSError, ValueError, AttributeError, TypeError) as error:
+                raise DataError(f"{path}: damaged: {error}"[:400], tables.REPAIR) from error
+            if failed:
+                yield path, failed
 
     def map_file(self, city: str) -> Path:
         """File of a map."""

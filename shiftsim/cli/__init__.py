@@ -21,13 +21,18 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, redi
 from dataclasses import MISSING, fields
 from functools import cache, wraps
 from importlib import import_module
-from typing import Annotated, Any, TextIO, TypeAlias, get_args, get_origin
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TextIO, TypeAlias, get_args, get_origin
+from urllib.parse import unquote
 
 import typer
 from typer import Option, echo
 
-from shiftsim.errors import DataError, ShiftsimError
+from shiftsim.errors import FAILED, DataError, ShiftsimError
 from shiftsim.runs.config import RunConfig, parse_argument
+
+if TYPE_CHECKING:
+    from shiftsim.data.store.reading import ScenarioStore
 
 Json = Annotated[bool, Option("--json", help="Print JSON.")]
 Quiet = Annotated[bool, Option("--quiet", "-q", help="Print no progress.")]
@@ -65,6 +70,19 @@ def stdout_to_stderr() -> redirect_stdout[TextIO]:
     What workers print goes there anyway.
     """
     return redirect_stdout(sys.stderr)
+
+
+def open_store(path: str | Path) -> "ScenarioStore":
+    """The store of a command; the standard error gets a line per report with failed checks."""
+    import shiftsim
+
+    store = shiftsim.open_store(path)
+    for report, failed in store.failed_checks():
+        (what, count), total = next(iter(failed.items())), sum(failed.values())
+        first = f"{what.removeprefix(FAILED)} ({count})"
+        checks = f"{plural(total, 'failed check')}, the first: {first}"
+        echo(f"map {unquote(report.stem)}: {checks}; all in {report}", err=True)
+    return store
 
 
 def plural(count: int, noun: str) -> str:

@@ -54,7 +54,7 @@ def verify(
             f"{folder}: nothing says where the scenarios are",
             hint="--store NAME; shiftsim convert nuplan LOGS MAPS --store NAME makes it",
         )
-    opened = shiftsim.open_store(store)
+    opened = cli.open_store(store)
     result = verify_experiment(
         folder, lambda token: opened.read_recorded(token) if token in opened else None, mode
     )

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from typer import Argument, Option, echo
 
-import shiftsim
+from shiftsim import cli
 from shiftsim.cli import Json, new_app, plural, print_result
 from shiftsim.errors import ConfigError, ShiftsimError, beginning, one_of
 from shiftsim.files import write_text
@@ -34,7 +34,7 @@ def check(
     from shiftsim.runs.scenarios import open_edits
     from shiftsim.sim.traffic import traffic_name
 
-    opened = shiftsim.open_store(store)
+    opened = cli.open_store(store)
     edits = open_edits(file, opened)
     if traffic:
         edits.require_traffic(traffic_name(traffic))
@@ -76,7 +76,7 @@ def show(
     from shiftsim.runs.scenarios import open_edits
     from shiftsim.view.still import before_and_after
 
-    opened = shiftsim.open_store(store)
+    opened = cli.open_store(store)
     edited = EditedStore(opened, open_edits(file, opened))
     found = beginning(f"edits {file!r}", "edited scenario", token, edited.tokens)
     scenario = edited.read(found)
@@ -126,7 +126,7 @@ def sample(
     from shiftsim.runs.scenarios import find_split
 
     one_of("kind", kind, KINDS)
-    opened = shiftsim.open_store(store)
+    opened = cli.open_store(store)
     tokens = find_split(split, Path(opened.path), opened.tokens).tokens
     read = lru_cache(maxsize=256)(opened.read)
     edits = list(sample_edits(kind, count, seed, tokens, read, grade, even=even))

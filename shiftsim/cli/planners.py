@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-import shiftsim
 from shiftsim import cli
 from shiftsim.cli import Json, new_app, plural, print_result, stdout_to_stderr
 
@@ -68,7 +67,7 @@ def check_one_planner(
     from shiftsim.planners.registry import load_planner
 
     arguments = cli.planner_arguments(planner_arg or (), {}, [planner]).get(planner, {})
-    scenes = shiftsim.open_store(store)
+    scenes = cli.open_store(store)
     scenario = scenes[token or scenes.tokens[0]]
     rows = scenes.summary().select(["city", "token"]).to_pylist()
     others = [row for row in rows if row["token"] != scenario.token]

@@ -194,6 +194,8 @@ def announce(
         echo(f"data        generated, not recorded: {text}", err=as_json)
     if not as_json:
         echo("\n".join([*lines, ""]))
+    for store in dict.fromkeys(plan.store for plan in plans):
+        cli.open_store(store)
     if dry_run:
         values = [{"run": str(plan.folder), "tasks": len(plan.tasks)} for plan in plans]
         lines = ["dry run: everything checked, nothing simulated"]

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument, Option, echo
 
-import shiftsim
 from shiftsim import cli
 from shiftsim.cli import Json, Quiet, new_app, plural, print_json, print_result, progress_bar
 from shiftsim.errors import DataError, one_of
@@ -87,7 +86,7 @@ def filter_scenarios(
     workers = settings.pop("workers", 0)
     limits = cli.given(min_path_m=min_path, min_progress_share=min_progress)
     config = FilterConfig(**settings, **limits)
-    folder = shiftsim.open_store(store).path
+    folder = cli.open_store(store).path
     with progress_bar(quiet=quiet or as_json) as advance:
         found = filter_store(folder, config, workers=workers, on_progress=advance)
     values = {"config": found.config, "counts": found.counts(), "verdicts": found.rows}
@@ -156,7 +155,7 @@ def make_split(
     """
     from shiftsim.runs.scenarios import choose_scenarios, write_split
 
-    opened = shiftsim.open_store(store)
+    opened = cli.open_store(store)
     found = choose_scenarios(
         opened.summary().select(["token", "type", "city"]).to_pylist(),
         set(_chosen(opened, settings)),
@@ -187,7 +186,7 @@ def export_to_nuplan(
     """
     from shiftsim.data.nuplan.export import export_nuplan
 
-    opened = shiftsim.open_store(store)
+    opened = cli.open_store(store)
     tokens = _chosen(opened, settings)
     with progress_bar(quiet=quiet or as_json) as advance:
         report = export_nuplan(opened, out, tokens=tokens, progress=advance)
@@ -241,7 +240,7 @@ def show_stats(
     from shiftsim.report.dataset import draw_stats, stats_dict, stats_table
 
     one_of("column", by, ("city", "type"))
-    opened = shiftsim.open_store(store)
+    opened = cli.open_store(store)
     tokens = _chosen(opened, settings)
     with progress_bar(quiet=quiet or as_json) as advance:
         found = store_stats(

@@ -7,7 +7,6 @@ from typing import Any
 
 from typer import Argument, Option, echo
 
-import shiftsim
 from shiftsim import cli
 from shiftsim.cli import Json, Quiet, new_app, print_result
 from shiftsim.planners.learned.device import require_torch
@@ -73,7 +72,7 @@ def realism(
     if weights and "learned" in models:
         models["learned"] = partial(LearnedTraffic, weights)
     rows = []
-    for store in map(shiftsim.open_store, stores):
+    for store in map(cli.open_store, stores):
         found = compare(map(store.read, store.tokens[: limit or None]), models, seconds)
         rows += [{"store": store.path.name, **row} for row in found]
     print_result(rows, _realism_lines(rows), as_json=as_json)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Option, echo
 
-import shiftsim
+from shiftsim import cli
 from shiftsim.cli import Quiet, plural, progress_bar, show_in_browser
 from shiftsim.cli.report import RunFolder
 from shiftsim.errors import ConfigError
@@ -121,7 +121,7 @@ def inspect(
 
     if "://" in store:  # where the source's own review would take the place of what is decided
         raise ConfigError(f"store {store!r} is behind a URL", "review a copy of its folder")
-    path = shiftsim.open_store(store).path
+    path = cli.open_store(store).path
     with review_server(ReviewService(path, reviewer), port) as server:
         echo(f"review     {server.address}")
         echo(f"kept in    {path / REVIEW}")

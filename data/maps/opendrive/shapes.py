@@ -12,6 +12,8 @@ from itertools import pairwise
 
 import numpy as np
 import shapely
+from shapely.geometry.polygon import orient
+from shapely.ops import substring
 
 from shiftsim.data.maps.opendrive.curves import ReferenceLine
 from shiftsim.data.maps.opendrive.graph import LaneSegment
@@ -235,6 +237,30 @@ def _bend_start(line: FloatArray, direction: FloatArray) -> FloatArray:
 def lane_polygon(left: FloatArray, right: FloatArray) -> shapely.Polygon:
     """The area between two borders of one direction; the largest part where they cross."""
     return largest_part(shapely.Polygon(np.concatenate([left, right[::-1]])))
+
+
+def unfold_borders(
+    left: FloatArray, right: FloatArray, area: shapely.Polygon
+) -> tuple[FloatArray, FloatArray]:
+    """Borders of a lane; those that fold or cross are the two sides of its `area` instead.
+
+    On the inner side of a bend that is tighter than the lane is wide a border runs back and forth
+    beyond the lane; the area is without these parts.
+    """
+    if area.is_empty or shapely.Polygon(np.concatenate([left, right[::-1]])).is_valid:
+        return left, right
+    ring = orient(area, -1.0).exterior  # along the left border, and back along the right one
+    ends = shapely.points([left[0], left[-1], right[-1], right[0]])
+    begin, *stops = shapely.line_locate_point(ring, ends)
+    left_end, right_end = begin + (stops[:2] - begin) % ring.length
+    right_begin = begin + ring.length - (begin - stops[2]) % ring.length
+    is_whole = shapely.distance(ring, ends).max() < CHORD_ERROR  # else it crosses itself
+    if not (is_whole and begin < left_end <= right_end < right_begin):
+        return left, right
+    twice = shapely.LineString(np.concatenate([ring.coords, ring.coords[1:]]))
+    parts = substring(twice, begin, left_end), substring(twice, right_end, right_begin)
+    left, right = map(shapely.get_coordinates, parts)
+    return left, right[::-1]
 
 
 def widen(left: FloatArray, right: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:

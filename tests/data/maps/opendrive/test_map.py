@@ -144,6 +144,37 @@ def test_borders_stay_within_five_centimetres_of_the_curve():
     assert shapely.distance(truth, outer).max() < 0.05
 
 
+@pytest.mark.parametrize("bend", [0.5, -0.5])
+def test_borders_inside_of_a_sharp_bend_neither_fold_nor_leave_the_lane(bend: float):
+    turn, end = 0.5 * np.pi, 1.0 / abs(bend)
+    plan = [
+        geometry("<line/>", length=20),
+        geometry(f'<arc curvature="{bend}"/>', s=20, x=20, length=turn * end),
+        geometry(
+            "<line/>",
+            s=20 + turn * end,
+            x=20 + end,
+            y=np.copysign(end, bend),
+            hdg=np.copysign(turn, bend),
+            length=20,
+        ),
+    ]
+    number = 1 if bend > 0 else -1  # the lane inside, wider than the bend
+    lanes = section(lane(number, width=3.5))
+    od = parse(road(plan=plan, length=40 + turn * end, sections=lanes))
+    built, _ = build_road_map(od, name="test")  # the centre line turns within half a metre
+    area = built.edges.shape(0)
+    sides = [
+        shapely.LineString(side.at(0)[:, :2])
+        for side in (built.left_boundaries, built.right_boundaries)
+    ]
+    assert all(side.is_simple and area.exterior.distance(side) < 1e-9 for side in sides)
+    assert all(area.buffer(1e-6).covers(side) for side in sides)
+    assert not sides[0].intersects(sides[1])
+    inner = min(sides, key=lambda side: side.length)
+    assert inner.length == pytest.approx(2 * (20 + end - 3.5), abs=0.05)
+
+
 def test_crossing_without_a_junction_becomes_an_intersection():
     across = road("2", plan=geometry("<line/>", x=50, y=-50, hdg=np.pi / 2))
     built, report = make(parse(road("1"), across))
