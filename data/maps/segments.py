@@ -1,7 +1,7 @@
 """Lane pieces, as readers of data sets with maps hand them over, and their geometry.
 
 A piece is what a data set calls a lane, lane segment or lanelet: two borders in the direction of
-travel and what follows it. `graph.py` makes lanes and connectors of pieces, `map.py` the map.
+travel and what follows it. `build.py` makes the map of them.
 """
 
 from collections.abc import Sequence
@@ -65,6 +65,11 @@ class LanePiece:
         return lane_polygon(self.left, self.right)
 
     @property
+    def ends(self) -> tuple[FloatArray, FloatArray]:
+        """First and last cross-section (2, 2), from the left to the right border [m]."""
+        return np.stack([self.left[0], self.right[0]]), np.stack([self.left[-1], self.right[-1]])
+
+    @property
     def chord(self) -> FloatArray:
         """(2,) from its first to its last centre point [m]."""
         return self.middle[-1] - self.middle[0]
@@ -85,8 +90,7 @@ def stop_area(piece: LanePiece, kind: int, ends: FloatArray | None = None) -> St
     `ends` (2, 2) are those of the line [m], where it is not the end of the piece. None where the
     line encloses nothing with what lies before it.
     """
-    if ends is None:
-        ends = np.stack([piece.left[-1], piece.right[-1]])
+    ends = piece.ends[1] if ends is None else ends
     step = piece.middle[-2] - piece.middle[-1]
     back = STOP_LINE_DEPTH * step / np.hypot(*step)
     polygon = shapely.Polygon(np.concatenate([ends, ends[::-1] + back])).buffer(0)

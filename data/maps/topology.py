@@ -11,6 +11,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, Self, TypeVar
 
+import shapely
+
+from shiftsim.kernels import FloatArray
+
 MAX_GAP = 2.0  # m between lanes that are linked
 _CUT_LENGTH, _CUT_SHARE = 3.0, 0.25  # m, and share of the shorter lane, that becomes a connector
 _MAX_STEPS = 2_000  # in the search for ways from one lane through an intersection
@@ -83,6 +87,25 @@ class Topology(Generic[N, S]):
         """Remove a link."""
         self.after[source].remove(target)
         self.before[target].remove(source)
+
+    def drop_wide_gaps(
+        self, ends: Callable[[N], tuple[FloatArray, FloatArray]], noted: float = MAX_GAP
+    ) -> None:
+        """Remove links over gaps that are too wide; counts them, and those wider than `noted` [m].
+
+        `ends` gives the first and the last cross-section (2, 2) of a node [m].
+        """
+        pairs = [(a, b) for a in sorted(self.after) for b in sorted(self.after[a])]
+        if not pairs:
+            return
+        last, first = ([ends(pair[i])[1 - i] for pair in pairs] for i in (0, 1))
+        gaps = shapely.distance(shapely.linestrings(last), shapely.linestrings(first))
+        for pair, gap in zip(pairs, gaps, strict=True):
+            if gap > MAX_GAP:
+                self.separate(*pair)
+                self.warnings[f"lane link over a gap of more than {MAX_GAP:g} m, left out"] += 1
+            elif gap > noted:
+                self.warnings[f"lane link over a gap of more than {noted:g} m"] += 1
 
     def build_lanes(self, groups: Sequence[list[N]]) -> None:
         """Join groups, leftmost node first, to roadblocks; fills the lanes of the graph."""

@@ -18,7 +18,7 @@ from shiftsim.data.maps.opendrive import records
 from shiftsim.data.maps.opendrive.curves import ReferenceLine
 from shiftsim.data.maps.opendrive.lanes import LaneKey, lane_links, runs_forward, section_borders
 from shiftsim.data.maps.opendrive.records import DRIVABLE, OpenDrive
-from shiftsim.data.maps.topology import MAX_GAP, Topology
+from shiftsim.data.maps.topology import Topology
 from shiftsim.kernels import FloatArray
 
 MIN_LENGTH = 0.1  # m, shorter lanes are linked through
@@ -91,7 +91,7 @@ class _Builder:
         self._note_touching(self._infer_road_links())
         for key in sorted(narrow):
             self._link_through(key)
-        self._drop_wide_gaps()
+        self.topology.drop_wide_gaps(self.ends.__getitem__, SNAP_GAP)
         for links in self.after.values():
             links.sort()
         self.topology.build_lanes(self._groups())
@@ -218,19 +218,6 @@ class _Builder:
         self.topology.graph.dropped.append(self.nodes.pop(key))
         what = "drivable lane shorter than 0.1 m or narrower than 0.5 m, linked through"
         self.warnings[what] += 1
-
-    def _drop_wide_gaps(self) -> None:
-        pairs = [(a, b) for a in sorted(self.nodes) for b in sorted(self.after[a])]
-        if not pairs:
-            return
-        ends = shapely.linestrings(np.stack([self.ends[a][1] for a, _ in pairs]))
-        starts = shapely.linestrings(np.stack([self.ends[b][0] for _, b in pairs]))
-        for (a, b), gap in zip(pairs, shapely.distance(ends, starts), strict=True):
-            if gap > MAX_GAP:
-                self.topology.separate(a, b)
-                self.warnings[f"lane link over a gap of more than {MAX_GAP:g} m, dropped"] += 1
-            elif gap > SNAP_GAP:
-                self.warnings[f"lane link over a gap of more than {SNAP_GAP:g} m"] += 1
 
     def _groups(self) -> list[list[LaneKey]]:
         """Lanes of one direction of one section, leftmost first, in the order of their roads."""
