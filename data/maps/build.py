@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 
 from shiftsim.data.maps import segments
-from shiftsim.data.maps.builder import LIGHT_KIND, PASS_THROUGH, BuiltMap, MapBuilder
+from shiftsim.data.maps.builder import BuiltMap, MapBuilder
 from shiftsim.data.maps.opendrive.areas import drivable_tiles, linked_groups, merge_areas
 from shiftsim.data.maps.opendrive.shapes import BASELINE_STEP
 from shiftsim.data.maps.segments import LanePiece, MapSource, Part
@@ -56,6 +56,7 @@ class _PieceMapBuilder(MapBuilder[Part]):
         super().__init__(_PieceGraph(source.pieces, warnings).build(), segments, warnings)
         self.source = source
         self.lights = [self._find_light(connector) for connector in self.graph.connectors]
+        self.stop_signs = [False] * len(self.lights)
 
     def _find_light(self, connector: Connector[Part]) -> str | None:
         """The light of a connector: of its own pieces, else of the lane that leads to it."""
@@ -63,14 +64,8 @@ class _PieceMapBuilder(MapBuilder[Part]):
         inner = [part.piece for part in connector.segments if connector.junctions]
         return next((piece.light for piece in (*inner, before) if piece.light is not None), None)
 
-    def light(self, number: int) -> str | None:
-        return self.lights[number]
-
     def speed_limits(self, segment: Part) -> Iterable[tuple[float | None, float]]:
         return [(segment.piece.speed_limit, segment.length)]
-
-    def sizes(self, polygons: Sequence[shapely.Polygon]) -> list[float]:
-        return [polygon.area for polygon in polygons]
 
     def stop_areas(self, lanes: Sequence[shapely.Polygon]) -> list[tuple[shapely.Polygon, int]]:
         return [(area.polygon, area.kind) for area in self.source.stop_areas]
@@ -95,11 +90,6 @@ class _PieceMapBuilder(MapBuilder[Part]):
         links = [(i, pairs.index(pair)) for i, pair in enumerate(pairs)]
         links += [p for p, area in shared_areas(connectors).items() if area > _SAME_PLACE]
         return linked_groups(links, len(pairs))
-
-    def kind(self, numbers: Sequence[int]) -> int:
-        if any(self.lights[i] is not None for i in numbers):
-            return LIGHT_KIND
-        return PASS_THROUGH if not any(self.graph.connectors[i].junctions for i in numbers) else 0
 
     def areas(
         self, edges: Sequence[shapely.Polygon], intersections: Sequence[AreaSpec]

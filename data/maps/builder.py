@@ -75,6 +75,8 @@ class MapBuilder(ABC, Generic[S]):
     """Makes the map of a lane graph, with one series of ids for all of its parts."""
 
     larger: str  # what the lane is, of two that overlap, that gives way: bigger or longer
+    lights: Sequence[str | None]  # light of each connector: its name, empty where unknown; or None
+    stop_signs: Sequence[bool]  # whether a stop sign governs each connector
 
     def __init__(self, graph: LaneGraph[S], shaper: Shaper[S], warnings: Counter[str]) -> None:
         """Counts in `warnings` what is repaired."""
@@ -94,10 +96,6 @@ class MapBuilder(ABC, Generic[S]):
     def speed_limits(self, segment: S) -> Iterable[tuple[float | None, float]]:
         """Limits on a segment [m/s], None for none, and the length over which each holds [m]."""
 
-    @abstractmethod
-    def sizes(self, polygons: Sequence[shapely.Polygon]) -> list[float]:
-        """How large each lane is; where two overlap, the larger one gives way."""
-
     def stacked_lanes(self, polygons: Sequence[shapely.Polygon]) -> Pairs:
         """Pairs i < j of lanes that lie on different levels."""
         return set()
@@ -115,16 +113,8 @@ class MapBuilder(ABC, Generic[S]):
         """Stop polygons of a connector, by its baseline and that of the lane before it."""
 
     @abstractmethod
-    def light(self, number: int) -> str | None:
-        """The light that governs a connector: its name, empty where unknown; None for no light."""
-
-    @abstractmethod
     def groups(self, connectors: Sequence[shapely.Polygon]) -> IntArray:
         """Number of the intersection of each connector, 0 and up."""
-
-    @abstractmethod
-    def kind(self, numbers: Sequence[int]) -> int:
-        """Kind of the intersection of some connectors."""
 
     @abstractmethod
     def areas(
@@ -171,7 +161,7 @@ class MapBuilder(ABC, Generic[S]):
         runs = [lane.segments for lane in self.graph.lanes]
         runs += [connector.segments for connector in self.graph.connectors]
         segments = dict(zip([*self._lane_ids, *self._connector_ids], runs, strict=True))
-        named = ((i, self.light(number)) for number, i in enumerate(self._connector_ids))
+        named = zip(self._connector_ids, self.lights, strict=True)
         lights = {i: light for i, light in named if light}
         return BuiltMap(road, dict(self.warnings), lights, segments, frozenset(stacked))
 
@@ -188,7 +178,9 @@ class MapBuilder(ABC, Generic[S]):
         polygons = [lane_polygon(*pair) for pair in borders]
         borders = [unfold_borders(*b, area) for b, area in zip(borders, polygons, strict=True)]
         self._stacked = self.stacked_lanes(polygons)
-        polygons, overlaps = subtract_overlaps(polygons, self.sizes(polygons), self._stacked)
+        lengths = [sum(s.length for s in lane.segments) for lane in self.graph.lanes]
+        sizes = lengths if self.larger == "longer" else [area.area for area in polygons]
+        polygons, overlaps = subtract_overlaps(polygons, sizes, self._stacked)
         if overlaps:
             self.warnings[f"overlap of two lanes, taken from the {self.larger} one"] += overlaps
         self._lanes = [
@@ -217,19 +209,15 @@ class MapBuilder(ABC, Generic[S]):
                 left_lane[number + 1] = self._lane_ids[number]
                 right_lane[number] = self._lane_ids[number + 1]
         for number, (lane, shape) in enumerate(zip(lanes, self._lanes, strict=True)):
-            yield EdgeSpec(
+            yield self._edge(
+                shape,
+                lane.segments,
                 id=self._lane_ids[number],
-                is_connector=False,
-                polygon=shape.polygon,
-                baseline=shape.line,
                 block_id=self._block_ids[lane.block],
                 incoming=incoming[number],
                 outgoing=outgoing[number],
-                left=shape.left,
-                right=shape.right,
                 left_id=borders[lane.block, lane.index],
                 right_id=borders[lane.block, lane.index + 1],
-                speed_limit=self._speed_limit(lane.segments),
                 lane_index=lane.index,
                 left_lane=left_lane.get(number),
                 right_lane=right_lane.get(number),
@@ -240,24 +228,28 @@ class MapBuilder(ABC, Generic[S]):
             connector = self.graph.connectors[number]
             left_id, right_id = self._new_ids(2)
             stops = self.stops_of(number, self._lanes[connector.source].line, shape.line)
-            yield EdgeSpec(
+            yield self._edge(
+                shape,
+                connector.segments,
                 id=self._connector_ids[number],
                 is_connector=True,
-                polygon=shape.polygon,
-                baseline=shape.line,
                 block_id=self._pair_ids[self.block_pairs[number]],
                 incoming=[self._lane_ids[connector.source]],
                 outgoing=[self._lane_ids[connector.target]],
-                left=shape.left,
-                right=shape.right,
                 left_id=left_id,
                 right_id=right_id,
-                speed_limit=self._speed_limit(connector.segments),
                 intersection_id=self._group_ids[self._groups[number]],
-                has_traffic_lights=self.light(number) is not None,
+                has_traffic_lights=self.lights[number] is not None,
                 stop_lines=[self._stop_ids[i] for i in stops],
                 turn_type=turn_type(shape.line),
             )
+
+    def _edge(self, shape: _Shape, segments: Sequence[S], **rest: Any) -> EdgeSpec:
+        """An edge of a shape; `rest` is what else it has."""
+        lines = {"left": shape.left, "right": shape.right, "baseline": shape.line}
+        limit = self._speed_limit(segments)
+        rest = {"is_connector": False, "speed_limit": limit, **lines, **rest}
+        return EdgeSpec(polygon=shape.polygon, **rest)
 
     def _speed_limit(self, segments: Sequence[S]) -> float | None:
         """The limit on most of a lane (nuPlan rule 507), the lower one on ties [m/s]."""
@@ -307,7 +299,15 @@ class MapBuilder(ABC, Generic[S]):
     def _intersections(self) -> Iterator[AreaSpec]:
         for group, numbers in sorted(_grouped(self._groups).items()):
             area = shapely.Polygon(self._merged(numbers, _CLOSING).exterior)
-            yield AreaSpec(self._group_ids[group], area, self.kind(numbers))
+            yield AreaSpec(self._group_ids[group], area, self._kind(numbers))
+
+    def _kind(self, numbers: Sequence[int]) -> int:
+        """Kind of the intersection of some connectors."""
+        if any(self.lights[i] is not None for i in numbers):
+            return LIGHT_KIND
+        if any(self.stop_signs[i] for i in numbers):
+            return STOP_SIGN_KIND
+        return 0 if any(self.graph.connectors[i].junctions for i in numbers) else PASS_THROUGH
 
     def _merged(self, numbers: Sequence[int], radius: float) -> shapely.Polygon:
         return merge_closed([self._connectors[i].polygon for i in numbers], radius)

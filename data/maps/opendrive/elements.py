@@ -2,6 +2,7 @@
 
 import re
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -113,13 +114,23 @@ class Reader:
 
     def _cubic(self, element: Any, is_crumb: bool) -> list[float]:
         """Coefficients of a cubic; of one that is absurd but shorter than 1 mm only the first."""
-        values = [self.number(element, k, may_be_any=is_crumb) for k in CUBIC]
-        allowed = [OPENDRIVE[f"{element.tag} {k}"] for k in CUBIC]
-        fits = [a.holds(v) or not np.isfinite(v) for a, v in zip(allowed, values, strict=True)]
+        values, fits = self.coefficients(element, CUBIC, is_crumb)
         if all(fits):
             return values
         self.warn("absurd record shorter than 1 mm, ignored")
         return [values[0] if fits[0] else np.nan, 0, 0, 0]
+
+    def coefficients(
+        self, element: Any, names: Sequence[str], is_crumb: bool
+    ) -> tuple[list[float], list[bool]]:
+        """Coefficients of a curve, and whether each is in its range, or not finite.
+
+        Those of a record shorter than 1 mm may be any numbers.
+        """
+        values = [self.number(element, name, may_be_any=is_crumb) for name in names]
+        allowed = [OPENDRIVE[f"{element.tag} {name}"] for name in names]
+        fits = [a.holds(v) or not np.isfinite(v) for a, v in zip(allowed, values, strict=True)]
+        return values, fits
 
 
 def read_object(element: Any, reader: Reader) -> RoadObject:

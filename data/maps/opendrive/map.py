@@ -7,14 +7,7 @@ from dataclasses import replace
 import numpy as np
 import shapely
 
-from shiftsim.data.maps.builder import (
-    LIGHT_KIND,
-    PASS_THROUGH,
-    STOP_SIGN_KIND,
-    BuiltMap,
-    MapBuilder,
-    Pairs,
-)
+from shiftsim.data.maps.builder import PASS_THROUGH, BuiltMap, MapBuilder, Pairs
 from shiftsim.data.maps.opendrive import areas, control, records
 from shiftsim.data.maps.opendrive.control import LIGHT, STOP, TOWN, YIELD
 from shiftsim.data.maps.opendrive.curves import ReferenceLine, length_error, total_turn
@@ -208,6 +201,8 @@ class _RoadMapBuilder(MapBuilder[LaneSegment]):
         super().__init__(graph, shapes, warnings)
         self.od, self.shapes, self.country = od, shapes, country
         self.controls = control.connector_controls(od, graph)
+        self.lights = ["" if LIGHT in found else None for found in self.controls]
+        self.stop_signs = [STOP in found for found in self.controls]
         self.stops: list[control.StopLine] = []
 
     def connector_borders(self, connector: Connector) -> tuple[FloatArray, FloatArray]:
@@ -218,9 +213,6 @@ class _RoadMapBuilder(MapBuilder[LaneSegment]):
 
     def speed_limits(self, segment: LaneSegment) -> Iterable[tuple[float | None, float]]:
         return control.speed_limits(self.od, segment, self.country)
-
-    def sizes(self, polygons: Sequence[shapely.Polygon]) -> list[float]:
-        return [sum(s.length for s in lane.segments) for lane in self.graph.lanes]
 
     def _levels(
         self, edges: Sequence[Lane | Connector], areas: Sequence[shapely.Polygon]
@@ -246,20 +238,11 @@ class _RoadMapBuilder(MapBuilder[LaneSegment]):
             return []
         return [i for i, stop in enumerate(self.stops) if stop.lane == connector.source]
 
-    def light(self, number: int) -> str | None:
-        return "" if LIGHT in self.controls[number] else None
-
     def groups(self, connectors: Sequence[shapely.Polygon]) -> IntArray:
         levels = self._levels(self.graph.connectors, connectors)
         return areas.group_connectors(
             self.graph.connectors, connectors, self.block_pairs, levels.are_stacked
         )
-
-    def kind(self, numbers: Sequence[int]) -> int:
-        found = frozenset(control for i in numbers for control in self.controls[i])
-        if not any(self.graph.connectors[i].junctions for i in numbers):
-            return PASS_THROUGH
-        return LIGHT_KIND if LIGHT in found else STOP_SIGN_KIND if STOP in found else 0
 
     def areas(
         self, edges: Sequence[shapely.Polygon], intersections: Sequence[AreaSpec]

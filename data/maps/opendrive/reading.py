@@ -5,7 +5,6 @@ counted in `OpenDrive.warnings`, one count per kind; what cannot raises one erro
 road and element.
 """
 
-from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -30,6 +29,12 @@ from shiftsim.world.ranges import OPENDRIVE
 MAX_BYTES = 200_000_000
 TINY_LENGTH = 1e-9  # m, shorter geometry records are skipped
 _PARAM_CUBIC = ("aU", "bU", "cU", "dU", "aV", "bV", "cV", "dV")
+_COEFFICIENTS = {
+    records.ARC: ("curvature",),
+    records.SPIRAL: ("curvStart", "curvEnd"),
+    records.POLY3: CUBIC,
+    records.PARAM_POLY3: _PARAM_CUBIC,
+}
 _TOP_LEVEL = ("header", "road", "junction", "include")
 
 
@@ -193,10 +198,10 @@ def _read_plan_view(element: Any, reader: Reader) -> tuple[records.Geometry, ...
             reader.warn("road left out: paramPoly3 without coefficients")
             return None
         is_crumb = TINY_LENGTH <= length < CRUMB
-        coefficients, p_end = _read_shape(shape, length, reader, may_be_any=is_crumb)
-        if is_crumb and not _is_sane(shape, coefficients):
+        coefficients, fits = reader.coefficients(shape, _COEFFICIENTS.get(kind, ()), is_crumb)
+        if is_crumb and not all(fits):
             reader.warn("absurd geometry shorter than 1 mm, taken as a line")
-            kind, coefficients = records.LINE, ()
+            kind, coefficients = records.LINE, []
         if not np.isfinite([s, x, y, heading, length, *coefficients]).all():
             reader.warn("road left out: geometry is not finite")
             return None
@@ -208,7 +213,9 @@ def _read_plan_view(element: Any, reader: Reader) -> tuple[records.Geometry, ...
             reader.warn("geometry without length, skipped")
             tiny.append(records.Geometry(s, x, y, heading, max(length, 0.0), records.LINE))
         else:
-            geometries.append(records.Geometry(s, x, y, heading, length, kind, coefficients, p_end))
+            is_arc_length = shape is not None and shape.get("pRange") == "arcLength"
+            curve = kind, tuple(coefficients), length if is_arc_length else 1.0
+            geometries.append(records.Geometry(s, x, y, heading, length, *curve))
     geometries = geometries or tiny[:1]  # a road without length still links its neighbours
     if not geometries:
         reader.warn("road left out: no geometry")
@@ -216,32 +223,6 @@ def _read_plan_view(element: Any, reader: Reader) -> tuple[records.Geometry, ...
     if any(a.s > b.s for a, b in pairwise(geometries)):
         reader.warn("records out of order")
     return tuple(sorted(geometries, key=lambda record: record.s))
-
-
-_COEFFICIENTS = {
-    records.ARC: ("curvature",),
-    records.SPIRAL: ("curvStart", "curvEnd"),
-    records.POLY3: CUBIC,
-    records.PARAM_POLY3: _PARAM_CUBIC,
-}
-
-
-def _read_shape(
-    shape: Any, length: float, reader: Reader, *, may_be_any: bool
-) -> tuple[tuple[float, ...], float]:
-    if shape is None or shape.tag == records.LINE:
-        return (), 0.0
-    names = _COEFFICIENTS[shape.tag]
-    values = tuple(reader.number(shape, k, may_be_any=may_be_any) for k in names)
-    return values, length if shape.get("pRange") == "arcLength" else 1.0
-
-
-def _is_sane(shape: Any, values: Sequence[float]) -> bool:
-    """Whether the coefficients of a shape are within their ranges, or not finite."""
-    if not values:
-        return True
-    allowed = [OPENDRIVE[f"{shape.tag} {key}"] for key in _COEFFICIENTS[shape.tag]]
-    return all(a.holds(v) or not np.isfinite(v) for a, v in zip(allowed, values, strict=True))
 
 
 def _note_directions(sections: list[Any], reader: Reader) -> None:
