@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 
 from shiftsim.data.maps import segments
-from shiftsim.data.maps.builder import BuiltMap, MapBuilder
+from shiftsim.data.maps.builder import BuiltMap, MapBuilder, StopArea
 from shiftsim.data.maps.opendrive.areas import drivable_tiles, linked_groups, merge_areas
 from shiftsim.data.maps.opendrive.shapes import BASELINE_STEP
 from shiftsim.data.maps.segments import LanePiece, MapSource, Part
@@ -67,8 +67,8 @@ class _PieceMapBuilder(MapBuilder[Part]):
     def speed_limits(self, segment: Part) -> Iterable[tuple[float | None, float]]:
         return [(segment.piece.speed_limit, segment.length)]
 
-    def stop_areas(self, lanes: Sequence[shapely.Polygon]) -> list[tuple[shapely.Polygon, int]]:
-        return [(area.polygon, area.kind) for area in self.source.stop_areas]
+    def stop_areas(self, lanes: Sequence[shapely.Polygon]) -> Sequence[StopArea]:
+        return self.source.stop_areas
 
     def stops_of(self, number: int, before: FloatArray, line: FloatArray) -> list[int]:
         """Stop polygons where the lane before a connector with a light ends."""
@@ -80,8 +80,8 @@ class _PieceMapBuilder(MapBuilder[Part]):
         piece = lane.segments[-1].piece.id
         return [
             number
-            for number, area in enumerate(self.source.stop_areas)
-            if area.piece == piece or (area.piece is None and path.intersects(area.polygon))
+            for number, area in enumerate(self.stops)
+            if area.before == piece or (area.before is None and path.intersects(area.polygon))
         ]
 
     def groups(self, connectors: Sequence[shapely.Polygon]) -> IntArray:

@@ -47,6 +47,14 @@ class BuiltMap:
     stacked: frozenset[tuple[str, str]] = frozenset()
 
 
+class StopArea(NamedTuple):
+    """A stop polygon of a source."""
+
+    polygon: shapely.Polygon  # its area
+    kind: int  # type number of a stop polygon, as nuPlan counts them
+    before: str | int | None = None  # piece or lane that ends at it; None: found by its place
+
+
 class _Shape(NamedTuple):
     """A lane or connector of the graph, in the direction of travel."""
 
@@ -105,8 +113,8 @@ class MapBuilder(ABC, Generic[S]):
         return True
 
     @abstractmethod
-    def stop_areas(self, lanes: Sequence[shapely.Polygon]) -> list[tuple[shapely.Polygon, int]]:
-        """Stop polygons and their kinds."""
+    def stop_areas(self, lanes: Sequence[shapely.Polygon]) -> Sequence[StopArea]:
+        """Stop polygons; `lanes` are the areas of the lanes."""
 
     @abstractmethod
     def stops_of(self, number: int, before: FloatArray, line: FloatArray) -> Sequence[int]:
@@ -126,7 +134,7 @@ class MapBuilder(ABC, Generic[S]):
         """The map, moved by `offset` (2,) [m]."""
         graph = self.graph
         self._shape_lanes()
-        stops = self.stop_areas([lane.polygon for lane in self._lanes])
+        self.stops = self.stop_areas([lane.polygon for lane in self._lanes])
         self._connectors = [self._shape_connector(connector) for connector in graph.connectors]
         self._groups = self.groups([c.polygon for c in self._connectors]).tolist()
         self._lane_ids = self._new_ids(len(graph.lanes))
@@ -135,12 +143,15 @@ class MapBuilder(ABC, Generic[S]):
         pairs = sorted(set(self.block_pairs))
         self._pair_ids = dict(zip(pairs, self._new_ids(len(pairs)), strict=True))
         self._group_ids = self._new_ids(max(self._groups, default=-1) + 1)
-        self._stop_ids = self._new_ids(len(stops))
+        self._stop_ids = self._new_ids(len(self.stops))
         edges = [*self._lane_specs(), *self._connector_specs()]
         blocks = [*self._roadblocks(), *self._roadblock_connectors()]
         layers = {
             "intersections": list(self._intersections()),
-            "stop_polygons": [AreaSpec(i, *s) for i, s in zip(self._stop_ids, stops, strict=True)],
+            "stop_polygons": [
+                AreaSpec(i, stop.polygon, stop.kind)
+                for i, stop in zip(self._stop_ids, self.stops, strict=True)
+            ],
         }
         polygons = [edge.polygon for edge in edges]
         for layer, shapes in self.areas(polygons, layers["intersections"]).items():

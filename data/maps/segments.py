@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 import shapely
 
+from shiftsim.data.maps.builder import StopArea as StopArea
 from shiftsim.data.maps.opendrive.control import STOP_LINE_DEPTH
 from shiftsim.data.maps.opendrive.shapes import (
     BASELINE_STEP,
@@ -73,15 +74,6 @@ class LanePiece:
     def chord(self) -> FloatArray:
         """(2,) from its first to its last centre point [m]."""
         return self.middle[-1] - self.middle[0]
-
-
-@dataclass(frozen=True)
-class StopArea:
-    """A stop polygon of a source."""
-
-    polygon: shapely.Polygon  # its area
-    kind: int  # type number of a stop polygon, as nuPlan counts them
-    piece: str | None = None  # piece that ends at it; None: found by its place
 
 
 def stop_area(piece: LanePiece, kind: int, ends: FloatArray | None = None) -> StopArea | None:

@@ -1,7 +1,6 @@
 """Areas of the map: intersections, drivable area, walkways, car parks, crosswalks."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import shapely
@@ -28,15 +27,6 @@ _SLIVER = 0.05  # m, cracks between lanes that are closed in the drivable area
 _TILE, _TILE_OVERLAP = 50.0, 0.5  # m
 _USED = records.PAVED | records.WALKED | records.SEAMS
 _CROSSWALK_WORDS = ("crosswalk", "zebra", "pedestrian")
-
-
-@dataclass(frozen=True)
-class LaneAreas:
-    """Polygons of lanes that are no lanes of the map: by what they are used for."""
-
-    paved: list[shapely.Polygon]
-    walked: list[shapely.Polygon]
-    parking: list[shapely.Polygon]
 
 
 def group_connectors(
@@ -84,17 +74,15 @@ def merge_closed(polygons: Iterable[shapely.Polygon], radius: float) -> shapely.
     return closed if isinstance(closed, shapely.Polygon) else largest_part(union.convex_hull)
 
 
-def lane_areas(od: OpenDrive, shapes: Shapes) -> LaneAreas:
-    """Areas of all lanes that cars do not follow."""
-    areas = LaneAreas([], [], [])
+def lane_areas(od: OpenDrive, shapes: Shapes) -> dict[str, list[shapely.Polygon]]:
+    """Areas of all lanes that cars do not follow: those `paved`, `walked` and for `parking`."""
+    areas: dict[str, list[shapely.Polygon]] = {"paved": [], "walked": [], "parking": []}
     for road in od.roads.values():
         for index, section in enumerate(road.sections):
-            if road.section_end(index) - section.s < 0.01:
-                continue
             kinds = {number: lane.type for number, lane in section.lanes.items()}
-            if not _USED & set(kinds.values()):
+            if road.section_end(index) - section.s < 0.01 or not _USED & set(kinds.values()):
                 continue
-            shape = shapes.section(road.id, index)
+            _, shape = shapes.section(road.id, index)
             for number, kind in kinds.items():
                 inner, outer = shape.inner[number], shape.outer[number]
                 width = float(np.hypot(*(outer - inner).T).max())
@@ -104,11 +92,11 @@ def lane_areas(od: OpenDrive, shapes: Shapes) -> LaneAreas:
                 is_seam = kind in records.SEAMS and width < _SEAM_WIDTH
                 beside = {kinds.get(number - 1), kinds.get(number + 1)}
                 if kind in records.PAVED:
-                    areas.paved.append(area)
+                    areas["paved"].append(area)
                 elif kind in records.WALKED or (is_seam and beside & records.WALKED):
-                    areas.walked.append(area)
+                    areas["walked"].append(area)
                 if kind == "parking":
-                    areas.parking.append(area)
+                    areas["parking"].append(area)
     return areas
 
 
@@ -211,12 +199,8 @@ def _place_ring(
 def crosswalk_polygons(od: OpenDrive, shapes: Shapes) -> list[shapely.Polygon]:
     """All crosswalks that enclose an area."""
     rings = rings_of(od.roads.values(), shapes, is_crosswalk)
-    rings += [
-        _signal_ring(road.id, signal, shapes)
-        for road in od.roads.values()
-        for signal in road.signals
-        if _is_crosswalk_signal(signal)
-    ]
+    signals = [(road.id, signal) for road in od.roads.values() for signal in road.signals]
+    rings += [_signal_ring(*pair, shapes) for pair in signals if _is_crosswalk_signal(pair[1])]
     polygons = [largest_part(shapely.Polygon(ring)) for ring in rings if np.isfinite(ring).all()]
     return [polygon for polygon in polygons if polygon.area > 0.1]
 

@@ -1,12 +1,12 @@
 """What governs traffic: lights, signs and stop lines at junctions, and speed limits."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 import shapely
 
+from shiftsim.data.maps.builder import StopArea
 from shiftsim.data.maps.opendrive.areas import is_stop_line, rings_of
 from shiftsim.data.maps.opendrive.graph import Graph, LaneSegment
 from shiftsim.data.maps.opendrive.records import SPEED_UNITS, OpenDrive, Road, Signal
@@ -15,6 +15,7 @@ from shiftsim.data.polygons import largest_part
 from shiftsim.kernels import FloatArray
 
 LIGHT, STOP, YIELD = "light", "stop", "yield"
+STOP_KINDS = {LIGHT: 2, STOP: 1, YIELD: 4}  # kinds of stop polygons
 STOP_LINE_DEPTH = 1.0  # m
 _APPROACH = 100.0  # m before a junction within which a signal governs it
 _NEAR_END = 10.0  # m between a drawn stop line and the end of its lane
@@ -29,15 +30,6 @@ _DEFAULTS_DE: dict[str, float | None] = {
     "motorway": None,
 }
 _DEFAULTS_US = _DEFAULTS_DE | dict.fromkeys(TOWN, 25 * _MPH) | {"motorway": 65 * _MPH}
-
-
-@dataclass(frozen=True)
-class StopLine:
-    """A stop line across a lane: its area, what it is for, and the lane."""
-
-    polygon: shapely.Polygon
-    control: str
-    lane: int
 
 
 def signal_control(signal: Signal) -> str | None:
@@ -78,7 +70,7 @@ def stop_lines(
     shapes: Shapes,
     controls: Sequence[frozenset[str]],  # what governs each connector
     polygons: Sequence[shapely.Polygon],  # of the lanes
-) -> list[StopLine]:
+) -> list[StopArea]:
     """One stop line per lane that ends at a controlled or marked junction (nuPlan rule 506)."""
     by_lane: dict[int, set[str]] = {}
     for connector, governed in zip(graph.connectors, controls, strict=True):
@@ -100,7 +92,7 @@ def stop_lines(
             box = shapely.intersection(line, polygons[lane])
         if (found or near) and (polygon := largest_part(box)).area > 0.01:
             control = next((c for c in (LIGHT, STOP, YIELD) if c in found), STOP)
-            lines.append(StopLine(polygon, control, lane))
+            lines.append(StopArea(polygon, STOP_KINDS[control], lane))
     return lines
 
 

@@ -35,8 +35,9 @@ class LaneKey(NamedTuple):
 class SectionBorders:
     """Borders of all lanes of a section at K places."""
 
-    inner: dict[int, FloatArray]  # per lane, (K,) distance t of the border next to the centre [m]
-    outer: dict[int, FloatArray]  # per lane, (K,) distance t of the other border [m]
+    # per lane, (K,) distances t, or (K, 2) points [m]
+    inner: dict[int, FloatArray]  # of the border next to the centre
+    outer: dict[int, FloatArray]  # of the other border
 
 
 def evaluate_cubics(records: FloatArray, s: FloatArray, look_up: FloatArray) -> FloatArray:

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import shapely
 
-from shiftsim.data.maps.builder import PASS_THROUGH, BuiltMap, MapBuilder, Pairs
+from shiftsim.data.maps.builder import PASS_THROUGH, BuiltMap, MapBuilder, Pairs, StopArea
 from shiftsim.data.maps.opendrive import areas, control, records
-from shiftsim.data.maps.opendrive.control import LIGHT, STOP, TOWN, YIELD
+from shiftsim.data.maps.opendrive.control import LIGHT, STOP, TOWN
 from shiftsim.data.maps.opendrive.curves import ReferenceLine, length_error, total_turn
 from shiftsim.data.maps.opendrive.graph import (
     Connector,
@@ -29,7 +29,6 @@ from shiftsim.world.build import AreaSpec
 from shiftsim.world.map import VectorMap
 from shiftsim.world.ranges import MAP_EXTENT, require
 
-STOP_KINDS = {LIGHT: 2, STOP: 1, YIELD: 4}  # kinds of stop polygons
 GAP_NOTED, GAP_SERIOUS = 0.01, 0.5  # m
 MAX_LENGTH_ERROR = 3.0  # as a share; a cubic that far from its stated length is nonsense
 MAX_TURN = 3 * np.pi  # rad in one geometry; no road winds further within its plane
@@ -203,7 +202,6 @@ class _RoadMapBuilder(MapBuilder[LaneSegment]):
         self.controls = control.connector_controls(od, graph)
         self.lights = ["" if LIGHT in found else None for found in self.controls]
         self.stop_signs = [STOP in found for found in self.controls]
-        self.stops: list[control.StopLine] = []
 
     def connector_borders(self, connector: Connector) -> tuple[FloatArray, FloatArray]:
         lanes = self.graph.lanes
@@ -228,15 +226,14 @@ class _RoadMapBuilder(MapBuilder[LaneSegment]):
         one, other = (lane.segments[0].key.lane for lane in (left, right))
         return abs(one - other) - (1 if one * other < 0 else 0) == 1
 
-    def stop_areas(self, lanes: Sequence[shapely.Polygon]) -> list[tuple[shapely.Polygon, int]]:
-        self.stops = control.stop_lines(self.od, self.graph, self.shapes, self.controls, lanes)
-        return [(stop.polygon, STOP_KINDS[stop.control]) for stop in self.stops]
+    def stop_areas(self, lanes: Sequence[shapely.Polygon]) -> list[StopArea]:
+        return control.stop_lines(self.od, self.graph, self.shapes, self.controls, lanes)
 
     def stops_of(self, number: int, before: FloatArray, line: FloatArray) -> list[int]:
         connector = self.graph.connectors[number]
         if not connector.junctions:
             return []
-        return [i for i, stop in enumerate(self.stops) if stop.lane == connector.source]
+        return [i for i, stop in enumerate(self.stops) if stop.before == connector.source]
 
     def groups(self, connectors: Sequence[shapely.Polygon]) -> IntArray:
         levels = self._levels(self.graph.connectors, connectors)
@@ -249,15 +246,15 @@ class _RoadMapBuilder(MapBuilder[LaneSegment]):
     ) -> dict[str, Sequence[shapely.Polygon]]:
         other = areas.lane_areas(self.od, self.shapes)
         spaces = areas.parking_spaces(self.od, self.shapes)
-        car_parks = areas.merge_areas([*other.parking, *spaces], 0.5)
+        car_parks = areas.merge_areas([*other["parking"], *spaces], 0.5)
         segments = [segment for segment in self.graph.dropped if segment.length > 0.01]
         dropped = [lane_polygon(*self.shapes.borders(segment)) for segment in segments]
         inner = [spec.polygon for spec in intersections if spec.kind != PASS_THROUGH]
         return {
             "crosswalks": areas.crosswalk_polygons(self.od, self.shapes),
-            "walkways": areas.merge_areas(other.walked, 0.05),
+            "walkways": areas.merge_areas(other["walked"], 0.05),
             "car_parks": car_parks,
             "drivable_areas": areas.drivable_tiles(
-                [*edges, *inner, *other.paved, *car_parks, *dropped]
+                [*edges, *inner, *other["paved"], *car_parks, *dropped]
             ),
         }

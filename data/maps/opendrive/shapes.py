@@ -7,7 +7,7 @@ lanes were joined, evenly in arc length, and small jumps between pieces are spre
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -17,7 +17,7 @@ from shapely.ops import substring
 
 from shiftsim.data.maps.opendrive.curves import ReferenceLine
 from shiftsim.data.maps.opendrive.graph import LaneSegment
-from shiftsim.data.maps.opendrive.lanes import BEFORE_END, LaneKey, section_borders
+from shiftsim.data.maps.opendrive.lanes import BEFORE_END, LaneKey, SectionBorders, section_borders
 from shiftsim.data.maps.opendrive.records import OpenDrive, Road
 from shiftsim.data.polygons import largest_part
 from shiftsim.kernels import FloatArray, IntArray
@@ -37,15 +37,6 @@ _FOLD, _ROUNDING = 2.0, 2.0  # rad of turn where a line runs back, and m about a
 _NARROW = 2.5  # m, nuPlan rule 511: connectors below it are widened
 
 
-@dataclass(frozen=True)
-class SectionShape:
-    """Borders of one lane section at common places."""
-
-    s: FloatArray  # (K,) places on the road, ascending [m]
-    inner: dict[int, FloatArray]  # per lane, (K, 2) border next to the centre [m]
-    outer: dict[int, FloatArray]  # per lane, (K, 2) other border [m]
-
-
 class Shapes:
     """Samples the lanes of a file; sections are evaluated once."""
 
@@ -53,7 +44,7 @@ class Shapes:
         self._od = od
         self._lines = {road.id: ReferenceLine(road.geometries) for road in od.roads.values()}
         self._stops: dict[tuple[str, int], set[float]] = defaultdict(set)
-        self._sections: dict[tuple[str, int], SectionShape] = {}
+        self._sections: dict[tuple[str, int], tuple[FloatArray, SectionBorders]] = {}
         for piece in pieces:
             self._stops[piece.key.road, piece.key.section].update((piece.begin, piece.end))
 
@@ -61,8 +52,8 @@ class Shapes:
         """Reference line of a road."""
         return self._lines[road]
 
-    def section(self, road: str, section: int) -> SectionShape:
-        """Borders of all lanes of a section."""
+    def section(self, road: str, section: int) -> tuple[FloatArray, SectionBorders]:
+        """Places along a section (K,), and there points (K, 2) of the borders of its lanes [m]."""
         key = road, section
         if key not in self._sections:
             place = self._od.roads[road], section, self._lines[road]
@@ -71,13 +62,10 @@ class Shapes:
 
     def borders(self, piece: LaneSegment) -> tuple[FloatArray, FloatArray]:
         """(K, 2) left and right border of a piece in the direction of travel [m]."""
-        shape = self.section(piece.key.road, piece.key.section)
+        s, shape = self.section(piece.key.road, piece.key.section)
         low, high = min(piece.begin, piece.end), max(piece.begin, piece.end)
-        inside = (shape.s >= low - 1e-9) & (shape.s <= high + 1e-9)
-        inner, outer = (
-            shape.inner[piece.key.lane][inside],
-            shape.outer[piece.key.lane][inside],
-        )
+        inside = (s >= low - 1e-9) & (s <= high + 1e-9)
+        inner, outer = (side[piece.key.lane][inside] for side in (shape.inner, shape.outer))
         forward = piece.end >= piece.begin
         if not forward:
             inner, outer = inner[::-1], outer[::-1]
@@ -295,7 +283,7 @@ def join_lines(lines: Sequence[FloatArray]) -> FloatArray:
 
 def _sample_section(
     road: Road, section: int, line: ReferenceLine, stops: set[float]
-) -> SectionShape:
+) -> tuple[FloatArray, SectionBorders]:
     begin, end = road.sections[section].s, road.section_end(section)
     s = np.array(sorted({begin, end, *stops, *_breakpoints(road, section, begin, end)}))
     steps = np.maximum(np.ceil(np.diff(s) / _MAX_STEP).astype(np.int64), 1)
@@ -320,14 +308,16 @@ def _sample_section(
             break
         s = np.sort(np.concatenate([s, middles[bad]]))
         shape = _evaluate_section(road, section, line, s)
-    return shape
+    return s, shape
 
 
-def _evaluate_section(road: Road, section: int, line: ReferenceLine, s: FloatArray) -> SectionShape:
+def _evaluate_section(
+    road: Road, section: int, line: ReferenceLine, s: FloatArray
+) -> SectionBorders:
     borders, poses = section_borders(road, section, s, repair=True), line.evaluate(s)
     sides = borders.inner, borders.outer
     points = {id(t): poses.offset(t) for side in sides for t in side.values()}
-    return SectionShape(s, *({n: points[id(t)] for n, t in side.items()} for side in sides))
+    return SectionBorders(*({n: points[id(t)] for n, t in side.items()} for side in sides))
 
 
 def _breakpoints(road: Road, section: int, begin: float, end: float) -> list[float]:
