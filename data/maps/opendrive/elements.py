@@ -1,5 +1,6 @@
 """Elements of an OpenDRIVE file: numbers, with a count of what is wrong, objects and signals."""
 
+import math
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -129,7 +130,7 @@ class Reader:
         """
         values = [self.number(element, name, may_be_any=is_crumb) for name in names]
         allowed = [OPENDRIVE[f"{element.tag} {name}"] for name in names]
-        fits = [a.holds(v) or not np.isfinite(v) for a, v in zip(allowed, values, strict=True)]
+        fits = [a.holds(v) or not math.isfinite(v) for a, v in zip(allowed, values, strict=True)]
         return values, fits
 
 

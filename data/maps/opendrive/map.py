@@ -62,11 +62,11 @@ def build_road_map(
     warnings = Counter(od.warnings)
     placed = _prepare(od, warnings)
     graph = build_lane_graph(placed, warnings)
-    shapes = _shapes_of(placed, graph)
+    shapes = Shapes(placed, graph)
     graph, crossings = cut_crossings(placed, graph, shapes)
     if crossings:
         warnings["lanes that cross without a junction, made an intersection"] += crossings
-        shapes = _shapes_of(placed, graph)
+        shapes = Shapes(placed, graph)
     builder = _RoadMapBuilder(placed, graph, shapes, warnings, country)
     built = builder.build(name, epsg=epsg, offset=np.array(offset))
     return built.road, built
@@ -183,12 +183,6 @@ def _note_lanes(road: records.Road, warnings: Counter[str]) -> None:
                 warnings["lane of unknown type left out"] += 1
             if border_is_mirrored(lane):
                 warnings["border of a right lane given on the left, mirrored"] += 1
-
-
-def _shapes_of(od: OpenDrive, graph: Graph) -> Shapes:
-    segments = [segment for lane in graph.lanes for segment in lane.segments]
-    segments += [segment for connector in graph.connectors for segment in connector.segments]
-    return Shapes(od, [*segments, *graph.dropped])
 
 
 class _RoadMapBuilder(MapBuilder[LaneSegment]):

@@ -6,9 +6,9 @@ away from the longer lane (nuPlan rule 505). Lanes on different levels stay as t
 """
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -127,102 +127,91 @@ def cut_crossings(od: OpenDrive, graph: Graph, shapes: Shapes) -> tuple[Graph, i
             along = points.distance[points.nearest(corners)]
             span = float(along.min()) - _MARGIN, float(along.max()) + _MARGIN
             intervals[graph.lanes[lane].block].append(span)
-    return (_Cutter(graph, intervals).cut() if crossings else graph), crossings
+    return (_cut_graph(graph, intervals) if crossings else graph), crossings
 
 
-class _Cutter:
-    """Cuts roadblocks at intervals; what lies in the intervals becomes connectors."""
+class _Cut(NamedTuple):
+    """What becomes of a lane: lanes that are left of it, and what lies in crossings."""
 
-    def __init__(self, graph: Graph, intervals: dict[int, list[tuple[float, float]]]) -> None:
-        self.old, self.intervals = graph, intervals
-        self.blocks: dict[tuple[int, int], int] = {}
-        self.lanes: list[Lane] = []
-        self.inner: list[Connector] = []
-        self.ends: dict[int, tuple[int, int]] = {}  # first and last new lane of an old one
-        self.lead: dict[int, list[LaneSegment]] = {}  # pieces that go to the connectors before
-        self.trail: dict[int, list[LaneSegment]] = {}
-        self.whole: dict[int, list[LaneSegment]] = {}  # lanes that vanish into connectors
-        self.onward: dict[int, list[Connector]] = defaultdict(list)
-        self.dropped = list(graph.dropped)
+    lanes: list[tuple[int, list[LaneSegment]]]  # which part of its roadblock each is, and segments
+    # before, between and after these lanes; all of the lane where none is left
+    crossed: list[list[LaneSegment]]
 
-    def cut(self) -> Graph:
-        """The graph after all cuts."""
-        for number, lane in enumerate(self.old.lanes):
-            self._cut_lane(number, lane)
-        outer = self._outer_connectors()
-        order = sorted(range(len(self.lanes)), key=lambda i: (self.lanes[i].block, i))
-        place = {old: new for new, old in enumerate(order)}
-        connectors = [
-            replace(c, source=place[c.source], target=place[c.target])
-            for c in (*outer, *self.inner)
-        ]
-        return Graph([self.lanes[i] for i in order], connectors, self.dropped)
 
-    def _cut_lane(self, number: int, lane: Lane) -> None:
-        length = sum(piece.length for piece in lane.segments)
-        spans = _merge(self.intervals.get(lane.block, []), length)
-        stops = [0.0, *(stop for span in spans for stop in span), length]
-        free = [
-            (part, begin, end)
-            for part, (begin, end) in enumerate(zip(stops[::2], stops[1::2], strict=True))
-            if end > begin
-        ]
-        if not free:
-            self.whole[number] = lane.segments
-            return
-        first = len(self.lanes)
-        for part, begin, end in free:
-            block = self.blocks.setdefault((lane.block, part), len(self.blocks))
-            pieces = _pieces_between(lane.segments, begin, end) if spans else lane.segments
-            self.lanes.append(Lane(pieces, block, lane.index))
-        for k, ((_, _, begin), (part, end, _)) in enumerate(pairwise(free)):
+def _cut_lane(lane: Lane, spans: Sequence[tuple[float, float]]) -> _Cut:
+    length = sum(piece.length for piece in lane.segments)
+    spans = _merge(spans, length)
+    if not spans:
+        return _Cut([(0, lane.segments)], [[], []])
+    stops = [0.0, *(stop for span in spans for stop in span), length]
+    parts = enumerate(zip(stops[::2], stops[1::2], strict=True))
+    free = [(part, begin, end) for part, (begin, end) in parts if end > begin]
+    if not free:
+        return _Cut([], [lane.segments])
+    lanes = [(part, _pieces_between(lane.segments, *ends)) for part, *ends in free]
+    begins, ends = [0.0, *(end for *_, end in free)], [*(begin for _, begin, _ in free), length]
+    gaps = zip(begins, ends, strict=True)
+    return _Cut(lanes, [_pieces_between(lane.segments, *gap) for gap in gaps])
+
+
+def _cut_graph(graph: Graph, intervals: dict[int, list[tuple[float, float]]]) -> Graph:
+    """The graph with its roadblocks cut at intervals; what lies in them becomes connectors."""
+    cuts = [_cut_lane(lane, intervals.get(lane.block, [])) for lane in graph.lanes]
+    blocks: dict[tuple[int, int], int] = {}
+    lanes: list[Lane] = []
+    inner: list[Connector] = []
+    ends: dict[int, tuple[int, int]] = {}  # first and last new lane of an old one
+    for number, (lane, cut) in enumerate(zip(graph.lanes, cuts, strict=True)):
+        first = len(lanes)
+        for part, pieces in cut.lanes:
+            block = blocks.setdefault((lane.block, part), len(blocks))
+            lanes.append(Lane(pieces, block, lane.index))
+        for k, ((part, _), pieces) in enumerate(zip(cut.lanes[1:], cut.crossed[1:], strict=False)):
             label = frozenset({f"crossing before part {part} of block {lane.block}"})
-            pieces = _pieces_between(lane.segments, begin, end)
-            self.inner.append(Connector(pieces, first + k, first + k + 1, label))
-        self.ends[number] = first, len(self.lanes) - 1
-        self.lead[number] = _pieces_between(lane.segments, 0.0, free[0][1])
-        self.trail[number] = _pieces_between(lane.segments, free[-1][2], length)
+            inner.append(Connector(pieces, first + k, first + k + 1, label))
+        if cut.lanes:
+            ends[number] = first, len(lanes) - 1
+    outer = [
+        replace(connector, source=ends[connector.source][1], target=ends[connector.target][0])
+        for connector in _outer_connectors(graph.connectors, cuts)
+    ]
+    sources, targets = {c.source for c in outer}, {c.target for c in outer}
+    dropped = list(graph.dropped)  # part of the drivable area in any case
+    for number, (first, last) in ends.items():
+        dropped += cuts[number].crossed[0] if first not in targets else []
+        dropped += cuts[number].crossed[-1] if last not in sources else []
+    dropped += [piece for cut in cuts if not cut.lanes for piece in cut.crossed[0]]
+    order = sorted(range(len(lanes)), key=lambda i: (lanes[i].block, i))
+    place = {old: new for new, old in enumerate(order)}
+    connectors = [
+        replace(c, source=place[c.source], target=place[c.target]) for c in (*outer, *inner)
+    ]
+    return Graph([lanes[i] for i in order], connectors, dropped)
 
-    def _outer_connectors(self) -> list[Connector]:
-        """Connectors of the old graph, longer where lanes were cut at their ends."""
-        for connector in self.old.connectors:
-            self.onward[connector.source].append(connector)
-        out: list[Connector] = []
-        for connector in self.old.connectors:
-            if connector.source not in self.whole:
-                pieces = [*self.trail[connector.source], *connector.segments]
-                out += self._extend(connector, pieces, connector.junctions, ())
-        sources, targets = {c.source for c in out}, {c.target for c in out}
-        for number, (first, last) in self.ends.items():
-            self.dropped += self.lead[number] if first not in targets else []
-            self.dropped += self.trail[number] if last not in sources else []
-        for pieces in self.whole.values():
-            self.dropped += pieces  # part of the drivable area in any case
-        return out
 
-    def _extend(
-        self,
-        connector: Connector,
-        pieces: list[LaneSegment],
-        junctions: frozenset[str],
-        passed: tuple[int, ...],
-    ) -> list[Connector]:
+def _outer_connectors(connectors: Sequence[Connector], cuts: Sequence[_Cut]) -> Iterator[Connector]:
+    """Connectors between lanes that are left, longer where these were cut at their ends."""
+    onward: dict[int, list[Connector]] = defaultdict(list)
+    for connector in connectors:
+        onward[connector.source].append(connector)
+
+    def extend(connector: Connector, passed: tuple[int, ...] = ()) -> Iterator[Connector]:
         """A connector up to the next lane that is left, through lanes that vanished."""
-        target = passed[-1] if passed else connector.target
-        if target not in self.whole:
-            source = self.ends[connector.source][1]
-            pieces = [*pieces, *self.lead[target]]
-            return [Connector(pieces, source, self.ends[target][0], junctions)]
-        found = []
-        for following in self.onward[target]:
+        cut, pieces, lane = cuts[connector.target], connector.segments, connector.target
+        if cut.lanes:
+            yield replace(connector, segments=[*pieces, *cut.crossed[0]])
+            return
+        for following in onward[lane]:
             if following.target not in passed and len(passed) < _MAX_VANISHED:
-                found += self._extend(
-                    connector,
-                    [*pieces, *self.whole[target], *following.segments],
-                    junctions | following.junctions | {f"crossing over lane {target}"},
-                    (*passed, following.target),
-                )
-        return found
+                label = connector.junctions | following.junctions | {f"crossing over lane {lane}"}
+                longer = [*pieces, *cut.crossed[0], *following.segments]
+                longest = Connector(longer, connector.source, following.target, label)
+                yield from extend(longest, (*passed, following.target))
+
+    for connector in connectors:
+        if cuts[connector.source].lanes:
+            pieces = [*cuts[connector.source].crossed[-1], *connector.segments]
+            yield from extend(replace(connector, segments=pieces))
 
 
 def _merge(spans: Sequence[tuple[float, float]], length: float) -> list[tuple[float, float]]:

@@ -6,9 +6,9 @@ lanes were joined, evenly in arc length, and small jumps between pieces are spre
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 import shapely
@@ -16,7 +16,7 @@ from shapely.geometry.polygon import orient
 from shapely.ops import substring
 
 from shiftsim.data.maps.opendrive.curves import ReferenceLine
-from shiftsim.data.maps.opendrive.graph import LaneSegment
+from shiftsim.data.maps.opendrive.graph import Graph, LaneSegment
 from shiftsim.data.maps.opendrive.lanes import BEFORE_END, LaneKey, SectionBorders, section_borders
 from shiftsim.data.maps.opendrive.records import OpenDrive, Road
 from shiftsim.data.polygons import largest_part
@@ -40,12 +40,13 @@ _NARROW = 2.5  # m, nuPlan rule 511: connectors below it are widened
 class Shapes:
     """Samples the lanes of a file; sections are evaluated once."""
 
-    def __init__(self, od: OpenDrive, pieces: Iterable[LaneSegment]) -> None:
+    def __init__(self, od: OpenDrive, graph: Graph) -> None:
         self._od = od
         self._lines = {road.id: ReferenceLine(road.geometries) for road in od.roads.values()}
         self._stops: dict[tuple[str, int], set[float]] = defaultdict(set)
         self._sections: dict[tuple[str, int], tuple[FloatArray, SectionBorders]] = {}
-        for piece in pieces:
+        chains = [edge.segments for edge in (*graph.lanes, *graph.connectors)]
+        for piece in chain(*chains, graph.dropped):
             self._stops[piece.key.road, piece.key.section].update((piece.begin, piece.end))
 
     def line(self, road: str) -> ReferenceLine:
