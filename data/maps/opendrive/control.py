@@ -52,7 +52,7 @@ def connector_controls(od: OpenDrive, graph: Graph) -> list[frozenset[str]]:
         places = [*((piece, np.inf) for piece in connector.segments), (last, _APPROACH)]
         found = set[str | None]()
         for piece, reach in places if connector.junctions else ():
-            side = "+" if piece.end >= piece.begin else "-"
+            side = "+" if piece.is_forward else "-"
             found |= {
                 signal_control(known.get(signal.id, signal))
                 for signal in od.roads[piece.key.road].signals
@@ -129,7 +129,7 @@ def speed_limits(
     road = od.roads[segment.key.road]
     start = road.sections[segment.key.section].s
     lane = road.sections[segment.key.section].lanes[segment.key.lane]
-    low, high = min(segment.begin, segment.end), max(segment.begin, segment.end)
+    low, high = segment.span
     places = [start + r.s for r in lane.speeds] + [t.s for t in road.types]
     places += [signal.s for signal in road.signals]
     for begin, end in pairwise(sorted({low, high, *(s for s in places if low < s < high)})):
@@ -154,7 +154,7 @@ def _limit_at(road: Road, piece: LaneSegment, s: float, country: str) -> float |
 
 def _signal_limit(road: Road, piece: LaneSegment, s: float) -> float | None:
     """Limit of the last sign that traffic has passed on this road."""
-    forward = piece.end >= piece.begin
+    forward = piece.is_forward
     passed = [
         (signal.s, limit)
         for signal in road.signals

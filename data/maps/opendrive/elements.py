@@ -130,7 +130,9 @@ class Reader:
         """
         values = [self.number(element, name, may_be_any=is_crumb) for name in names]
         allowed = [OPENDRIVE[f"{element.tag} {name}"] for name in names]
-        fits = [a.holds(v) or not math.isfinite(v) for a, v in zip(allowed, values, strict=True)]
+        fits = [
+            bool(a.holds(v)) or not math.isfinite(v) for a, v in zip(allowed, values, strict=True)
+        ]
         return values, fits
 
 

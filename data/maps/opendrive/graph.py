@@ -42,6 +42,16 @@ class LaneSegment:
         """Length along the reference line [m]."""
         return abs(self.end - self.begin)
 
+    @property
+    def span(self) -> tuple[float, float]:
+        """Where it lies on its road, from and to [m]."""
+        return min(self.begin, self.end), max(self.begin, self.end)
+
+    @property
+    def is_forward(self) -> bool:
+        """Whether travel follows the road."""
+        return self.end >= self.begin
+
     def split(self, at: float) -> tuple["LaneSegment", "LaneSegment"]:
         """The parts before and after a distance from where travel enters [m]."""
         place = float(self.begin + np.sign(self.end - self.begin) * at)
@@ -88,7 +98,7 @@ class _Builder:
             if source in self.nodes and target in self.nodes:
                 self.topology.join(source, target)
         self._infer_links()
-        self._note_touching(self._infer_road_links())
+        self._infer_road_links()
         for key in sorted(narrow):
             self._link_through(key)
         self.topology.drop_wide_gaps(self.ends.__getitem__, SNAP_GAP)
@@ -153,54 +163,45 @@ class _Builder:
         if inferred:
             self.warnings["lane link missing between sections, inferred"] += inferred
 
-    def _infer_road_links(self) -> list[tuple[LaneKey, LaneKey]]:
+    def _infer_road_links(self) -> None:
         """Links to a linked road that no lane tells of, where lanes touch.
 
-        Returns those of all lanes that end where another begins, but that nothing links.
+        Lanes that end where another begins, but that nothing links, are counted.
         """
         loose = [key for key in self.nodes if not self.after[key]]
-        first = [key for key in self.nodes if not self._told(key, entry=True)]
+        first = [key for key in self.nodes if not self._beyond(key, entry=True)[0]]
         if not loose or not first:
-            return []
+            return
         starts = shapely.STRtree(shapely.points([self.ends[key][0].mean(axis=0) for key in first]))
         places = shapely.points([self.ends[key][1].mean(axis=0) for key in loose])
         touching = []
         for i, j in starts.query(places, "dwithin", INFER_GAP).T.tolist():
             source, target = loose[i], first[j]
             turned = np.abs(self.ends[source][1] - self.ends[target][0]).max() >= INFER_GAP
-            if turned or source.road == target.road or self._told(source, entry=False):
+            is_told, onward = self._beyond(source, entry=False)
+            if turned or source.road == target.road or is_told:
                 continue
-            if target.road in self._linked(source, False) or source.road in self._linked(
-                target, True
-            ):
+            if onward == target.road or self._beyond(target, entry=True)[1] == source.road:
                 self.topology.join(source, target)
                 self.warnings["lane link missing between linked roads, inferred"] += 1
             elif not self.before[target]:
                 touching.append((source, target))
-        return touching
-
-    def _note_touching(self, pairs: Sequence[tuple[LaneKey, LaneKey]]) -> None:
-        if pairs:
-            names = " and ".join(repr(key.road) for key in pairs[0])
+        if touching:
+            names = " and ".join(repr(key.road) for key in touching[0])
             what = f"lanes that touch end to end without a link, the first of roads {names}"
-            self.warnings[what] += len(pairs)
+            self.warnings[what] += len(touching)
 
-    def _at_start(self, key: LaneKey, entry: bool) -> bool:
-        """Whether travel enters (or leaves) a lane at the start of its section."""
-        return self._is_forward(key) == entry
+    def _beyond(self, key: LaneKey, *, entry: bool) -> tuple[bool, str | None]:
+        """What the file says of the place where travel enters (or leaves) a lane.
 
-    def _told(self, key: LaneKey, entry: bool) -> bool:
-        """Whether the file names a lane before (or after) this one, or it ends within its road."""
-        road, at_start = self.od.roads[key.road], self._at_start(key, entry)
+        Whether it names a lane there, or the place lies within its road; and the road linked there.
+        """
+        road, at_start = self.od.roads[key.road], self._is_forward(key) == entry
         lane = road.sections[key.section].lanes[key.lane]
         last = 0 if at_start else len(road.sections) - 1
-        return key.section != last or bool(lane.predecessors if at_start else lane.successors)
-
-    def _linked(self, key: LaneKey, entry: bool) -> list[str]:
-        """The road that its road is linked to where travel enters (or leaves) a lane, if any."""
-        road = self.od.roads[key.road]
-        link = road.predecessor if self._at_start(key, entry) else road.successor
-        return [link.id] if link is not None and link.kind == "road" else []
+        is_told = key.section != last or bool(lane.predecessors if at_start else lane.successors)
+        link = road.predecessor if at_start else road.successor
+        return is_told, link.id if link is not None and link.kind == "road" else None
 
     def _is_forward(self, key: LaneKey) -> bool:
         return runs_forward(self.od.roads[key.road], key.section, key.lane)

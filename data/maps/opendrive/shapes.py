@@ -45,7 +45,8 @@ class Shapes:
         self._lines = {road.id: ReferenceLine(road.geometries) for road in od.roads.values()}
         self._stops: dict[tuple[str, int], set[float]] = defaultdict(set)
         self._sections: dict[tuple[str, int], tuple[FloatArray, SectionBorders]] = {}
-        chains = [edge.segments for edge in (*graph.lanes, *graph.connectors)]
+        chains = [lane.segments for lane in graph.lanes]
+        chains += [connector.segments for connector in graph.connectors]
         for piece in chain(*chains, graph.dropped):
             self._stops[piece.key.road, piece.key.section].update((piece.begin, piece.end))
 
@@ -64,13 +65,12 @@ class Shapes:
     def borders(self, piece: LaneSegment) -> tuple[FloatArray, FloatArray]:
         """(K, 2) left and right border of a piece in the direction of travel [m]."""
         s, shape = self.section(piece.key.road, piece.key.section)
-        low, high = min(piece.begin, piece.end), max(piece.begin, piece.end)
+        low, high = piece.span
         inside = (s >= low - 1e-9) & (s <= high + 1e-9)
         inner, outer = (side[piece.key.lane][inside] for side in (shape.inner, shape.outer))
-        forward = piece.end >= piece.begin
-        if not forward:
+        if not piece.is_forward:
             inner, outer = inner[::-1], outer[::-1]
-        return (inner, outer) if (piece.key.lane < 0) == forward else (outer, inner)
+        return (inner, outer) if (piece.key.lane < 0) == piece.is_forward else (outer, inner)
 
     def joined_borders(self, segments: Sequence[LaneSegment]) -> tuple[FloatArray, FloatArray]:
         """Borders of a chain of segments; ends that nearly meet become one vertex."""
@@ -79,7 +79,7 @@ class Shapes:
 
     def centers(self, piece: LaneSegment, s: FloatArray) -> FloatArray:
         """(K, 2) points midway between the borders at `s` (K,) [m]."""
-        low, high = min(piece.begin, piece.end), max(piece.begin, piece.end)
+        low, high = piece.span
         return self._middles(piece.key, np.clip(s, low, max(high - BEFORE_END, low)))
 
     def _middles(self, key: LaneKey, s: FloatArray) -> FloatArray:
@@ -109,15 +109,13 @@ class Shapes:
     def _without_steps(self, piece: LaneSegment) -> list[LaneSegment]:
         """The piece, cut where the middle of the lane jumps."""
         road = self._od.roads[piece.key.road]
-        low, high = min(piece.begin, piece.end), max(piece.begin, piece.end)
+        low, high = piece.span
         places = np.array(_breakpoints(road, piece.key.section, low, high))
         if len(places) == 0:
             return [piece]
         jumps = self._middles(piece.key, places) - self._middles(piece.key, places - BEFORE_END)
         cuts = np.unique(places[np.hypot(*jumps.T) > _STEP]).tolist()
-        stops = [low, *cuts, high]
-        if piece.end < piece.begin:
-            stops.reverse()
+        stops = [low, *cuts, high] if piece.is_forward else [high, *cuts[::-1], low]
         return [replace(piece, begin=a, end=b) for a, b in pairwise(stops)]
 
     def _shifted(self, piece: LaneSegment, shift: tuple[FloatArray, FloatArray]) -> FloatArray:
