@@ -47,7 +47,8 @@ class BuiltMap:
     stacked: frozenset[tuple[str, str]] = frozenset()
 
 
-class StopArea(NamedTuple):
+@dataclass(frozen=True)
+class StopArea:
     """A stop polygon of a source."""
 
     polygon: shapely.Polygon  # its area
