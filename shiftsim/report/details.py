@@ -10,8 +10,14 @@ from shiftsim.edits.sampling import GRADES, graded
 from shiftsim.kernels import BoolArray, FloatArray
 from shiftsim.report.groups import Group, distinct_sets
 from shiftsim.report.paper import traffics
-from shiftsim.report.statistics import FEW_CLUSTERS, cluster_codes, compare, holm
-from shiftsim.report.tables import Cell, Estimate, Number, Table
+from shiftsim.report.statistics import (
+    FEW_CLUSTERS,
+    bootstrap_interval,
+    cluster_codes,
+    compare,
+    holm,
+)
+from shiftsim.report.tables import Cell, Estimate, Interval, Number, Table
 from shiftsim.runs.results import Run
 
 ALL_KINDS = "all"
@@ -142,7 +148,24 @@ def edited_scores(groups: Sequence[Group], *, allow_partial: bool = False) -> li
 
 
 def recorded_score(group: Group, where: BoolArray, others: Sequence[Group]) -> Estimate | None:
-    """The score of recorded scenarios that some (N,) scenarios of a group were made of.
+    """The score of recorded scenarios that some (N,) scenarios of a group were made of."""
+    values = recorded_values(group, where, others)
+    if values is None:
+        return None
+    return Estimate(100.0 * float(values.mean()), None, len(values), len(values))
+
+
+def recorded_interval(group: Group, where: BoolArray, others: Sequence[Group]) -> Interval | None:
+    """The bootstrap interval of `recorded_score` over recordings."""
+    values = recorded_values(group, where, others)
+    if values is None:
+        return None
+    recordings = np.array(group.data.recordings)[where].tolist()
+    return bootstrap_interval(100.0 * values, cluster_codes(recordings))
+
+
+def recorded_values(group: Group, where: BoolArray, others: Sequence[Group]) -> FloatArray | None:
+    """Scores of the recorded scenarios that some (N,) scenarios of a group were made of, in [0, 1].
 
     None where no other group has all of them under the same rules.
     """
@@ -153,9 +176,9 @@ def recorded_score(group: Group, where: BoolArray, others: Sequence[Group]) -> E
     for other in others:
         place = {token: i for i, token in enumerate(other.data.tokens)}
         if not other.data.edits and _driven_as(other) == wanted and set(bases) <= set(place):
-            values = other.column()[[place[token] for token in bases]]
+            values: FloatArray = other.column()[[place[token] for token in bases]]
             if len(values) and np.isfinite(values).all():
-                return Estimate(100.0 * float(values.mean()), None, len(values), len(values))
+                return values
     return None
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from shiftsim.edits.sampling import GRADES, graded
 from shiftsim.kernels import BoolArray
-from shiftsim.report.details import recorded_score
+from shiftsim.report.details import recorded_interval, recorded_score
 from shiftsim.report.groups import COLUMNS, DataSet, Group, distinct_sets
 from shiftsim.report.palette import Style, dashes, new_figure, planner_styles, save_picture
 from shiftsim.report.paper import traffics
@@ -132,11 +132,20 @@ def _robustness(
                 is_partial = any(cell and cell.label for cell in found.values())
                 label = f"{planner} (partial)" if is_partial else planner
                 # shifted a little, so that error bars do not cover those of others
-                _curve(axes, label, cells, 0.02 * (place - len(planners) / 2), styles[planner])
+                shift = 0.02 * (place - len(planners) / 2)
+                _curve(axes, label, cells, shift, styles[planner])
+                for group in groups:
+                    mine = (group.traffic, group.planner) == (traffic, planner)
+                    if mine and group.noise in names and (of := score_interval(group)):
+                        look = {"color": styles[planner].colour, "alpha": 0.3, "linewidth": 3.0}
+                        axes.vlines(names.index(group.noise) + shift, of.low, of.high, **look)
         axes.set_xticks(range(len(LEVELS)), LEVELS)
         axes.set_xlabel("strength of the noise", fontsize=8)
         _finish_axes(axes, f"{_KINDS[kind]}, {_TRAFFIC.get(traffic, traffic)}")
-    note = "error bars: standard deviation over seeds; thin line: the clean score"
+    note = (
+        f"n = {len(data.tokens)} scenarios; error bars: standard deviation over seeds; broad bars: "
+        "95 % bootstrap interval over recordings; thin line: the clean score"
+    )
     _finish(figure, data, "Noise robustness", note, {"clean": "none", "under noise": "some"})
     return [Figure(f"robustness_{data.name}", f"Noise robustness on {data.label}", figure)]
 
@@ -169,16 +178,21 @@ def _difficulty(
         parts = [np.array([pair == (kind, grade) for pair in found]) for grade in GRADES]
         for group in (group for group in clean if group.traffic == traffic):
             shift = 0.06 * (planners.index(group.planner) - (len(planners) - 1) / 2)
-            cells = [recorded_score(group, np.array([k == kind for k, _ in found]), groups)]
+            of_kind = np.array([k == kind for k, _ in found])
+            cells = [recorded_score(group, of_kind, groups)]
             cells += [_estimate(group, allow_partial, "cls", where) for where in parts]
             points = {i + shift: cell.mean for i, cell in enumerate(cells) if cell is not None}
+            bars = [recorded_interval(group, of_kind, groups)]
+            bars += [score_interval(group, "cls", where) for where in parts]
             style = styles[group.planner]
             look = {**style.marks("none"), "linestyle": dashes("none"), "linewidth": 1.3}
             axes.plot([*points], [*points.values()], label=_label(group), **look)
-            for x, where in enumerate(parts, 1):
-                if interval := score_interval(group, "cls", where):
+            for x, interval in enumerate(bars):
+                if interval is not None:
                     axes.vlines(x + shift, interval.low, interval.high, color=style.colour)
-        axes.set_xticks(range(1 + len(GRADES)), ["recorded", *GRADES])
+        counts = [np.sum(parts), *map(np.sum, parts)]
+        ticks = [f"{n}\n(n = {c})" for n, c in zip(["recorded", *GRADES], counts, strict=True)]
+        axes.set_xticks(range(1 + len(GRADES)), ticks)
         axes.set_xlim(-0.35, len(GRADES) + 0.35)
         axes.set_xlabel("difficulty of the edit", fontsize=8)
         _finish_axes(axes, f"{kind}, {_TRAFFIC.get(traffic, traffic)}")

@@ -318,7 +318,8 @@ def _data_set(run: Run, known: Sequence[KnownSet]) -> DataSet:
     elif whole is not None and len(tokens) != whole.count:
         suffix = f" ({len(tokens)}/{whole.count})"
     elif whole is None and manifest["config"].get("limit"):
-        suffix = f" (first {len(tokens)})"
+        of = f" of {manifest['split_size']}" if "split_size" in manifest else ""
+        suffix = f" (first {len(tokens)}{of})"
     elif whole is None and split in {one.name for one in known}:
         suffix = " (not the published list)"
     return DataSet(
