@@ -92,8 +92,8 @@ class RunWriter:
         self._linked: dict[Path, Path] = {}
 
     def _read_journal(self) -> None:
-        for number, key, values, has_rollout in self._journal.items():
-            result = TaskResult.from_json(Task(*json.loads(key)), values, self.rollouts)
+        for number, _, rows, has_rollout in self._journal.items():
+            result = TaskResult.from_rows(rows, self.rollouts)
             self._note(result, number, has_rollout=has_rollout)
 
     def _note(self, result: TaskResult, number: int, *, has_rollout: bool) -> None:
@@ -106,8 +106,8 @@ class RunWriter:
 
     def result(self, task: Task) -> TaskResult:
         """What became of a task that has ended, without its rollout."""
-        values = self._journal.values(self.ended[task].number)
-        return TaskResult.from_json(task, values, self.rollouts)
+        rows = self._journal.values(self.ended[task].number)
+        return TaskResult.from_rows(rows, self.rollouts)
 
     def add(self, result: TaskResult) -> None:
         """Put one result on disk; a file of another run that holds its rollout is linked to.
@@ -221,4 +221,4 @@ def _by_scenario(task: Task) -> tuple[str, Task]:
 
 def _entry(result: TaskResult) -> tuple[str, dict[str, Any]]:
     """A result as an entry of the journal, without its rollout."""
-    return json.dumps(result.task), result.to_json()
+    return json.dumps(result.task), result.rows()

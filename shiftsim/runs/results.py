@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 from shiftsim.errors import ConfigError, DataError, listed
 from shiftsim.files import write_text
 from shiftsim.runs.rollouts import Task, complete_rollout, describe
-from shiftsim.runs.rollouts.files import RolloutLocation, RolloutReader
+from shiftsim.runs.rollouts.files import FOLDER, RolloutLocation, RolloutReader
 from shiftsim.runs.tables import LOCATION, OK, damaged, read_table, stored_location
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.scenario import Scenario
@@ -68,7 +68,7 @@ class Run:
             for names in (Task._fields, LOCATION)
         )
         return {
-            Task(*key): stored_location(self.path, *place)
+            Task(*key): stored_location(self.path / FOLDER, *place)
             for key, place in zip(keys, places, strict=True)
         }
 
