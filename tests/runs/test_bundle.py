@@ -111,4 +111,4 @@ def test_half_a_bundle_of_a_killed_process_is_made_anew(finished):
     run, _ = finished
     (run.path / BUNDLE).mkdir()
     assert open_run_store(run).path != run.path / BUNDLE
-    assert bundle_run(run).tokens == run.scores["token"].to_pylist()[:2]
+    assert list(bundle_run(run).tokens) == run.scores["token"].to_pylist()
