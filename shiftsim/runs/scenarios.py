@@ -174,7 +174,8 @@ def select_scenarios(
     name, tokens, held, edited = split.name, split.tokens, set(store.tokens), dict[str, Any]()
     left_out = []
     if default:
-        left_out += [f"{whole - len(tokens)} of {whole} scenarios (--split {store.path.name})"]
+        count = f"{whole - len(tokens)} of {whole} scenarios, not in split {default}"
+        left_out += [f"{count} (--split {store.path.name} takes all)"]
     elif split.name == store.path.name and len(tokens) < whole:
         dropped = whole - len(tokens)
         left_out += [f"{dropped} of {whole} scenarios, dropped by filter or review (--all)"]

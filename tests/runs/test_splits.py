@@ -144,7 +144,8 @@ def test_where_no_split_is_named_the_demo_is_its_own_split(demo, toy):
     found = select_scenarios(RunConfig(**settings), demo)
     assert (found.split, tuple(found.present)) == ("demo-mini", demo.tokens[:2])
     left = len(demo) - 2
-    assert found.left_out == [f"{left} of {len(demo)} scenarios (--split demo)"]
+    words = f"{left} of {len(demo)} scenarios, not in split demo-mini (--split demo takes all)"
+    assert found.left_out == [words]
     whole = select_scenarios(RunConfig(**settings, split="demo"), demo)
     assert (tuple(whole.present), whole.left_out) == (demo.tokens, [])
     assert default_split(open_store(toy)) == ""
