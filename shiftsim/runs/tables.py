@@ -142,17 +142,20 @@ def stored_location(
 def stored_results(run: Path) -> Iterator[TaskResult]:
     """The results that the tables of a run hold, in their order, without those that are missing."""
     found = {name: _rows_by_task(run / f"{name}.parquet") for name in TABLES}
-    for task, tasks in found.pop("tasks"):
-        status = tasks[0]["status"]
-        if status == MISSING:
-            continue
-        rows = {"tasks": tasks, "scores": [], "metrics": []}
-        for name, others in found.items() if status == OK else ():
-            other, rows[name] = next(others, (None, []))
-            if other != task:
-                what = f"the rows of {describe(task)} are missing"
-                raise damaged(run / f"{name}.parquet", what)
-        yield TaskResult.from_rows(rows, run / FOLDER)
+    for task, tasks in found["tasks"]:
+        status, rows = tasks[0]["status"], {"tasks": tasks}
+        for name in ("scores", "metrics"):
+            rows[name] = _next_rows(task, found[name], run / name) if status == OK else []
+        if status != MISSING:
+            yield TaskResult.from_rows(rows, run / FOLDER)
+
+
+def _next_rows(task: Task, rows: Iterator[Any], table: Path) -> list[dict[str, Any]]:
+    found, values = next(rows, (None, []))
+    if found != task:
+        what = f"the rows of {describe(task)} are missing"
+        raise damaged(table.with_suffix(".parquet"), what)
+    return list(values)
 
 
 def _rows_by_task(path: Path) -> Iterator[tuple[Task, list[dict[str, Any]]]]:
