@@ -28,14 +28,13 @@ from shiftsim.runs.edited import EditSet, edits_text, make_edits
 from shiftsim.runs.execute import Progress, execute
 from shiftsim.runs.prepare import RUNS, RunPlan, prepare
 from shiftsim.runs.results import Run, open_run
-from shiftsim.runs.scenarios import open_edits
+from shiftsim.runs.scenarios import default_split, open_edits
 from shiftsim.runs.tables import stored_results
 from shiftsim.sim.traffic import traffic_name
 
 MANIFEST = "bench.json"
 EDITS = "edits.toml"  # what was edited, in the folder of the benchmark
 OWN, EDITED = "own", "edited"  # beginnings of names of runs
-DEFAULT_SPLIT = "demo-mini"  # of the demo store, where nothing is said
 _FORMAT = 1
 
 
@@ -70,10 +69,16 @@ def plan_bench(
     values = dict(settings)
     resumes = values.pop("resume", False)
     modes = [values.pop("traffic")] if values.get("traffic") else list(track.traffic)
-    if "store" not in values and "split" not in values:
-        values |= {"store": DEFAULT_STORE, "split": DEFAULT_SPLIT}
-    values = {"noise": list(track.noise), "seeds": list(track.seeds)} | values
     edits_of = str(values.pop("edits", ""))
+    values = {
+        "noise": list(track.noise),
+        "seeds": list(track.seeds),
+        "store": DEFAULT_STORE,
+    } | values
+    if not values.get("split"):  # the same for recorded and for edited scenarios
+        opened = open_store(str(values["store"]))
+        edits = open_edits(edits_of, opened) if edits_of and track.drawn else None
+        values["split"] = default_split(opened, edits) or opened.path.name
     sets = {OWN: {"thresholds": track.own_thresholds} | values}
     if reference and track.reference is None:
         raise ConfigError(f"the track {track.name} has no published list", hint="leave --val14 out")

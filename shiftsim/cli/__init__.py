@@ -233,6 +233,7 @@ _COMMANDS = {
     "run": "run:run",
     "score": "run:score",
     "merge": "run:merge",
+    "bundle": "run:bundle",
     "bench": "bench:bench",
     "report": "report:report",
     "explain": "report:explain",

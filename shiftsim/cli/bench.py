@@ -30,7 +30,6 @@ save_rollouts allow_partial""".split()
 @cli.with_settings(
     *_SETTINGS,
     store="Own scenarios: name or folder (demo).",
-    split="Name or file (the whole store; demo-mini of the demo).",
     seeds="Only these, such as 0,1; the result is partial.",
     noise="Only these; the result is partial.",
     traffic="Only this mode; the result is partial.",
@@ -111,6 +110,7 @@ def _plan_lines(plan: "Plan") -> "Iterator[str]":
             f"run         {name}: split {run.selection.split}, {plural(found, 'scenario')}, "
             f"traffic {run.config.traffic}, thresholds {run.config.thresholds}"
         )
+        yield from (f"left out    {name}: {words}" for words in run.selection.left_out)
     yield f"noise       {' '.join(config.noise)}   seeds {' '.join(map(str, config.seeds))}"
     if config.limit:
         lists = ", ".join(f"{listed.count} of {listed.name}" for listed in plan.own)

@@ -115,7 +115,7 @@ def sample(
     count: int = Option(100, min=1, help="How many edits."),
     seed: int = Option(0, min=0, help="Of all draws."),
     store: Store = "demo",
-    split: str = Option("", help="Only scenarios of a split. [whole store]"),
+    split: str = Option("", help="Only scenarios of a split. [that of run]"),
     even: bool = Option(False, "--even", help="As many easy, medium and hard ones."),
     out: Path = Option(Path(), "--out", "-o", help="The .toml file. [KIND.toml]"),
 ) -> None:
@@ -123,11 +123,12 @@ def sample(
     from shiftsim.edits.sampling import KINDS, sample_edits
     from shiftsim.runs.avoidable import grade
     from shiftsim.runs.edited import edits_text
-    from shiftsim.runs.scenarios import find_split
+    from shiftsim.runs.scenarios import default_split, find_split
 
     one_of("kind", kind, KINDS)
     opened = cli.open_store(store)
-    tokens = find_split(split, Path(opened.path), opened.tokens).tokens
+    name = split or default_split(opened)
+    tokens = find_split(name, Path(opened.path), opened.tokens).tokens
     read = lru_cache(maxsize=256)(opened.read)
     edits = list(sample_edits(kind, count, seed, tokens, read, grade, even=even))
     path = out if out.suffix else Path(f"{kind}.toml")

@@ -96,7 +96,7 @@ def report(
         if not any(one.name.split("_")[0] == name for one in tables):
             echo(f"no table {name}: these runs hold nothing of it", err=True)
     if kind == "text" and not table:
-        _print_worst(opened.runs, worst)
+        print_worst(opened.runs, worst)
 
 
 def read_tables(
@@ -148,12 +148,13 @@ def _write_pages(
     )
 
 
-def _print_worst(runs: "Sequence[Run]", count: int) -> None:
+def print_worst(runs: "Sequence[Run]", count: int) -> None:
+    """Name the worst scenarios of each run, and of how many they are."""
     from shiftsim.report.scores import worst_rollouts
     from shiftsim.report.words import task_words
 
     for run in runs:
-        rows = worst_rollouts(run, count)
+        rows = [row for row in worst_rollouts(run, count) if row["cls"] < 1.0]
         if rows:
             each = "one per recording and cause, each by its worst rollout"
             of = f"{len(rows)} of {len(set(run.scores['token'].to_pylist()))}"
@@ -183,7 +184,7 @@ def explain(
     if token is None and as_json:
         print_json({run.path.name: worst_rollouts(run, _WORST) for run in runs})
     elif token is None:
-        _print_worst(runs, _WORST)
+        print_worst(runs, _WORST)
         echo(f"\nwhy: shiftsim explain {source} TOKEN")
     if token is None:
         return

@@ -24,6 +24,7 @@ from shiftsim.cli import (
     progress_bar,
     stdout_to_stderr,
 )
+from shiftsim.cli.report import print_worst
 from shiftsim.errors import ConfigError
 from shiftsim.files import DEFAULT_STORE, read_toml, store_path
 from shiftsim.runs.config import default_workers, make_config
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from shiftsim.world.scenario import Scenario
 
 _MAX_NAMED_FAILURES = 5
+_WORST = 3
 _KERNELS_OF_A_RUN = "70 to 160"  # constant-velocity in replayed, PDM-Closed in reactive traffic
 _BEFORE = {
     "new": "nothing there yet",
@@ -214,12 +216,15 @@ def _plan_lines(plan: "RunPlan") -> Iterator[str]:
         if weights := _weights(plan.planners[name].fingerprint):
             yield f"weights     {name}, {weights}"
     yield f"noise       {' '.join(config.noise)}   seeds {' '.join(map(str, config.seeds))}"
+    first = ""
+    if config.limit and config.limit < scenarios.size:
+        first = f", the first of {scenarios.size}"
     yield (
         f"split       {scenarios.split}  {found} of {plural(found + missing, 'scenario')} found"
-        f"   store {plan.store}"
+        f"{first}   store {plan.store}"
     )
-    if scenarios.num_dropped:
-        yield f"filter      {scenarios.num_dropped} dropped scenarios left out (--all keeps them)"
+    for words in scenarios.left_out:
+        yield f"left out    {words}"
     yield (
         f"settings    traffic {config.traffic}   controller {config.controller}"
         f"   thresholds {config.thresholds}"
@@ -268,20 +273,12 @@ def leave_with(finished: "Run", *, allow_partial: bool, as_json: bool) -> None:
 
 
 def _print_results(finished: "Run", *, allow_partial: bool) -> None:
-    from shiftsim.report.scores import failures, score_table, worst_rollouts
-    from shiftsim.report.words import task_words
+    from shiftsim.report.scores import failures, score_table
 
     counts = finished.manifest["counts"]
     echo()
     echo(score_table([finished], allow_partial=allow_partial))
-    worst = [row for row in worst_rollouts(finished, 3) if row["cls"] < 1.0]
-    if worst:
-        words = (
-            f"{row['token']} {task_words(row)} {100.0 * row['cls']:.2f} {row['reason']}"
-            for row in worst
-        )
-        of = len(set(finished.scores["token"].to_pylist()))
-        echo(f" worst {len(worst)} of {plural(of, 'scenario')}: {' · '.join(words)}")
+    print_worst([finished], _WORST)
     lost = failures(finished)
     alike: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for row in lost:
@@ -292,8 +289,9 @@ def _print_results(finished: "Run", *, allow_partial: bool) -> None:
         echo(f" {status}: {first}{more}: {error}")
         if hint:
             echo(f"   hint: {hint}")
-    if (left := len(alike) - _MAX_NAMED_FAILURES) > 0:
-        echo(f" and {plural(left, 'other error')}, which tasks.parquet of the run holds")
+    if len(alike) > _MAX_NAMED_FAILURES:
+        count = f"{_MAX_NAMED_FAILURES} of {len(alike)} different errors"
+        echo(f" these are {count}, all of which tasks.parquet of the run holds")
     if lost:
         echo(
             f" {counts['failed']} failed, {counts['timeout']} timeout, {counts['missing']} missing"
@@ -345,6 +343,27 @@ def merge(
     leave_with(merged, allow_partial=allow_partial, as_json=as_json)
 
 
+def bundle(
+    source: Path = Argument(metavar="RUN", help="A run folder, or that of a benchmark."),
+    store: str | None = Option(None, "--store", "-s", help="Name or folder. [the one of the run]"),
+    as_json: Json = False,
+) -> None:
+    """Copy the scenarios and maps of a finished run into its folder: it needs no store then."""
+    from shiftsim.benchmarks.bench import open_runs
+    from shiftsim.runs.scenarios import bundle_run
+
+    found = [(run.path, bundle_run(run, store)) for run in open_runs([source]).runs]
+    values = [
+        {"run": str(path), "scenarios": len(one.tokens), "maps": len(one.cities)}
+        for path, one in found
+    ]
+    lines = [
+        f" {plural(len(one.tokens), 'scenario')} in {plural(len(one.cities), 'map')} → {one.path}"
+        for _, one in found
+    ]
+    print_result(values, lines, as_json=as_json)
+
+
 @cli.with_settings("workers", "limit")
 def demo(
     out: Path | None = Option(None, help="Folder of the store."),
@@ -365,7 +384,7 @@ def demo(
         return
     if seed is not None:
         raise ConfigError("--seed is of random towns only", hint="say how many with --towns")
-    from shiftsim.data.synthetic.store import DEMO_SPLIT, demo_store
+    from shiftsim.data.synthetic.store import demo_store
 
     folder = out or store_path(DEFAULT_STORE)
     if not folder.exists():
@@ -375,7 +394,6 @@ def demo(
         "planners": ["log-future", "idm", "constant-velocity"],
         "noise": ["none", "ou-high"],
         "store": str(folder) if out else DEFAULT_STORE,
-        "split": DEMO_SPLIT,
         **settings,
     }
     try:

@@ -10,7 +10,7 @@ from typer import Argument, Option, echo
 
 from shiftsim import cli
 from shiftsim.cli import Json, Quiet, new_app, plural, print_json, print_result, progress_bar
-from shiftsim.errors import DataError, one_of
+from shiftsim.errors import one_of
 from shiftsim.files import store_path
 
 if TYPE_CHECKING:
@@ -115,24 +115,12 @@ _DETAILS = {"path_m": "path", "progress_m": "along the route", "max_outside_m": 
 
 def _chosen(store: "ScenarioStore", settings: cli.Settings) -> tuple[str, ...]:
     """The scenarios of a split, or all that review and filter accepted."""
-    from shiftsim.runs.filter import read_filter_results
-    from shiftsim.runs.scenarios import find_split
+    from shiftsim.runs.scenarios import open_split, require_scenarios
 
-    if split := settings.get("split"):
-        tokens = find_split(split, store.path, store.tokens).tokens
-        missing = sorted(set(tokens) - set(store.tokens))
-        if missing:
-            raise DataError(
-                f"split {split!r} needs {len(tokens)} scenarios, the store lacks {len(missing)} of"
-                f" them, such as {missing[0]!r}",
-                hint="name the store that was converted for this split",
-            )
-        return tokens
-    if settings.get("all_scenarios"):
-        return store.tokens
-    verdicts = read_filter_results(store.path, store.hash)
-    usable = store.tokens if verdicts is None else verdicts.accepted
-    return store.reviews.usable(store.tokens, usable)
+    whole = settings.get("all_scenarios", False)
+    split, _ = open_split(store, settings.get("split", ""), whole=whole)
+    require_scenarios(split.name, split.tokens, store.path.name, store.tokens)
+    return split.tokens
 
 
 @cli.with_settings("split", "all_scenarios")

@@ -9,8 +9,14 @@ import pyarrow.compute as pc
 from shiftsim.edits.sampling import GRADES, graded
 from shiftsim.kernels import FloatArray
 from shiftsim.report.groups import Group, by_set, distinct_sets
-from shiftsim.report.statistics import FEW_CLUSTERS, cluster_codes, compare, holm
-from shiftsim.report.tables import Cell, Number, Row, Table
+from shiftsim.report.statistics import (
+    FEW_CLUSTERS,
+    bootstrap_interval,
+    cluster_codes,
+    compare,
+    holm,
+)
+from shiftsim.report.tables import Cell, Interval, Number, Row, Table
 from shiftsim.runs.results import Run
 
 ALL_KINDS = "all"
@@ -116,7 +122,7 @@ def edited_scores(groups: Sequence[Group]) -> list[Table]:
                 grade = difficulties[(kinds == name) | (name == ALL_KINDS)]
                 noise = (group.noise,) if is_noisy else ()
                 count = Number(len(part.data.tokens), 0)
-                recorded = () if data.is_interplan else (recorded_score(part, groups),)
+                recorded = () if data.is_interplan else recorded_score(part, groups)[:1]
                 scores = (part.only(grade == one).estimate() for one in grades)
                 labels = (group.traffic, group.planner, *noise, name or "unknown", count)
                 rows.append((*labels, *recorded, *scores, part.estimate()))
@@ -140,8 +146,8 @@ def edited_scores(groups: Sequence[Group]) -> list[Table]:
     return out
 
 
-def recorded_score(group: Group, others: Sequence[Group]) -> Number | None:
-    """The score of the recorded scenarios that those of a group were made of.
+def recorded_score(group: Group, others: Sequence[Group]) -> tuple[Number | None, Interval | None]:
+    """Score and interval of the recorded scenarios that those of a group were made of.
 
     None where no other group has all of them under the same rules.
     """
@@ -151,10 +157,11 @@ def recorded_score(group: Group, others: Sequence[Group]) -> Number | None:
         place = {token: i for i, token in enumerate(other.data.tokens)}
         is_alike = not other.data.edits and _driven_as(other) == _driven_as(group)
         if bases and is_alike and set(bases) <= set(place):
-            values = other.scenario_means()[[place[token] for token in bases]]
+            values = 100.0 * other.scenario_means()[[place[token] for token in bases]]
             if np.isfinite(values).all():
-                return Number(100.0 * float(values.mean()))
-    return None
+                interval = bootstrap_interval(values, cluster_codes(group.data.recordings))
+                return Number(float(values.mean())), interval
+    return None, None
 
 
 def _driven_as(group: Group) -> tuple[object, ...]:

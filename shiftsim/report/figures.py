@@ -75,7 +75,8 @@ def figures(groups: Sequence[Group]) -> list[Figure]:
         if kinds := {_KINDS[kind]: _levels(kind, shown) for kind in _KINDS if kind in found}:
             labels = ("strength of the noise", "closed-loop score")
             drawn = _scores(shown, kinds, styles, (4.1, 3.3), noise="some", labels=labels)
-            note = "error bars: standard deviation over seeds; thin line: the clean score"
+            bars = f"bars: standard deviation over seeds; without several, {_BARS.split(': ')[1]}"
+            note = f"n = {len(data.tokens)} scenarios; {bars}; thin line: the clean score"
             samples = {"clean": "none", "under noise": "some"}
             _finish(drawn, data, "Noise robustness", note, samples)
             out.append(Figure(f"robustness_{name}", f"Noise robustness on {data.label}", drawn))
@@ -123,28 +124,30 @@ def _difficulties(data: DataSet, groups: Sequence[Group]) -> dict[str, list[_Pla
     kinds, grades = np.array([graded(name) for name in data.types], str).T
 
     def recorded(kind: str) -> _Place:
-        return _Place("recorded", lambda g: (recorded_score(g.only(kinds == kind), groups), None))
+        heading = f"recorded\n(n = {np.count_nonzero(kinds == kind)})"
+        return _Place(heading, lambda group: recorded_score(group.only(kinds == kind), groups))
+
+    def edited(kind: str, grade: str) -> _Place:
+        where = (kinds == kind) & (grades == grade)
+        return _place(f"{grade}\n(n = {np.count_nonzero(where)})", where)
 
     return {
-        kind: [
-            recorded(kind),
-            *(_place(grade, (kinds == kind) & (grades == grade)) for grade in GRADES),
-        ]
+        kind: [recorded(kind), *(edited(kind, grade) for grade in GRADES)]
         for kind in np.unique(kinds[grades != ""]).tolist()
     }
 
 
 def _levels(kind: str, groups: Sequence[Group]) -> list[_Place]:
-    """The places of every level of a noise; the bars are the deviation over the seeds."""
-    scores = {(g.traffic, g.planner, g.noise): g.estimate() for g in groups}
+    """The places of every level of a noise; bars are deviations over seeds, or intervals."""
+    scores = {(g.traffic, g.planner, g.noise): (g.estimate(), score_interval(g)) for g in groups}
 
     def place(level: str) -> _Place:
         noise = level if level == "none" else f"{kind}-{level}"
 
         def score(group: Group) -> tuple[Number | None, Interval | None]:
-            found = scores.get((group.traffic, group.planner, noise))
+            found, interval = scores.get((group.traffic, group.planner, noise), (None, None))
             if found is None or found.value is None or found.std is None:
-                return found, None
+                return found, interval
             return found, Interval(found.value - found.std, found.value + found.std)
 
         return _Place(level, score)

@@ -358,7 +358,8 @@ def _data_set(run: Run, known: Sequence[KnownSet]) -> DataSet:
     elif listed is not None and len(tokens) != listed.count:
         suffix = f" ({len(tokens)}/{listed.count})"
     elif listed is None and manifest["config"].get("limit"):
-        suffix = f" (first {len(tokens)})"
+        of = f" of {manifest['split_size']}" if "split_size" in manifest else ""
+        suffix = f" (first {len(tokens)}{of})"
     elif listed is None and split in {one.name for one in known}:
         suffix = " (not the published list)"
     return DataSet(

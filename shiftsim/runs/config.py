@@ -94,7 +94,7 @@ class RunConfig:
         (0,), "Noise seeds, such as 0,1,2 or 0-2. [0]", parse=parse_seeds
     )
     store: str = setting(DEFAULT_STORE, "Name or folder. [demo]", "--store", "-s")
-    split: str = setting("", "Name or file (.toml, .txt). [whole store]")
+    split: str = setting("", "Name or file (.toml, .txt). [whole store; of demo demo-mini]")
     limit: int = setting(0, "Only the first N scenarios.")
     all_scenarios: bool = setting(False, "Also the scenarios that the filter dropped.", "--all")
     edits: str = setting("", "File (.toml) of edits; only what they make is run.")

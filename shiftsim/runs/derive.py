@@ -38,7 +38,7 @@ def merge_runs(runs: Sequence[Run], *, out: str | None = None, allow_partial: bo
     name = first["run"].removesuffix(f".{first['shard'].replace('/', '-of-')}")
     target = Path(out) if out else runs[0].path.parent / name
     check_target(target, first["determining"])
-    manifest = {key: value for key, value in first.items() if key != "tokens"} | {
+    manifest = {key: value for key, value in first.items() if key not in ("tokens", "bundle")} | {
         "run": target.name,
         "shard": "",
         "config": first["config"] | {"shard": ""},

@@ -18,6 +18,7 @@ from shiftsim.metrics import SHORT_NAMES
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.rollouts.columns import stored_plans, stored_tracks
+from shiftsim.runs.tables import task_of
 from shiftsim.world.scenario import FULL_DURATION
 
 # columns of a stored rollout in the order of cause and effect within one step
@@ -102,8 +103,7 @@ def diff_runs(
     single = len(planners[0]) == len(planners[1]) == 1
     names = dict(zip(*planners, strict=True)) if single else {n: n for n in planners[0]}
     ours, theirs = (
-        {Task(*(row[name] for name in Task._fields)): row for row in run.scores.to_pylist()}
-        for run in (first, second)
+        {task_of(row): row for row in run.scores.to_pylist()} for run in (first, second)
     )
     pairs = {task: task._replace(planner=names[task.planner]) for task in sorted(ours)}
     pairs = {task: other for task, other in pairs.items() if other in theirs}

@@ -72,6 +72,11 @@ class EditSet:
             )
         return out
 
+    def named(self, store: ScenarioStore) -> dict[str, str]:
+        """The recorded scenarios that edits name, by the ids of what is made of them."""
+        found = self.expand(store, store.tokens)
+        return {token: one.base for token, one in found.items() if one.edit.tokens}
+
     def describe(self, store: ScenarioStore, tokens: Iterable[str]) -> dict[str, Any]:
         """For a manifest: base token and digest of the edited scenarios, by id."""
         return {

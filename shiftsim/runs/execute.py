@@ -14,6 +14,7 @@ from shiftsim.runs.manifest import make_manifest, now
 from shiftsim.runs.prepare import RunPlan
 from shiftsim.runs.results import Run, open_run
 from shiftsim.runs.rollouts import Task
+from shiftsim.runs.scenarios import BUNDLE, bundle_run
 from shiftsim.runs.tables import FAILED, OK, TIMEOUT, TaskResult
 from shiftsim.runs.task import Batch
 from shiftsim.runs.workers import Outcome, map_on_cluster, map_unordered
@@ -62,7 +63,7 @@ def execute(
     """
     try:
         if plan.config.resumes and plan.before == "complete":
-            return open_run(plan.folder)
+            return _bundled(open_run(plan.folder), plan)
         return _execute(plan, argv, on_progress)
     except OSError as error:
         raise DataError(
@@ -83,7 +84,7 @@ def _execute(plan: RunPlan, argv: Sequence[str], on_progress: OnProgress) -> Run
         fingerprint=plan.fingerprint,
         argv=argv,
     )
-    manifest["workers"] = plan.workers
+    manifest |= {"workers": plan.workers, "split_size": selection.size}
     if selection.edits is not None:
         manifest["edits"] = {**selection.edits.to_dict(), "made": dict(selection.edited)}
     if config.shard:  # what the whole run would be, for `merge`
@@ -97,23 +98,19 @@ def _execute(plan: RunPlan, argv: Sequence[str], on_progress: OnProgress) -> Run
             if plan.before == "complete":
                 raise
             state = "interrupted"
-        if config.bundle:
-            manifest["bundle"] = _bundle(plan)
         manifest |= {"state": state, "ended": now()}
         run = writer.finish(manifest, (*plan.tasks, *plan.missing), reasons)
+        _bundled(run, plan)
     if state == "interrupted":
         raise KeyboardInterrupt
     return run
 
 
-def _bundle(plan: RunPlan) -> dict[str, Any]:
-    from shiftsim.data import open_store
-    from shiftsim.runs.scenarios import write_bundle
-
-    store, tokens = open_store(plan.store), {task.token for task in plan.tasks}
-    if plan.selection.edits is not None:
-        tokens = {plan.selection.edited[token]["base"] for token in tokens}
-    return write_bundle(store, plan.folder, tokens)
+def _bundled(run: Run, plan: RunPlan) -> Run:
+    """The run; with its scenarios where it shall have them, or had them before."""
+    if plan.config.bundle or (plan.folder / BUNDLE).is_dir():
+        bundle_run(run, plan.store)
+    return run
 
 
 def _do_tasks(plan: RunPlan, writer: RunWriter, on_progress: OnProgress) -> None:

@@ -19,9 +19,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.files import atomic_write, safe_join, write_text
+from shiftsim.files import atomic_write, safe_join
 from shiftsim.runs.journal import Journal
-from shiftsim.runs.results import JOURNAL, Run, open_run
+from shiftsim.runs.results import JOURNAL, Run, open_run, write_manifest
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.rollouts.columns import decode_rows
 from shiftsim.runs.rollouts.files import (
@@ -87,13 +87,13 @@ class RunWriter:
             self._journal.put_all(map(_entry, stored_results(path)))
             self._read_journal()
         if before is None or not before.is_complete:
-            self._write_manifest(manifest | {"state": "running", "counts": {}})
+            write_manifest(path, manifest | {"state": "running", "counts": {}})
         self.rollouts.mkdir(exist_ok=True)
         self._linked: dict[Path, Path] = {}
 
     def _read_journal(self) -> None:
-        for number, key, values, has_rollout in self._journal.items():
-            result = TaskResult.from_json(Task(*json.loads(key)), values, self.rollouts)
+        for number, _, rows, has_rollout in self._journal.items():
+            result = TaskResult.from_rows(rows, self.rollouts)
             self._note(result, number, has_rollout=has_rollout)
 
     def _note(self, result: TaskResult, number: int, *, has_rollout: bool) -> None:
@@ -106,8 +106,8 @@ class RunWriter:
 
     def result(self, task: Task) -> TaskResult:
         """What became of a task that has ended, without its rollout."""
-        values = self._journal.values(self.ended[task].number)
-        return TaskResult.from_json(task, values, self.rollouts)
+        rows = self._journal.values(self.ended[task].number)
+        return TaskResult.from_rows(rows, self.rollouts)
 
     def add(self, result: TaskResult) -> None:
         """Put one result on disk; a file of another run that holds its rollout is linked to.
@@ -163,7 +163,7 @@ class RunWriter:
                         rows[name] += found
                 for name, table in tables.items():
                     table.write_table(pa.Table.from_pylist(rows[name], TABLES[name]))
-        self._write_manifest({**manifest, "counts": counts})
+        write_manifest(self.path, {**manifest, "counts": counts})
         self._journal.remove()  # what it points to is needed until then
         used = {location.file for location in locations.values()}
         for path in self.rollouts.iterdir():
@@ -214,10 +214,6 @@ class RunWriter:
         )
         return locations | written
 
-    def _write_manifest(self, manifest: dict[str, Any]) -> None:
-        text = json.dumps(manifest, indent=2, ensure_ascii=False)
-        write_text(self.path / "manifest.json", f"{text}\n")
-
 
 def _by_scenario(task: Task) -> tuple[str, Task]:
     return task.token, task
@@ -225,4 +221,4 @@ def _by_scenario(task: Task) -> tuple[str, Task]:
 
 def _entry(result: TaskResult) -> tuple[str, dict[str, Any]]:
     """A result as an entry of the journal, without its rollout."""
-    return json.dumps(result.task), result.to_json()
+    return json.dumps(result.task), result.rows()

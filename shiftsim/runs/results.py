@@ -10,8 +10,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from shiftsim.errors import ConfigError, DataError, listed
+from shiftsim.files import write_text
 from shiftsim.runs.rollouts import Task, complete_rollout, describe
-from shiftsim.runs.rollouts.files import RolloutLocation, RolloutReader
+from shiftsim.runs.rollouts.files import FOLDER, RolloutLocation, RolloutReader
 from shiftsim.runs.tables import LOCATION, OK, damaged, read_table, stored_location
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.scenario import Scenario
@@ -67,7 +68,7 @@ class Run:
             for names in (Task._fields, LOCATION)
         )
         return {
-            Task(*key): stored_location(self.path, *place)
+            Task(*key): stored_location(self.path / FOLDER, *place)
             for key, place in zip(keys, places, strict=True)
         }
 
@@ -127,6 +128,12 @@ def open_run(path: str | Path) -> Run:
             hint="the command that started it, with --resume, finishes it",
         )
     return Run(folder, manifest)
+
+
+def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
+    """Write the manifest of a run folder, in one step."""
+    text = json.dumps(manifest, indent=2, ensure_ascii=False)
+    write_text(folder / "manifest.json", f"{text}\n")
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:

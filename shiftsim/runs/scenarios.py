@@ -8,7 +8,7 @@ import hashlib
 import json
 import shutil
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
@@ -16,15 +16,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from shiftsim.data.store.reading import ScenarioStore, open_store
 from shiftsim.data.store.tables import REVIEW
-from shiftsim.errors import ConfigError, DataError, nearest, one_of
-from shiftsim.files import read_toml, safe_join, store_path
+from shiftsim.errors import ConfigError, DataError, listed, nearest, one_of
+from shiftsim.files import DEFAULT_STORE, read_toml, safe_join, store_path
 from shiftsim.runs.config import RunConfig
-from shiftsim.runs.results import Run
+from shiftsim.runs.results import Run, write_manifest
 
 if TYPE_CHECKING:
     from shiftsim.runs.edited import EditSet
 
 BUNDLE = "store"  # folder below that of the run
+_REMEDY = "`shiftsim bundle RUN` makes the run self-contained"
+_DEMO_SPLIT = "demo-mini"  # of the generated store, where no split is named
 
 
 def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
@@ -35,21 +37,31 @@ def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
     Raises:
         DataError: It is not there, or is another one.
     """
-    bundle, place = run.path / BUNDLE, store or run.manifest["store"]
+    found = _recorded(run, store)
+    if edits := run.manifest.get("edits"):
+        from shiftsim.runs.edited import EditedStore, make_edits
+
+        return EditedStore(found, make_edits(edits, run.path.name), edits.get("made"))
+    return found
+
+
+def _recorded(run: Run, store: str | None) -> ScenarioStore:
+    """The recorded scenarios of a run."""
+    place = store or run.manifest["store"]
     recorded = wanted = run.manifest["determining"]["store"]
-    if store is None and bundle.is_dir():
-        found, wanted = open_store(bundle), run.manifest.get("bundle", {}).get("hash")
+    if store is None and is_bundled(run):
+        found, wanted = open_store(run.path / BUNDLE), run.manifest["bundle"].get("hash")
     elif "://" in place:
         if store is None:  # which may be anybody's
             raise DataError(
                 f"the store of run {run.path.name!r} is behind the URL {place!r}",
-                hint=f"if you trust it: --store {place}",
+                hint=f"if you trust it: --store {place}; or, where it was made, {_REMEDY}",
             )
         found = open_store(place)
     elif not (path := store_path(place)).exists():
         raise DataError(
             f"the store of run {run.path.name!r} is not at {str(path)!r}",
-            hint="say where it is with --store",
+            hint=f"say where it is with --store; or, where it is, {_REMEDY}",
         )
     else:
         found = open_store(path)
@@ -59,11 +71,55 @@ def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
             hint="name the right one with --store, or run again",
         )
     found.hash = recorded
-    if edits := run.manifest.get("edits"):
-        from shiftsim.runs.edited import EditedStore, make_edits
-
-        return EditedStore(found, make_edits(edits, run.path.name), edits.get("made"))
     return found
+
+
+def is_bundled(run: Run) -> bool:
+    """Whether a run holds its scenarios itself."""
+    return isinstance(run.manifest.get("bundle"), dict) and (run.path / BUNDLE).is_dir()
+
+
+def bundle_run(run: Run, store: str | None = None) -> ScenarioStore:
+    """Copy the scenarios of a run, with recordings and maps, into its folder; the copy's store.
+
+    `store` says where the store has moved. Of a run that holds them already they are checked.
+
+    Raises:
+        DataError: The store is not there, or is another one.
+    """
+    from shiftsim.data.store.writing import StoreWriter, window_row
+
+    target, partial = (safe_join(run.path, name) for name in (BUNDLE, f".{BUNDLE}.tmp"))
+    if is_bundled(run):
+        return _recorded(run, None)
+    found = _recorded(run, store)
+    made = run.manifest.get("edits", {}).get("made", {})
+    tokens = set(run.tasks["token"].to_pylist())
+    wanted = {made[token]["base"] if token in made else token for token in tokens}
+    columns = (found.summary()[name].to_pylist() for name in ("token", "recording", "city"))
+    used = [row for row in zip(*columns, strict=True) if row[0] in wanted]
+    for folder in (partial, target):  # left by a process that was killed
+        shutil.rmtree(folder, ignore_errors=True)
+    with StoreWriter(partial, found.generator or None) as writer:
+        for city in sorted({city for _, _, city in used}):
+            writer.add_map(found.map(city))
+        for recording in sorted({recording for _, recording, _ in used}):
+            rows = [
+                window_row(found.window(token), city)
+                for token, name, city in used
+                if name == recording
+            ]
+            copied = partial / ".recording"
+            shutil.copytree(found.recording_folder(recording), copied)
+            writer.take_recording(copied, recording, rows)
+    if (found.path / REVIEW).is_file():
+        (partial / REVIEW).parent.mkdir()
+        shutil.copyfile(found.path / REVIEW, partial / REVIEW)
+    partial.rename(target)
+    bundle = open_store(target)
+    run.manifest["bundle"] = {"hash": bundle.hash}
+    write_manifest(run.path, run.manifest)
+    return bundle
 
 
 def open_edits(name: str, store: ScenarioStore) -> "EditSet":
@@ -91,7 +147,8 @@ class Selection(NamedTuple):
     split: str  # name of the split
     present: list[str]  # tokens that the store holds
     missing: list[str]  # tokens that it does not hold
-    num_dropped: int  # scenarios left out because the filter dropped them
+    size: int  # scenarios of the whole split, where the run is limited to the first ones
+    left_out: list[str]  # what the store holds and the run leaves out, and why, in words
     fingerprint: dict[str, Any]  # what identifies them
     edits: "EditSet | None" = None  # what makes them of recorded ones
     edited: Mapping[str, Any] = {}  # which are made of which, for the manifest
@@ -110,27 +167,32 @@ def select_scenarios(
     Raises:
         ShiftsimError: A split or edits are unknown or wrong, or scenarios are missing.
     """
-    known = tuple(store.tokens)
-    usable, fingerprint = known, {"store": store.hash}
-    if config.split in ("", store.path.name) and not config.all_scenarios:
-        usable, filter_hash = _usable(config.store, store)
-        fingerprint |= {"filter": filter_hash} if filter_hash else {}
-    split = find_split(config.split, Path(store.path), usable)
-    name, tokens, store_tokens, edited = split.name, split.tokens, set(known), dict[str, Any]()
     edits = given or (open_edits(config.edits, store) if config.edits else None)
+    whole, fingerprint = len(store.tokens), {"store": store.hash}
+    default = "" if config.split or config.all_scenarios else default_split(store, edits)
+    split, filter_hash = open_split(store, config.split or default, whole=config.all_scenarios)
+    name, tokens, held, edited = split.name, split.tokens, set(store.tokens), dict[str, Any]()
+    left_out = []
+    if default:
+        count = f"{whole - len(tokens)} of {whole} scenarios, not in split {default}"
+        left_out += [f"{count} (--split {store.path.name} takes all)"]
+    elif split.name == store.path.name and len(tokens) < whole:
+        dropped = whole - len(tokens)
+        left_out += [f"{dropped} of {whole} scenarios, dropped by filter or review (--all)"]
+    if filter_hash:
+        fingerprint["filter"] = filter_hash
     if edits is not None:
         edits.require_traffic(config.traffic)
         edited = edits.describe(store, tokens)
-        name, tokens, store_tokens = f"{name}+{edits.name}", tuple(edited), set(edited)
+        if lost := edits.named(store).keys() - edited:
+            of = f"{len(lost)} of {len(edited) + len(lost)} edited scenarios"
+            left_out += [f"{of}, not made of split {name}: {listed(sorted(lost))}"]
+        name, tokens, held = f"{name}+{edits.name}", tuple(edited), set(edited)
         fingerprint["edits"] = edits.digest
-    tokens = tokens[: config.limit] if config.limit else tokens
-    missing = sorted(set(tokens) - store_tokens)
-    if missing and not config.allow_partial:
-        raise DataError(
-            f"split {split.name!r} needs {len(tokens)} scenarios, store {config.store!r} "
-            f"lacks {len(missing)} of them, such as {missing[0]!r}",
-            hint="convert the missing scenarios, or --allow-partial",
-        )
+    size, tokens = len(tokens), tokens[: config.limit or None]
+    missing = sorted(set(tokens) - held)
+    if not config.allow_partial:
+        require_scenarios(split.name, tokens, config.store, held)
     if len(missing) == len(tokens):
         raise DataError(
             f"split {split.name!r}: store {config.store!r} holds none of its scenarios",
@@ -139,57 +201,62 @@ def select_scenarios(
     fingerprint["tokens"] = token_hash(tokens)
     if store.is_reviewed and store.reviews.hash:
         fingerprint["review"] = store.reviews.hash
-    present = [token for token in tokens if token in store_tokens]
-    dropped = len(known) - len(usable)
-    return Selection(name, present, missing, dropped, fingerprint, edits, edited)
+    present = [token for token in tokens if token in held]
+    return Selection(name, present, missing, size, left_out, fingerprint, edits, edited)
 
 
-def _usable(name: str, store: ScenarioStore) -> tuple[tuple[str, ...], str]:
-    """The scenarios of a whole store that filter and review accept, and the filter's hash."""
+def default_split(store: ScenarioStore, edits: "EditSet | None" = None) -> str:
+    """The split that is meant where none is named; empty for the whole store.
+
+    Of the generated demo it is the one that every page shows, unless edits name other scenarios.
+    """
+    path = Path(store.path) / "splits" / f"{_DEMO_SPLIT}.toml"
+    if store.generator.get("name") != DEFAULT_STORE or not path.is_file():
+        return ""
+    if edits is not None:
+        if not set(edits.named(store).values()) <= set(read_split(path).tokens):
+            return ""
+    return _DEMO_SPLIT
+
+
+def open_split(store: ScenarioStore, name: str, *, whole: bool = False) -> "tuple[Split, str]":
+    """The split of a name, and the hash of the filter's results, empty where they did not choose.
+
+    Of a store without a name of a split it is what filter and review accept, or the `whole` store.
+
+    Raises:
+        ShiftsimError: There is no such split, or the filter accepts nothing.
+    """
     from shiftsim.runs.filter import read_filter_results
 
-    usable, results = tuple(store.tokens), read_filter_results(store.path, store.hash)
-    if results is not None:
-        if not results.accepted:
-            raise DataError(
-                f"store {name!r}: the filter dropped all {len(results.rows)} scenarios",
-                hint="`shiftsim filter` says why; --all to use them nevertheless",
-            )
-        accepted = set(results.accepted)
-        usable = tuple(token for token in usable if token in accepted)
-    if store.is_reviewed:
-        usable = store.reviews.usable(tuple(store.tokens), usable)
-    return usable, results.hash if results else ""
+    usable, digest = tuple(store.tokens), ""
+    if name in ("", store.path.name) and not whole:
+        if (results := read_filter_results(store.path, store.hash)) is not None:
+            digest, accepted = results.hash, set(results.accepted)
+            if not accepted:
+                raise DataError(
+                    f"store {store.path.name!r}: the filter dropped all {len(usable)} scenarios",
+                    hint="`shiftsim filter` says why; --all to use them nevertheless",
+                )
+            usable = tuple(token for token in usable if token in accepted)
+        if store.is_reviewed:
+            usable = store.reviews.usable(tuple(store.tokens), usable)
+    return find_split(name, Path(store.path), usable), digest
 
 
-def write_bundle(store: ScenarioStore, folder: Path, tokens: Iterable[str]) -> dict[str, Any]:
-    """Copy scenarios with their recordings and maps into a run folder; for its manifest."""
-    from shiftsim.data.store.writing import StoreWriter, window_row
+def require_scenarios(split: str, tokens: Sequence[str], store: str, held: Iterable[str]) -> None:
+    """Refuse a split of which a store does not hold everything.
 
-    target, partial = (safe_join(folder, name) for name in (BUNDLE, f".{BUNDLE}.tmp"))
-    if target.exists():
-        return {"hash": open_store(target).hash}
-    shutil.rmtree(partial, ignore_errors=True)
-    columns = (store.summary()[name].to_pylist() for name in ("token", "recording", "city"))
-    wanted = set(tokens)
-    used = [row for row in zip(*columns, strict=True) if row[0] in wanted]
-    with StoreWriter(partial, store.generator or None) as writer:
-        for city in sorted({city for _, _, city in used}):
-            writer.add_map(store.map(city))
-        for recording in sorted({recording for _, recording, _ in used}):
-            rows = [
-                window_row(store.window(token), city)
-                for token, name, city in used
-                if name == recording
-            ]
-            copied = partial / ".recording"
-            shutil.copytree(store.recording_folder(recording), copied)
-            writer.take_recording(copied, recording, rows)
-    if (store.path / REVIEW).is_file():
-        (partial / REVIEW).parent.mkdir()
-        shutil.copyfile(store.path / REVIEW, partial / REVIEW)
-    partial.rename(target)
-    return {"hash": open_store(target).hash}
+    Raises:
+        DataError: Scenarios are missing.
+    """
+    if missing := sorted(set(tokens).difference(held)):
+        raise DataError(
+            f"split {split!r} needs {len(tokens)} scenarios, store {store!r} "
+            f"lacks {len(missing)} of them, such as {missing[0]!r}",
+            hint="convert the missing scenarios, or name the store that was converted for this "
+            "split; `run` and `bench` also take --allow-partial",
+        )
 
 
 @dataclass(frozen=True, slots=True)

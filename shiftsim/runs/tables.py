@@ -8,7 +8,6 @@ Timings are in `tasks.parquet`.
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import groupby
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -98,20 +97,6 @@ class TaskResult:
     )
     warning: str = ""  # why the first plan is most likely not what was meant
 
-    def to_json(self) -> dict[str, Any]:
-        """All but the task, the rollout and the warning, as JSON values."""
-        values = {name: getattr(self, name) for name in (*_TEXTS, "seconds", "scores", "metrics")}
-        return values | {
-            "location": self.location and (self.location.file.name, *self.location[1:])
-        }
-
-    @staticmethod
-    def from_json(task: Task, values: dict[str, Any], folder: Path) -> "TaskResult":
-        """A result from JSON values; `folder` is that of its rollout."""
-        found = values["location"]
-        location = found and RolloutLocation(part_file(folder, found[0]), *found[1:])
-        return TaskResult(task, **{**values, "location": location})
-
     def rows(self) -> dict[str, list[dict[str, Any]]]:
         """Its rows by table."""
         key = self.task._asdict()
@@ -124,41 +109,58 @@ class TaskResult:
             "metrics": [key | metric for metric in self.metrics],
         }
 
+    @staticmethod
+    def from_rows(rows: dict[str, list[dict[str, Any]]], folder: Path) -> "TaskResult":
+        """The result that became rows; `folder` is that of its rollout, which it is without."""
+        (row,), scores = rows["tasks"], rows["scores"]
+        return TaskResult(
+            task_of(row),
+            **{name: row[name] for name in _TEXTS},
+            seconds={name: row[name] for name in _DURATIONS if row.get(name) is not None},
+            scores=_beyond_key(scores[0]) if scores else {},
+            metrics=list(map(_beyond_key, rows["metrics"])),
+            location=stored_location(folder, *(row[name] for name in LOCATION)),
+        )
 
-def stored_location(run: Path, rollout: str | None, row: Any, rows: Any) -> RolloutLocation | None:
-    """Where a rollout of a run is, by the columns of `tasks.parquet`."""
-    return RolloutLocation(part_file(run / FOLDER, rollout), row, rows) if rollout else None
+
+def task_of(row: dict[str, Any]) -> Task:
+    """The task of a row of any table."""
+    return Task(*(row[name] for name in Task._fields))
+
+
+def _beyond_key(row: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in row.items() if name not in Task._fields}
+
+
+def stored_location(
+    folder: Path, rollout: str | None, row: Any, rows: Any
+) -> RolloutLocation | None:
+    """Where a rollout is below the folder of rollouts, by the columns of `tasks.parquet`."""
+    return RolloutLocation(part_file(folder, rollout), row, rows) if rollout else None
 
 
 def stored_results(run: Path) -> Iterator[TaskResult]:
     """The results that the tables of a run hold, in their order, without those that are missing."""
-    files = [run / f"{name}.parquet" for name in ("scores", "metrics")]
-    scores, metrics = map(_rows_by_task, files)
-    for key, (row,) in _rows_by_task(run / "tasks.parquet"):
-        if row["status"] == MISSING:
-            continue
-        is_done = row["status"] == OK
-        yield TaskResult(
-            Task(*key),
-            **{name: row[name] for name in _TEXTS},
-            seconds={name: row[name] for name in _DURATIONS if row[name] is not None},
-            scores=_next_rows(key, scores, files[0])[0] if is_done else {},
-            metrics=_next_rows(key, metrics, files[1]) if is_done else [],
-            location=stored_location(run, *(row[name] for name in LOCATION)),
-        )
+    found = {name: _rows_by_task(run / f"{name}.parquet") for name in TABLES}
+    for task, tasks in found["tasks"]:
+        status, rows = tasks[0]["status"], {"tasks": tasks}
+        for name in ("scores", "metrics"):
+            rows[name] = _next_rows(task, found[name], run / name) if status == OK else []
+        if status != MISSING:
+            yield TaskResult.from_rows(rows, run / FOLDER)
 
 
-def _rows_by_task(path: Path) -> Iterator[tuple[tuple[Any, ...], list[dict[str, Any]]]]:
-    rows = (row for batch in _batches(path) for row in batch.to_pylist())
-    for key, group in groupby(rows, itemgetter(*Task._fields)):
-        yield key, [{n: v for n, v in row.items() if n not in Task._fields} for row in group]
-
-
-def _next_rows(key: tuple[Any, ...], rows: Iterator[Any], path: Path) -> list[dict[str, Any]]:
+def _next_rows(task: Task, rows: Iterator[Any], table: Path) -> list[dict[str, Any]]:
     found, values = next(rows, (None, []))
-    if found != key:
-        raise damaged(path, f"the rows of {describe(Task(*key))} are missing")
+    if found != task:
+        what = f"the rows of {describe(task)} are missing"
+        raise damaged(table.with_suffix(".parquet"), what)
     return list(values)
+
+
+def _rows_by_task(path: Path) -> Iterator[tuple[Task, list[dict[str, Any]]]]:
+    rows = (row for batch in _batches(path) for row in batch.to_pylist())
+    return ((task, list(group)) for task, group in groupby(rows, task_of))
 
 
 def read_table(path: Path) -> pa.Table:

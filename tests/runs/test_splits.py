@@ -1,12 +1,20 @@
 """Splits name scenarios."""
 
+import json
+import shutil
+
 import pytest
 
+from shiftsim.data.store.reading import open_store
 from shiftsim.errors import ConfigError
+from shiftsim.runs.config import RunConfig
+from shiftsim.runs.edited import make_edits
 from shiftsim.runs.scenarios import (
     choose_scenarios,
+    default_split,
     find_split,
     read_split,
+    select_scenarios,
     token_hash,
     write_split,
 )
@@ -112,3 +120,49 @@ def test_nothing_is_written_that_could_not_be_read(tmp_path, name, tokens):
     with pytest.raises(ConfigError):
         write_split(tmp_path / name, tokens)
     assert not (tmp_path / name).exists()
+
+
+@pytest.fixture
+def demo(toy, tmp_path):
+    """A store that says it is the generated demo, whose split `demo-mini` has two scenarios."""
+    folder = shutil.copytree(toy, tmp_path / "demo")
+    manifest = json.loads((folder / "store.json").read_text())
+    (folder / "store.json").write_text(json.dumps(manifest | {"generator": {"name": "demo"}}))
+    tokens = open_store(folder).tokens
+    write_split(folder / "splits/demo-mini.toml", tokens[:2])
+    return open_store(folder)
+
+
+def edits_of(*tokens):
+    spawn = {"at": {"ahead_m": 40, "left_m": 1.5}, "behavior": "stopped"}
+    listed = [{"name": f"van{i}", "tokens": [t], "spawn": spawn} for i, t in enumerate(tokens)]
+    return make_edits({"edit": listed}, "vans")
+
+
+def test_where_no_split_is_named_the_demo_is_its_own_split(demo, toy):
+    settings = {"planners": ("idm",), "store": str(demo.path)}
+    found = select_scenarios(RunConfig(**settings), demo)
+    assert (found.split, tuple(found.present)) == ("demo-mini", demo.tokens[:2])
+    left = len(demo) - 2
+    words = f"{left} of {len(demo)} scenarios, not in split demo-mini (--split demo takes all)"
+    assert found.left_out == [words]
+    whole = select_scenarios(RunConfig(**settings, split="demo"), demo)
+    assert (tuple(whole.present), whole.left_out) == (demo.tokens, [])
+    assert default_split(open_store(toy)) == ""
+
+
+def test_a_limited_run_knows_the_size_of_its_split(demo):
+    config = RunConfig(planners=("idm",), store=str(demo.path), split="demo", limit=1)
+    assert select_scenarios(config, demo).size == len(demo)
+
+
+def test_edits_of_other_scenarios_are_driven_or_named(demo):
+    inside, outside = demo.tokens[0], demo.tokens[-1]
+    settings = {"planners": ("idm",), "store": str(demo.path)}
+    both = edits_of(inside, outside)
+    assert default_split(demo, edits_of(inside)) == "demo-mini"
+    assert len(select_scenarios(RunConfig(**settings), demo, both).present) == 2
+    found = select_scenarios(RunConfig(**settings, split="demo-mini"), demo, both)
+    assert found.present == [f"{inside}-van0"]
+    lost = f"{outside}-van1"
+    assert found.left_out == [f"1 of 2 edited scenarios, not made of split demo-mini: {lost}"]
