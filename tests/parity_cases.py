@@ -44,6 +44,7 @@ KINDS = {
     "opendrive": ["*.refline.parquet"],
     "open_loop": ["openloop_plans.parquet"],
     "scenario_edits": ["tokens.json", "build.json", "traffic.json"],
+    "nuplan_real_logs": ["*.msgpack.xz", "tracker_steps.parquet", "comfort_signals.parquet"],
     "nuplan_experiment": [
         "|".join(
             f"{deep}{name}"

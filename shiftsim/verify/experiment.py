@@ -170,7 +170,7 @@ def _compare_results(path: Path, challenge: str, find: FindScenario, report: Rep
                 left_out |= recorded.left_out
                 source = origin(challenge, recorded)
                 report.remarks.append(f"{run}: {_ORIGINS[source]}")
-            if recorded and recorded.has_repeat:
+            if recorded and recorded.dropped_us:
                 report.remarks.append(f"{run}: the last sample repeats a time (dt = 0): dropped")
                 if scenario:
                     rows = scenario.iteration_rows[:-1]

@@ -134,7 +134,7 @@ class Recorded:
     plans: Source | None  # a row per sample and state of the plan; None where it is left out
     seconds: Any  # what the planner took at every sample [s]; None where it is left out
     left_out: frozenset[str]  # names of the classes whose objects were left out
-    has_repeat: bool  # whether a last sample is dropped that had the time of the one before
+    dropped_us: int | None  # iteration time of a last sample whose ego has the time before [us]
 
 
 def find_simulation_logs(folder: Path) -> dict[tuple[str, str], Path]:
@@ -190,9 +190,10 @@ def _recorded(log: Any, report: Report, left_out: frozenset[str]) -> Recorded:
     scenario, history = log.scenario.arguments, log.simulation_history
     goal, cut, samples = history.mission_goal, scenario[8], history.data
     times = _values(samples[-2:], "ego_state._time_point.time_us")
-    has_repeat = len(times) > len(set(times))
-    if has_repeat:
-        samples = samples[:-1]
+    dropped_us = None
+    if len(times) > len(set(times)):
+        *samples, last = samples
+        dropped_us = last.iteration.time_point.time_us
     egos = _egos(_values(samples, "ego_state")) | _columns(samples, _SAMPLE)
     return Recorded(
         facts={
@@ -209,7 +210,7 @@ def _recorded(log: Any, report: Report, left_out: frozenset[str]) -> Recorded:
         plans=_plans(_values(samples, "trajectory"), report),
         seconds=getattr(log.planner, "_compute_trajectory_runtimes", None),
         left_out=left_out,
-        has_repeat=has_repeat,
+        dropped_us=dropped_us,
     )
 
 

@@ -154,7 +154,7 @@ def test_states_that_a_plan_is_followed_perfectly_to_are_driven_in_that_mode_onl
 
 def test_a_log_that_is_played_back_is_said_to_be_that(tmp_path: Path, monkeypatch: Any) -> None:
     recorded = read_simulation_log(write_log(tmp_path, monkeypatch, driven=False), Report())
-    assert not recorded.has_repeat
+    assert recorded.dropped_us is None
     assert origin("NR", recorded) == "played back"
     assert "played back: its states are the recorded ego" in "\n".join(remarks(tmp_path))
     # one that steers was driven, if not by the tracker that is known here
@@ -165,7 +165,7 @@ def test_a_log_that_is_played_back_is_said_to_be_that(tmp_path: Path, monkeypatc
 def test_a_last_sample_that_repeats_a_time_is_dropped(tmp_path: Path, monkeypatch: Any) -> None:
     path = write_log(tmp_path, monkeypatch, driven=True, repeats=True)
     recorded = read_simulation_log(path, Report())
-    assert recorded.has_repeat
+    assert recorded.dropped_us == (NUM_SAMPLES - 1) * STEP
     assert len(recorded.ego["x"]) == len(recorded.ego["time_us"]) == NUM_SAMPLES - 1
     assert recorded.plans["iteration"].max() == NUM_SAMPLES - 2
     assert (np.diff(recorded.ego["ego_time_us"]) == STEP).all()
@@ -181,7 +181,7 @@ def test_genuine_logs_were_played_back(tmp_path: Path) -> None:
     for path in paths:
         (folder / path.name).symlink_to(path)
         recorded = read_simulation_log(path, Report())
-        assert recorded.has_repeat
+        assert recorded.dropped_us
         assert len(recorded.ego["x"]) == 149
         assert not recorded.ego["tire_steering_angle"].any()
     lines = "\n".join(remarks(tmp_path))
