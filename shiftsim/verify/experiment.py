@@ -7,19 +7,15 @@ the planners that nuPlan's devkit brings along are simulated.
 
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from shiftsim.errors import DataError
-from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.metrics import MetricResult, evaluate, measure
 from shiftsim.metrics.score import closed_loop_score
 from shiftsim.planners.registry import load_planner
-from shiftsim.sim.dynamics.lqr import TRACKED, track_and_step
-from shiftsim.sim.dynamics.perfect import interpolate
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.planner import Observation, Planner, SceneInfo
@@ -29,6 +25,7 @@ from shiftsim.verify.rollouts import (
     CHALLENGES,
     DERIVED,
     LOGGED,
+    ORIGINS,
     REACTIVE,
     SCORES,
     SIMULATED,
@@ -38,6 +35,8 @@ from shiftsim.verify.rollouts import (
     ego_columns,
     light_columns,
     object_columns,
+    origin,
+    plan_at,
     read_ego,
     recorded_log,
     tracks_of,
@@ -50,17 +49,7 @@ from shiftsim.verify.simulation_log import (
 )
 from shiftsim.verify.tables import DAMAGED, EXACT, TOLERANCE, Groups, Source, Tolerances, read_table
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import (
-    AX,
-    AY,
-    HEADING,
-    NUM_STATE,
-    PACIFICA,
-    STEERING,
-    YAW_RATE,
-    Trajectory,
-    speeds,
-)
+from shiftsim.world.state import AX, AY, PACIFICA, Trajectory, speeds
 
 _PARTS = ("metrics", "aggregator_metric", "simulation_log")  # folders that nuPlan makes
 _CHALLENGES = {"closed_loop_nonreactive_agents": "NR", "closed_loop_reactive_agents": "R"}
@@ -78,13 +67,6 @@ _NO_METRICS = {
     "aggregator_type",
 }
 POSE = [1e-6, 1e-6, 1e-7]  # m, m, rad
-_ORIGINS = {  # of the ego states in a simulation log
-    "driven": "driven: every state follows from the plan before it",
-    "played back": "played back: its states are the recorded ego and do not follow from the plans",
-    "other": "driven by another controller: its states do not follow from the plans",
-    "unknown": "driven or played back: its plans are of a class that is not known here",
-}
-_STEP_ERROR = 1e-6  # m, rad, m/s, …: of a state that follows from the plan before it
 _RUNTIMES = (("mean", np.mean), ("median", np.median), ("std", np.std))
 
 FindScenario = Callable[[str], Scenario | None]  # by token; None where there is none
@@ -168,8 +150,8 @@ def _compare_results(path: Path, challenge: str, find: FindScenario, report: Rep
             recorded = read_simulation_log(logs[run.key], report) if run.key in logs else None
             if recorded:
                 left_out |= recorded.left_out
-                source = origin(challenge, recorded)
-                report.remarks.append(f"{run}: {_ORIGINS[source]}")
+                source = origin(challenge, recorded.ego, recorded.plans)
+                report.remarks.append(f"{run}: {ORIGINS[source]}")
             if recorded and recorded.dropped_us:
                 report.remarks.append(f"{run}: the last sample repeats a time (dt = 0): dropped")
                 if scenario:
@@ -249,32 +231,6 @@ def _compare_means(table: Source) -> Source:
     return table.at(np.isnan(count))
 
 
-def origin(challenge: str, recorded: Recorded) -> str:
-    """How the ego of a simulation log came to its states: a word of `_ORIGINS`."""
-    states, time_us = read_ego(recorded.ego), recorded.ego["ego_time_us"].astype(np.int64)
-    if recorded.plans is None:
-        return "unknown"
-    after, command = np.empty(NUM_STATE), np.empty(2)
-    for row, (now, following) in enumerate(pairwise(time_us.tolist())):
-        plan = _plan_at(recorded.plans, row)
-        if challenge == "PT":
-            is_stepped = interpolate(plan.time_us, plan.states, following, after)
-        else:
-            given = now, following, states[row], plan.time_us, plan.states, 0.0, 0.0
-            is_stepped = track_and_step(*given, after, command) == TRACKED
-        error = after - states[row + 1]
-        error[HEADING] = wrap_angle(error[HEADING])
-        if not (is_stepped and np.abs(error).max() <= _STEP_ERROR):
-            # nuPlan rule 415: a recorded ego has neither
-            return "other" if states[:, [STEERING, YAW_RATE]].any() else "played back"
-    return "driven"
-
-
-def _plan_at(plans: Source, iteration: int) -> Trajectory:
-    now = plans.at(plans["iteration"] == iteration)
-    return Trajectory(now["time_us"].astype(np.int64), read_ego(now))
-
-
 class _Replay:
     """Answers with recorded plans."""
 
@@ -286,7 +242,7 @@ class _Replay:
 
     def plan(self, observation: Observation) -> Trajectory:
         """The plan of this iteration."""
-        return _plan_at(self._plans, observation.iteration)
+        return plan_at(self._plans, observation.iteration)
 
 
 def _compare_log(run: Run, scenario: Scenario, recorded: Recorded, report: Report) -> SimulationLog:

@@ -13,8 +13,9 @@ import places
 import pytest
 
 from shiftsim.sim.dynamics.lqr import track_and_step
-from shiftsim.verify.experiment import origin, verify_experiment
+from shiftsim.verify.experiment import verify_experiment
 from shiftsim.verify.report import Report
+from shiftsim.verify.rollouts import origin
 from shiftsim.verify.simulation_log import read_simulation_log
 from shiftsim.world.state import NUM_STATE, VX, VY, center_poses
 
@@ -131,7 +132,7 @@ def test_a_driven_log_is_said_to_be_driven(tmp_path: Path, monkeypatch: Any) -> 
     recorded = read_simulation_log(write_log(tmp_path, monkeypatch, driven=True), Report())
     assert len(recorded.ego["x"]) == NUM_SAMPLES
     assert np.abs(recorded.ego["tire_steering_angle"]).max() > 0.0
-    assert origin("NR", recorded) == "driven"
+    assert origin("NR", recorded.ego, recorded.plans) == "driven"
     assert "NR log SimplePlanner: driven: every state follows" in "\n".join(remarks(tmp_path))
 
 
@@ -140,7 +141,7 @@ def test_states_that_a_plan_is_followed_perfectly_to_are_driven_in_that_mode_onl
 ) -> None:
     path = write_log(tmp_path, monkeypatch, driven=False)
     recorded = read_simulation_log(path, Report())
-    assert origin("NR", recorded) == "played back"
+    assert origin("NR", recorded.ego, recorded.plans) == "played back"
     plans, ego = recorded.plans, recorded.ego
     for row in range(NUM_SAMPLES):
         now = plans["iteration"] == row
@@ -148,18 +149,18 @@ def test_states_that_a_plan_is_followed_perfectly_to_are_driven_in_that_mode_onl
         for name in ("x", "y", "heading", "vx", "vy", "ax", "ay"):
             ahead = np.minimum(row + np.arange(9), NUM_SAMPLES - 1)
             plans.values[name][now] = ego[name][ahead]
-    assert origin("PT", recorded) == "driven"
-    assert origin("NR", recorded) == "played back"
+    assert origin("PT", recorded.ego, recorded.plans) == "driven"
+    assert origin("NR", recorded.ego, recorded.plans) == "played back"
 
 
 def test_a_log_that_is_played_back_is_said_to_be_that(tmp_path: Path, monkeypatch: Any) -> None:
     recorded = read_simulation_log(write_log(tmp_path, monkeypatch, driven=False), Report())
     assert recorded.dropped_us is None
-    assert origin("NR", recorded) == "played back"
+    assert origin("NR", recorded.ego, recorded.plans) == "played back"
     assert "played back: its states are the recorded ego" in "\n".join(remarks(tmp_path))
     # one that steers was driven, if not by the tracker that is known here
     recorded.ego.values["tire_steering_angle"][3] = 0.01
-    assert origin("NR", recorded) == "other"
+    assert origin("NR", recorded.ego, recorded.plans) == "other"
 
 
 def test_a_last_sample_that_repeats_a_time_is_dropped(tmp_path: Path, monkeypatch: Any) -> None:
@@ -169,7 +170,7 @@ def test_a_last_sample_that_repeats_a_time_is_dropped(tmp_path: Path, monkeypatc
     assert len(recorded.ego["x"]) == len(recorded.ego["time_us"]) == NUM_SAMPLES - 1
     assert recorded.plans["iteration"].max() == NUM_SAMPLES - 2
     assert (np.diff(recorded.ego["ego_time_us"]) == STEP).all()
-    assert origin("NR", recorded) == "driven"
+    assert origin("NR", recorded.ego, recorded.plans) == "driven"
     assert "log SimplePlanner: the last sample repeats a time" in "\n".join(remarks(tmp_path))
 
 
