@@ -192,8 +192,7 @@ def sample(
 def test_closed_loop(path: Path, scenes: Scenes, cases: Cases) -> None:
     """Features, ids and all outputs are stored for some iterations, the encoding for fewer."""
     plans = ("trajectory_time_us", "trajectory", "ego_prediction")
-    names = [f"{part}{what}" for part in ("lanes", "route_lanes") for what in ("", "_speed_limit")]
-    names += [f"{part}_has_speed_limit" for part in ("lanes", "route_lanes")]
+    names = ["lanes", "lanes_speed_limit", "lanes_has_speed_limit", "route_lanes"]
     names += ["neighbor_agents_past", "ego_current_state", "static_objects"]
     for loop in loop_steps(path, KeyedPlanner, scenes, cases, plans):
         bound = drive_bound(loop.variant, 1e-3, 2e-4)  # m
@@ -209,6 +208,12 @@ def test_closed_loop(path: Path, scenes: Scenes, cases: Cases) -> None:
                 "prediction": loop.output,
                 **{f"feature/{name}": getattr(features, name) for name in names},
             }
+            # which the network does not read
+            on_route = builder.lanes_on_route(road.block_of[features.edges], features.route or ())
+            for name in ("lanes_speed_limit", "lanes_has_speed_limit"):
+                limits = np.zeros_like(getattr(features, name)[: builder.ROUTE_LANES])
+                limits[: len(on_route)] = getattr(features, name)[on_route]
+                ours[f"feature/route_{name}"] = limits
             loop.match(loop.stored, ours, {"": FEATURE, "prediction": bound})
         if "encoding" in loop.stored:
             network, (inputs, _) = loop.planner.network, loop.planner.batch([loop.features])
