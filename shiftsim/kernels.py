@@ -9,6 +9,7 @@ import hashlib
 import logging
 import os
 import shutil
+import stat
 import sys
 import tempfile
 from contextlib import suppress
@@ -56,17 +57,22 @@ def _is_trusted(folder: Path) -> bool:
     """Whether nobody but this user and root can have written what is in a folder; else said."""
     if sys.platform == "win32":
         return True
+    # who may write in a folder above can exchange this one, unless that is sticky, as /tmp is
+    anybody = stat.S_IWOTH
+    modes = {parent: parent.stat().st_mode for parent in folder.resolve().parents}
+    unsafe = [path for path in modes if modes[path] & (anybody | stat.S_ISVTX) == anybody]
     # others do not reach what is in a private folder: there the group is what a umask left
     forbidden = 0o022 if folder.stat().st_mode & 0o077 else 0o002
     for path in (folder, *folder.rglob("*")):
         with suppress(OSError):  # another process may be writing it
             info = path.stat()
             if info.st_uid not in (0, os.getuid()) or info.st_mode & forbidden:
-                text = "%s may be written by other users: compiled kernels in %s are not read; %s"
-                remedy = "remove that folder, or give NUMBA_CACHE_DIR one of your own"
-                logging.getLogger(__name__).warning(text, path, folder, remedy)
-                return False
-    return True
+                unsafe.append(path)
+    if unsafe:
+        text = "%s may be written by other users: compiled kernels in %s are not read; %s"
+        remedy = "remove that folder, or give NUMBA_CACHE_DIR one of your own"
+        logging.getLogger(__name__).warning(text, unsafe[0], folder, remedy)
+    return not unsafe
 
 
 def _cache_folder() -> str:

@@ -44,6 +44,7 @@ KINDS = {
     "opendrive": ["*.refline.parquet"],
     "open_loop": ["openloop_plans.parquet"],
     "scenario_edits": ["tokens.json", "build.json", "traffic.json"],
+    "nuplan_real_logs": ["*.msgpack.xz", "tracker_steps.parquet", "comfort_signals.parquet"],
     "nuplan_experiment": [
         "|".join(
             f"{deep}{name}"
@@ -59,7 +60,7 @@ COMPARED_ELSEWHERE = {
 }
 
 # of a known kind, but their files are not compared yet; --reference names them as not covered
-NOT_COMPARED_YET = {"pluto_vertex", "training"}
+NOT_COMPARED_YET = {"training"}
 
 
 @dataclass
@@ -79,8 +80,9 @@ def recognise(folder: Path) -> list[tuple[str, Path]]:
             if kind == "network":
                 manifest = folder / "state_dict.json"
                 listed = json.loads(manifest.read_text()) if manifest.is_file() else {}
-                kind = listed.get("planner", folder.name)
-                if kind not in NETS:
+                called = listed.get("planner", folder.name)
+                kind = next((name for name in NETS if called.startswith(name)), "")
+                if not kind:
                     continue
             return [(kind, folder)]
     return []
@@ -360,8 +362,8 @@ class Scenes:
     """The scenarios of a nuplan reference folder by scene name, each read when first asked for.
 
     Attributes:
-        folder: Holds `scenes.json`, `logs` and `maps`; without `scenes.json` there are no scenes.
-        entries: What `scenes.json` says, by scene name.
+        folder: Holds `scenes.json`, `logs` and `maps`, or closed loops with logs and maps beside.
+        entries: What `scenes.json`, or the closed loops, say of their scenes, by scene name.
         mapping: Duration [s], offset [s] and subsample ratio that the scenarios are cut with.
     """
 
@@ -369,7 +371,7 @@ class Scenes:
         self, folder: Path, report: Report | None = None, mapping: tuple[float, ...] = MAPPING
     ) -> None:
         path, used = folder / "scenes.json", report or Report()
-        listed = json.loads(path.read_text()) if path.is_file() else []
+        listed = json.loads(path.read_text()) if path.is_file() else _scenes_of_loops(folder)
         entries = [File("scenes.json", "field", entry, used) for entry in listed]
         self.folder, self.entries = folder, {entry["scene"]: entry for entry in entries}
         self.mapping, self._read = mapping, dict[str, Scenario]()
@@ -382,10 +384,15 @@ class Scenes:
         return self._read[scene]
 
     @cached_property
+    def map_files(self) -> dict[str, Path]:
+        """Files of all maps of the folder, by name."""
+        beside = {path.parents[1].name: path for path in self.folder.glob("*/*/map.gpkg")}
+        return beside or find_maps(self.folder / "maps")
+
+    @cached_property
     def maps(self) -> dict[str, VectorMap]:
         """All maps of the folder by name."""
-        files = find_maps(self.folder / "maps")
-        return {name: load_map(files, name) for name in files}
+        return {name: load_map(self.map_files, name) for name in self.map_files}
 
     def by_token(self, token: str) -> Scenario | None:
         """The scenario of a token, None where there is none."""
@@ -394,6 +401,18 @@ class Scenes:
 
 
 open_scenes = cache(Scenes)  # one for all tests
+
+
+def _scenes_of_loops(folder: Path) -> list[dict[str, str]]:
+    """As in `scenes.json`, for the closed loops in a folder with their logs beside them."""
+    out = []
+    for path in sorted(folder.glob("closed_loop_*.npz")):
+        with np.load(path, allow_pickle=False) as archive:
+            names = {"scene": "scene", "token": "token", "map": "map_name"}
+            scene = {name: str(archive[f"meta/{key}"]) for name, key in names.items()}
+        if (folder / f"{scene['scene']}.db").is_file():
+            out.append({**scene, "db": f"{scene['scene']}.db"})
+    return out
 
 
 def ids(layer: Any, rows: Any) -> Any:

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 from parity_cases import Cases, File, Scenes, read_file
 
-from shiftsim.data.nuplan.scenarios import find_maps
 from shiftsim.planners.learned.checkpoint import network_module
 from shiftsim.planners.learned.deterministic import deterministic_state, keyed_normals, rule_of
 from shiftsim.planners.learned.features import PLAN_POSES, STEP
@@ -276,7 +275,7 @@ def compare_scene(loop: Loop, scenes: Scenes) -> None:
     """Where the loop is, which log and map it was made from, and how its ego got there."""
     file, scenario = loop.file, loop.scenario
     entry, meta = scenes.entries[str(file["meta/scene"])], file.below("meta/")
-    paths = scenes.folder / entry["db"], find_maps(scenes.folder / "maps")[entry["map"]]
+    paths = scenes.folder / entry["db"], scenes.map_files[entry["map"]]
     content = [path.read_bytes() for path in paths]
     md5 = [hashlib.md5(data, usedforsecurity=False).hexdigest() for data in content]
     facts = {

@@ -29,6 +29,7 @@ from shiftsim.data.recording import visible_columns
 from shiftsim.data.store.check import check_store
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.files import PACKAGE
+from shiftsim.kernels import _is_trusted
 from shiftsim.metrics import compute_metrics
 from shiftsim.planners.registry import load_planner
 from shiftsim.planners.table import PLANNERS
@@ -222,7 +223,7 @@ def _search(folder: Path) -> str:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no owners and modes of files")
-@pytest.mark.parametrize("change", ["folder", "part", "file", "group", "owner"])
+@pytest.mark.parametrize("change", ["folder", "part", "file", "group", "owner", "parent"])
 def test_machine_code_that_others_may_have_written_is_not_read(tmp_path: Path, change: str) -> None:
     (tmp_path / "family.py").write_text(CHILD_AND_PARENT)
     folder = tmp_path / "cache"
@@ -237,7 +238,8 @@ def test_machine_code_that_others_may_have_written_is_not_read(tmp_path: Path, c
         folder.chmod(0o755)
         index.chmod(0o664)
     else:
-        {"folder": folder, "part": index.parent, "file": index}[change].chmod(0o777)
+        changed = {"folder": folder, "part": index.parent, "file": index, "parent": tmp_path}
+        changed[change].chmod(0o777)
     code = "from family import *; assert child(4)[3] == 3"
     own = {"NUMBA_CACHE_DIR": str(folder), "SHIFTSIM_CACHE": str(tmp_path / "own")}
     done = subprocess.run(
@@ -250,6 +252,21 @@ def test_machine_code_that_others_may_have_written_is_not_read(tmp_path: Path, c
     assert not (tmp_path / "ran").exists()
     assert done.stderr.count("may be written by other users") == 1
     assert str(folder) in done.stderr
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no owners and modes of files")
+@pytest.mark.parametrize(
+    ("mode", "is_trusted"), [(0o700, True), (0o775, True), (0o1777, True), (0o777, False)]
+)
+def test_a_cache_is_where_others_cannot_exchange_its_folder(
+    tmp_path: Path, mode: int, is_trusted: bool
+) -> None:
+    # the private folder between does not help: it can be exchanged itself
+    folder = tmp_path / "parent" / "between" / "cache"
+    for path in (tmp_path / "parent", folder.parent, folder):
+        path.mkdir(mode=0o700)
+    (tmp_path / "parent").chmod(mode)
+    assert _is_trusted(folder) == is_trusted
 
 
 def test_a_process_that_is_started_does_not_say_it_again(tmp_path: Path) -> None:

@@ -46,7 +46,7 @@ _BESIDE = ("filter", "splits")  # folders that hold statements about the scenari
 _ROW_S = 0.05
 _FAST = 2.0  # m/s
 _MAX_TURNED = 0.5  # rad, median angle between heading and motion of a vehicle
-_LEAST_ROWS = 20  # of motion that say something of a heading
+_LEAST_ROWS, _MAX_WRONG = 20, 0.2  # of motion that say something; share of tracks, 0.11 by noise
 _MAX_OFF = 3.0  # m, how far the ego may be beside lanes and drivable area
 _MAX_OFF_SHARE = 0.1  # of the iterations
 _MIN_OVERLAP = 0.5  # m^2, of two lanes; less is hardly ever met
@@ -278,7 +278,8 @@ def _check_boxes(boxes: pa.Table, time_us: IntArray) -> Iterator[_Finding]:
     time = (time_us[row[good]] - time_us[0]) * 1e-6
     derived = fitted_velocities(motion[good, :2], time, owner, _ROW_S)
     is_wrong, share = contradiction(motion[good, 3:], derived, time, owner)
-    if is_wrong.any():
+    lasts = np.bincount(owner) >= _LEAST_ROWS
+    if is_wrong[lasts].sum() > _MAX_WRONG * lasts.sum():
         worst = int(np.argmax(np.where(is_wrong, share, -1.0)))
         what = (
             f"the velocity of {is_wrong.sum()} of {len(names)} tracks contradicts their positions,"

@@ -12,7 +12,7 @@ import shapely
 from shiftsim.geometry.polylines import RUN
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.planners.per_map import PerMap
-from shiftsim.world.layers import Polygons, index_polygons, meeting, square_around
+from shiftsim.world.layers import Polygons, join_polygons, meeting, square_around
 from shiftsim.world.map import VectorMap
 
 NODE_CAPACITY = 10  # of nuPlan's spatial indices
@@ -35,14 +35,9 @@ def make_areas(road: VectorMap, route_lanes: list[int]) -> Areas:
 
 
 def _make_unmarked(road: VectorMap) -> Areas:
-    first, second = road.edges.polygons, road.car_parks.polygons
-    polygons = first
+    polygons = road.edges.polygons
     if len(road.car_parks):
-        polygons = index_polygons(
-            np.concatenate([first.xy, second.xy]),
-            np.concatenate([first.ring_ptr, second.ring_ptr[1:] + len(first.xy)]),
-            np.concatenate([first.poly_ptr, second.poly_ptr[1:] + len(first.ring_ptr) - 1]),
-        )
+        polygons = join_polygons([polygons, road.car_parks.polygons])
     # nuPlan rule 181: membership is a test on ids, which car parks may share with lanes
     parks = [road.edges.index.get(name, -1) for name in road.car_parks.ids]
     lane = np.concatenate([np.arange(len(road.edges)), np.array(parks, np.int64)])

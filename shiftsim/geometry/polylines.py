@@ -94,9 +94,9 @@ def vertex_headings(xy: FloatArray) -> FloatArray:
 
 def arc_lengths(xy: FloatArray, ptr: IntArray) -> FloatArray:
     """(V,) arc length at each vertex from the start of its own polyline, as in `Polylines` [m]."""
-    steps = np.diff(xy, axis=0)
+    dx, dy = np.diff(xy, axis=0).T
     out = np.zeros(len(xy))
-    np.hypot(steps[:, 0], steps[:, 1], out=out[1:])
+    np.sqrt(dx * dx + dy * dy, out=out[1:])  # as nuPlan and GEOS do; hypot may round otherwise
     for start, stop in pairwise(ptr.tolist()):
         out[start:stop][:1] = 0.0
         np.cumsum(out[start:stop], out=out[start:stop])

@@ -25,6 +25,7 @@ from shiftsim.verify.rollouts import (
     CHALLENGES,
     DERIVED,
     LOGGED,
+    ORIGINS,
     REACTIVE,
     SCORES,
     SIMULATED,
@@ -34,6 +35,8 @@ from shiftsim.verify.rollouts import (
     ego_columns,
     light_columns,
     object_columns,
+    origin,
+    plan_at,
     read_ego,
     recorded_log,
     tracks_of,
@@ -143,16 +146,27 @@ def _compare_results(path: Path, challenge: str, find: FindScenario, report: Rep
     left_out, known = set[str](), set[str]()
     for token, planner in dict.fromkeys(key for keys in listed for key in keys):
         run, scenario = Run(challenge, token, planner), find(token)
-        if scenario is None:
-            report.skip(f"{run}: there is no such scenario")
-            continue
         with report.attempt("run", str(run)):
             recorded = read_simulation_log(logs[run.key], report) if run.key in logs else None
-            left_out |= recorded.left_out if recorded else set()
+            if recorded:
+                left_out |= recorded.left_out
+                source = origin(challenge, recorded.ego, recorded.plans)
+                report.remarks.append(f"{run}: {ORIGINS[source]}")
+            if recorded and recorded.dropped_us:
+                report.remarks.append(f"{run}: the last sample repeats a time (dt = 0): dropped")
+                if scenario:
+                    rows = scenario.iteration_rows[:-1]
+                    scenario = replace(scenario, iteration_rows=rows)
+            if scenario is None:
+                report.skip(f"{run}: there is no such scenario")
+                continue
             if runner and not _compare_runner(run, runner["runner_report"][run.key], recorded):
                 continue
             if recorded:
                 rollout = _compare_log(run, scenario, recorded, report)
+                if source != "played back":
+                    with report.attempt("replay", str(run)):
+                        _compare_replay(run, scenario, recorded)
             elif planner in _TWINS:
                 rollout = run.drive(scenario, load_planner(_TWINS[planner]))
             else:
@@ -228,8 +242,7 @@ class _Replay:
 
     def plan(self, observation: Observation) -> Trajectory:
         """The plan of this iteration."""
-        now = self._plans.at(self._plans["iteration"] == observation.iteration)
-        return Trajectory(now["time_us"], read_ego(now))
+        return plan_at(self._plans, observation.iteration)
 
 
 def _compare_log(run: Run, scenario: Scenario, recorded: Recorded, report: Report) -> SimulationLog:
@@ -251,8 +264,6 @@ def _compare_log(run: Run, scenario: Scenario, recorded: Recorded, report: Repor
         report.note("scenario types where they differ (convert with the same filter as nuPlan)")
     _compare_derived(where, ego)
     _match_unordered(where, recorded.lights, light_columns(scenario), "lane_connector_id", EXACT)
-    with report.attempt("replay", where):
-        _compare_replay(run, scenario, recorded)
     states = read_ego(ego)
     return replace(
         recorded_log(scenario, states),

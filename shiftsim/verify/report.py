@@ -41,12 +41,14 @@ class Report:
         mismatches: One line per case that differs.
         not_covered: Count by description of what should be compared and was not.
         informative: Descriptions of what need not be compared.
+        remarks: What else the reader should know of the content.
     """
 
     quantities: dict[str, Quantity] = field(default_factory=dict)
     mismatches: list[str] = field(default_factory=list)
     not_covered: dict[str, int] = field(default_factory=dict)
     informative: list[str] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
 
     def compare(
         self,
@@ -128,6 +130,7 @@ class Report:
                 f"max |Δ| {tally.max_error:.3g} (tolerance {tally.tolerance:.3g})"
                 for name, tally in self.quantities.items()
             ),
+            *self.remarks,
             *(f"not compared: {what}" for what in self.informative),
             *(f"not covered: {what} ({count})" for what, count in self.not_covered.items()),
             *(f"MISMATCH {line}" for line in self.mismatches[:max_mismatches]),

@@ -2,14 +2,18 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from shiftsim.errors import DataError
+from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.planners.registry import load_planner
+from shiftsim.sim.dynamics.lqr import TRACKED, track_and_step
+from shiftsim.sim.dynamics.perfect import interpolate
 from shiftsim.sim.log import SimulationLog, as_recorded
 from shiftsim.sim.planner import Observation, observe_log, scene_info
 from shiftsim.verify.tables import TOLERANCE, Source
@@ -44,6 +48,13 @@ CHALLENGES = {  # controller and traffic
     "PT": ("perfect", "nonreactive"),
     "R": ("lqr", "reactive"),
 }
+ORIGINS = {  # of the ego states in a simulation log
+    "driven": "driven: every state follows from the plan before it",
+    "played back": "played back: its states are the recorded ego and do not follow from the plans",
+    "other": "driven by another controller: its states do not follow from the plans",
+    "unknown": "driven or played back: its plans are of a class that is not known here",
+}
+_STEP_ERROR = 1e-6  # m, rad, m/s, …: of a state that follows from the plan before it
 CATEGORIES = {  # as the devkit files metrics; the others are of `Planning`
     **dict.fromkeys(("speed_limit_compliance", "ego_is_comfortable"), "Violations"),
     **dict.fromkeys(("ego_jerk", "ego_lat_acceleration", "ego_lon_acceleration"), "Dynamics"),
@@ -127,6 +138,33 @@ def recorded_log(scenario: Scenario, ego: FloatArray) -> SimulationLog:
     if len(ego) != len(log.ego):
         raise DataError(f"{len(ego)} ego states, {len(log.ego) + 1} of the expert")
     return replace(log, ego=ego)
+
+
+def origin(challenge: str, ego: Source, plans: Source | None) -> str:
+    """How the ego of a simulation log came to its states: a word of `ORIGINS`."""
+    states, time_us = read_ego(ego), ego["ego_time_us"].astype(np.int64)
+    if plans is None:
+        return "unknown"
+    after, command = np.empty(state.NUM_STATE), np.empty(2)
+    for row, (now, following) in enumerate(pairwise(time_us.tolist())):
+        plan = plan_at(plans, row)
+        if challenge == "PT":
+            is_stepped = interpolate(plan.time_us, plan.states, following, after)
+        else:
+            given = now, following, states[row], plan.time_us, plan.states, 0.0, 0.0
+            is_stepped = track_and_step(*given, after, command) == TRACKED
+        error = after - states[row + 1]
+        error[state.HEADING] = wrap_angle(error[state.HEADING])
+        if not (is_stepped and np.abs(error).max() <= _STEP_ERROR):
+            # nuPlan rule 415: a recorded ego has neither
+            return "other" if states[:, [state.STEERING, state.YAW_RATE]].any() else "played back"
+    return "driven"
+
+
+def plan_at(plans: Source, iteration: int) -> Trajectory:
+    """The recorded plan of an iteration."""
+    now = plans.at(plans["iteration"] == iteration)
+    return Trajectory(now["time_us"].astype(np.int64), read_ego(now))
 
 
 class RecordedRun:

@@ -134,6 +134,7 @@ class Recorded:
     plans: Source | None  # a row per sample and state of the plan; None where it is left out
     seconds: Any  # what the planner took at every sample [s]; None where it is left out
     left_out: frozenset[str]  # names of the classes whose objects were left out
+    dropped_us: int | None  # iteration time of a last sample whose ego has the time before [us]
 
 
 def find_simulation_logs(folder: Path) -> dict[tuple[str, str], Path]:
@@ -187,9 +188,13 @@ def _unpacked(path: Path) -> bytes:
 
 def _recorded(log: Any, report: Report, left_out: frozenset[str]) -> Recorded:
     scenario, history = log.scenario.arguments, log.simulation_history
-    goal, cut = history.mission_goal, scenario[8]
-    egos = _egos(_values(history.data, "ego_state"))
-    egos |= _columns(history.data, _SAMPLE)
+    goal, cut, samples = history.mission_goal, scenario[8], history.data
+    times = _values(samples[-2:], "ego_state._time_point.time_us")
+    dropped_us = None
+    if len(times) > len(set(times)):
+        *samples, last = samples
+        dropped_us = last.iteration.time_point.time_us
+    egos = _egos(_values(samples, "ego_state")) | _columns(samples, _SAMPLE)
     return Recorded(
         facts={
             "token": scenario[2],
@@ -200,11 +205,12 @@ def _recorded(log: Any, report: Report, left_out: frozenset[str]) -> Recorded:
             "vehicle": scenario[9].arguments,
         },
         ego=Source("ego", "column", egos, report),
-        objects=Source("objects", "column", _objects(history.data), report),
-        lights=Source("lights", "column", _lights(history.data), report),
-        plans=_plans(_values(history.data, "trajectory"), report),
+        objects=Source("objects", "column", _objects(samples), report),
+        lights=Source("lights", "column", _lights(samples), report),
+        plans=_plans(_values(samples, "trajectory"), report),
         seconds=getattr(log.planner, "_compute_trajectory_runtimes", None),
         left_out=left_out,
+        dropped_us=dropped_us,
     )
 
 

@@ -137,6 +137,13 @@ def index_polygons(xy: FloatArray, ring_ptr: IntArray, poly_ptr: IntArray) -> Po
     return Polygons(*(readonly(array) for array in arrays))
 
 
+def join_polygons(parts: Sequence[Polygons]) -> Polygons:
+    """Several sets of polygons as one, in their order."""
+    counts = ([part.ring_ptr for part in parts], [part.poly_ptr for part in parts])
+    ptrs = (np.cumsum(np.concatenate([[0], *map(np.diff, each)])) for each in counts)
+    return index_polygons(np.concatenate([part.xy for part in parts]), *ptrs)
+
+
 def _open_ring(ring: FloatArray) -> FloatArray:
     xy = np.asarray(ring, np.float64)[:, :2]
     return xy[:-1] if len(xy) > 1 and (xy[0] == xy[-1]).all() else xy

@@ -130,6 +130,9 @@ def scenes_folder(request: pytest.FixtureRequest) -> Path:
     place = request.node.callspec.params.get("path") or request.node.callspec.params["folder"]
     if places.GOLDEN in place.parents:
         return request.getfixturevalue("nuplan_reference")
+    own = place if place.is_dir() else place.parent
+    if any(own.glob("*.db")):
+        return own
     nearby = [parent / "nuplan" for parent in place.resolve().parents]
     return next((path for path in nearby if (path / "scenes.json").is_file()), nearby[0])
 

@@ -3,7 +3,7 @@
 Everything is made from the scene's own log and map; stored features are only compared with.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -192,8 +192,7 @@ def sample(
 def test_closed_loop(path: Path, scenes: Scenes, cases: Cases) -> None:
     """Features, ids and all outputs are stored for some iterations, the encoding for fewer."""
     plans = ("trajectory_time_us", "trajectory", "ego_prediction")
-    names = [f"{part}{what}" for part in ("lanes", "route_lanes") for what in ("", "_speed_limit")]
-    names += [f"{part}_has_speed_limit" for part in ("lanes", "route_lanes")]
+    names = ["lanes", "lanes_speed_limit", "lanes_has_speed_limit", "route_lanes"]
     names += ["neighbor_agents_past", "ego_current_state", "static_objects"]
     for loop in loop_steps(path, KeyedPlanner, scenes, cases, plans):
         bound = drive_bound(loop.variant, 1e-3, 2e-4)  # m
@@ -209,6 +208,9 @@ def test_closed_loop(path: Path, scenes: Scenes, cases: Cases) -> None:
                 "prediction": loop.output,
                 **{f"feature/{name}": getattr(features, name) for name in names},
             }
+            given = {name: getattr(features, name) for name in names}
+            limits = route_limits(given, road.block_of[features.edges], features.route or ())
+            ours |= {f"feature/{name}": value for name, value in limits.items()}
             loop.match(loop.stored, ours, {"": FEATURE, "prediction": bound})
         if "encoding" in loop.stored:
             network, (inputs, _) = loop.planner.network, loop.planner.batch([loop.features])
@@ -270,8 +272,18 @@ def test_many_lanes(path: Path, cases: Cases) -> None:
     cases.compare(f"{NAME} lights", file.name, lights.sum(axis=1), once)
     route = [index.get(name, -1) for name in file["in.route"].tolist()]
     ours = builder.lane_inputs(lanes, edges, lights.argmax(axis=1)[edges], anchor, route)
+    ours |= route_limits(ours, blocks[edges], route)
     file.below("out.").match(file.name, ours, FEATURE, quantity=f"{NAME} many")
     file.finish()
+
+
+def route_limits(lanes: Mapping[str, Any], blocks: Any, route: Any) -> dict[str, Any]:
+    """Speed limits of the lanes on a route, which the network does not read."""
+    on_route, out = builder.lanes_on_route(blocks, route), {}
+    for name in ("lanes_speed_limit", "lanes_has_speed_limit"):
+        out[f"route_{name}"] = np.zeros_like(lanes[name][: builder.ROUTE_LANES])
+        out[f"route_{name}"][: len(on_route)] = lanes[name][on_route]
+    return out
 
 
 def read_lines(file: File, name: str) -> Polylines:

@@ -1,6 +1,5 @@
 """The map as CaRL sees it: what of its raster depends on the map only."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +7,7 @@ from numpy.typing import NDArray
 
 from shiftsim.kernels import IntArray, kernel
 from shiftsim.planners.proposals.areas import index_ranks
-from shiftsim.world.layers import Lists, Polygons, Polylines, index_polygons, make_polylines
+from shiftsim.world.layers import Lists, Polygons, Polylines, join_polygons, make_polylines
 from shiftsim.world.map import NONE, VectorMap
 
 YES = 255
@@ -36,7 +35,9 @@ class Roads(NamedTuple):
 
 def make_roads(road: VectorMap) -> Roads:
     """What of a map is drawn."""
-    areas = _joined([road.blocks.polygons, road.car_parks.polygons, road.intersections.polygons])
+    areas = join_polygons(
+        [road.blocks.polygons, road.car_parks.polygons, road.intersections.polygons]
+    )
     num_blocks, num_areas = len(road.blocks), len(road.blocks) + len(road.car_parks)
     drivable = np.arange(num_areas)
     for block in range(road.num_roadblocks, num_blocks):
@@ -55,18 +56,6 @@ def make_roads(road: VectorMap) -> Roads:
         lines_of,
         np.array([level(limit, MAX_SPEED) for limit in road.speed_limits.tolist()], np.uint8),
     )
-
-
-def _joined(parts: Sequence[Polygons]) -> Polygons:
-    """Several sets of polygons as one."""
-    ring_ptr, poly_ptr = [np.zeros(1, np.int64)], [np.zeros(1, np.int64)]
-    vertices = rings = 0
-    for part in parts:
-        ring_ptr.append(part.ring_ptr[1:] + vertices)
-        poly_ptr.append(part.poly_ptr[1:] + rings)
-        vertices, rings = vertices + len(part.xy), rings + len(part.ring_ptr) - 1
-    xy = np.concatenate([part.xy for part in parts])
-    return index_polygons(xy, np.concatenate(ring_ptr), np.concatenate(poly_ptr))
 
 
 def _lines(road: VectorMap) -> tuple[Polylines, IntArray]:

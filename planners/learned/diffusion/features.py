@@ -61,8 +61,6 @@ class Features:
     lanes_speed_limit: Single  # (70, 1) [m/s], 0 where unknown
     lanes_has_speed_limit: BoolArray  # (70, 1)
     route_lanes: Single  # (25, 20, 12) those of the lanes that are on the route
-    route_lanes_speed_limit: Single  # (25, 1); the network does not read it
-    route_lanes_has_speed_limit: BoolArray  # (25, 1); the network does not read it
     noise: Single  # (11, 80, 4) standard normal start noise of the sampler
     edges: IntArray  # edges behind the lanes
     agents: IntArray  # tracks behind the agents
@@ -212,12 +210,11 @@ def lane_inputs(
     known, limits = np.zeros((LANES, 1), np.bool_), np.zeros((LANES, 1), np.float32)
     known[:count, 0] = ~np.isnan(lanes.limits[edges])
     limits[:count, 0] = np.nan_to_num(lanes.limits[edges])
-    named = {"lanes": rows, "lanes_speed_limit": limits, "lanes_has_speed_limit": known}
     on_route = lanes_on_route(lanes.blocks[edges], route)
-    for name, array in list(named.items()):
-        chosen = named[f"route_{name}"] = np.zeros((ROUTE_LANES, *array.shape[1:]), array.dtype)
-        chosen[: len(on_route)] = array[on_route]
-    return named
+    chosen = np.zeros((ROUTE_LANES, POINTS, LANE_COLUMNS), np.float32)
+    chosen[: len(on_route)] = rows[on_route]
+    limited = {"lanes_speed_limit": limits, "lanes_has_speed_limit": known}
+    return {"lanes": rows, "route_lanes": chosen, **limited}
 
 
 def agent_features(tracks: Tracks, anchor: FloatArray) -> tuple[Single, Single, IntArray]:

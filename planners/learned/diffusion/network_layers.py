@@ -5,6 +5,7 @@ make zero tokens. The transformer refines trajectories of the ego and its neighb
 """
 
 import math
+from collections import OrderedDict
 from typing import NamedTuple
 
 import torch
@@ -75,18 +76,6 @@ class AgentEncoder(MixerEncoder):
         return self.token(x + self.type_emb(agents[:, -1, AGENT_COLUMNS:]))
 
 
-class StaticEncoder(nn.Module):
-    """Static objects to tokens."""
-
-    def __init__(self, hidden: int) -> None:
-        super().__init__()
-        self.projection = Mlp(STATIC_COLUMNS, hidden, hidden)
-
-    def forward(self, objects: Tensor) -> Tensor:
-        """(N, 10) to (N, hidden)."""
-        return self.projection(objects)
-
-
 class LaneEncoder(MixerEncoder):
     """Lanes to tokens."""
 
@@ -139,7 +128,8 @@ class SceneEncoder(nn.Module):
     def __init__(self, hidden: int, heads: int, depth: int) -> None:
         super().__init__()
         self.neighbor_encoder = AgentEncoder(hidden, depth)
-        self.static_encoder = StaticEncoder(hidden)
+        projection = Mlp(STATIC_COLUMNS, hidden, hidden)
+        self.static_encoder = nn.Sequential(OrderedDict(projection=projection))
         self.lane_encoder = LaneEncoder(hidden, depth)
         self.fusion = Fusion(hidden, heads, depth)
         self.pos_emb = Linear(POSITION, hidden)

@@ -1,5 +1,6 @@
 """The network of PLUTO, with the names and shapes of its checkpoint."""
 
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -69,16 +70,9 @@ class Outputs(NamedTuple):
     ego: Tensor  # (B, 128) its token
 
 
-class Head(nn.Module):
-    """Linear, LayerNorm, ReLU, Linear."""
-
-    def __init__(self, hidden: int, outputs: int) -> None:
-        super().__init__()
-        self.mlp = head(DIM, hidden, outputs)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(..., 128) to (..., outputs)."""
-        return self.mlp(x)
+def _head(hidden: int, outputs: int) -> nn.Sequential:
+    """(..., 128) to (..., outputs): Linear, LayerNorm, ReLU, Linear."""
+    return nn.Sequential(OrderedDict(mlp=head(DIM, hidden, outputs)))
 
 
 def _motion(x: Tensor, heads: Sequence[nn.Module]) -> Tensor:
@@ -122,7 +116,7 @@ class AgentPredictor(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        heads = (Head(2 * DIM, 2 * STEPS) for _ in range(3))
+        heads = (_head(2 * DIM, 2 * STEPS) for _ in range(3))
         self.loc_predictor, self.yaw_predictor, self.vel_predictor = heads
 
     def forward(self, tokens: Tensor) -> Tensor:
@@ -180,8 +174,8 @@ class PlanningDecoder(nn.Module):
         self.m_pos = nn.Parameter(0.01 * torch.randn(1, MODES, DIM))
         self.decoder_blocks = nn.ModuleList(DecoderBlock() for _ in range(DEPTH))
         self.cat_x_proj = Linear(2 * DIM, DIM)
-        self.loc_head, self.yaw_head, self.vel_head = (Head(2 * DIM, 2 * STEPS) for _ in range(3))
-        self.pi_head = Head(DIM, 1)
+        self.loc_head, self.yaw_head, self.vel_head = (_head(2 * DIM, 2 * STEPS) for _ in range(3))
+        self.pi_head = _head(DIM, 1)
 
     def forward(
         self, inputs: Inputs, tokens: Tensor, scenes: Scenes, egos: Tensor
@@ -237,7 +231,7 @@ class PlutoNetwork(nn.Module):
         self.agent_predictor = AgentPredictor()
         self.planning_decoder = PlanningDecoder()
         self.hidden_proj = layers.perceptron(DIM, DIM, DIM)  # of the contrastive loss only
-        self.ref_free_decoder = Head(2 * DIM, 4 * STEPS)
+        self.ref_free_decoder = _head(2 * DIM, 4 * STEPS)
 
     def forward(self, inputs: Inputs) -> Outputs:
         """Plan for a batch."""

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shiftsim.errors import PlannerError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.kernels import FloatArray
 from shiftsim.planners.learned.base import LearnedPlanner
@@ -101,24 +100,20 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
     """PLUTO with its rule-based choice."""
 
     name = "pluto"
-    _scene: SceneInfo | None = None
     route: reference.RouteLanes | None = None  # lanes of the corrected route, from the first step
-    surroundings: Surroundings | None = None  # what the last step saw
+    surroundings: Surroundings  # what the last step saw
     choice: Choice | None = None  # how it chose; None where it had no reference line
 
     def reset(self, scene: SceneInfo) -> None:
         """Look up the route; it is corrected at the first step."""
         self._blocks = route_blocks(scene)
         self._scene, self._lights = scene, LightLookup(scene.map)
-        self.route = self.surroundings = self.choice = None
+        self.route = self.choice = None
         self.degraded = ""
 
     def features(self, observation: Observation) -> SceneInputs:
         """Arrays of the network; what they were made from is kept in `surroundings`."""
-        scene = self._scene
-        if scene is None:
-            raise PlannerError(f"{self.name}: plan() was called before reset()")
-        road, history = scene.map, observation.history
+        road, history = self._scene.map, observation.history
         ego, center = history.ego[-1].copy(), observation.ego.center
         if self.route is None:
             known = self._blocks
@@ -153,8 +148,6 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
 
     def decode(self, output: Output, observation: Observation) -> Trajectory:
         """The best proposal, an emergency brake, or the reference-free trajectory."""
-        assert self.surroundings is not None
-        assert self._scene is not None
         history, self.choice = observation.history, None
         # where the official planner would fail
         reason = short_history(len(history.ego)) if self.surroundings.lines else NO_LINE
@@ -170,11 +163,9 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         return Trajectory(observation.time_us + STEP_US * np.arange(len(states)), states)
 
     def _choose(self, output: Output, observation: Observation) -> Choice:
-        surroundings = self.surroundings
-        assert surroundings is not None
         ego, tracks = observation.history.ego[-1].copy(), observation.history.tracks
         poses, learned = best_proposals(output, ego[:3])
-        seen, rows = surroundings.agents, surroundings.agents.tracks
+        seen, rows = self.surroundings.agents, self.surroundings.agents.tracks
         local = np.concatenate([seen.position[1:, -1], seen.heading[1:, -1:]], axis=1)
         present = (tracks.poses[-1, rows], tracks.velocities[-1, rows])
         motion = predicted_agents(output, local, *present, ego[:3])
@@ -189,8 +180,6 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         `learned` (P,) are their scores by the network.
         """
         scene, surroundings, route = self._scene, self.surroundings, self.route
-        assert scene is not None
-        assert surroundings is not None
         assert route is not None
         ego = observation.history.ego[-1].copy()
         size = np.array([scene.vehicle.length, scene.vehicle.width])

@@ -186,15 +186,6 @@ class CarFootprint(OrientedBox):
         """From the pose of the centre."""
         return cls(center, vehicle_parameters)
 
-    @classmethod
-    def build_from_cog(
-        cls, cog_pose: StateSE2, vehicle_parameters: VehicleParameters
-    ) -> "CarFootprint":
-        """From the pose of the centre of gravity."""
-        ahead = vehicle_parameters.cog_position_from_rear_axle
-        distance = vehicle_parameters.rear_axle_to_center - ahead
-        return cls(translate_longitudinally(cog_pose, distance), vehicle_parameters)
-
     oriented_box = derived(lambda self: self, "The box itself.")
     rear_axle_to_center_dist = derived(
         lambda self: float(self.vehicle_parameters.rear_axle_to_center),
@@ -205,10 +196,6 @@ class CarFootprint(OrientedBox):
     def rear_axle(self) -> StateSE2:
         """Pose of the rear axle."""
         return translate_longitudinally(self.center, -self.rear_axle_to_center_dist)
-
-    def get_point_of_interest(self, point_of_interest: OrientedBoxPointType) -> Point2D:
-        """One point of the box."""
-        return self.corner(point_of_interest)
 
 
 def collision_by_radius_check(

@@ -145,12 +145,6 @@ class StateSE2(Point2D):
         cos, sin = np.cos(self.heading), np.sin(self.heading)
         return np.array([[cos, -sin, self.x], [sin, cos, self.y], [0.0, 0.0, 1.0]])
 
-    def as_matrix_3d(self) -> FloatArray:
-        """(4, 4) the same in space."""
-        out = np.eye(4)
-        out[:2, [0, 1, 3]] = self.as_matrix()[:2]
-        return out
-
     def distance_to(self, state: Point2D) -> float:
         """Distance between the positions [m]."""
         return float(np.hypot(self.x - state.x, self.y - state.y))

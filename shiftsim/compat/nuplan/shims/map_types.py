@@ -126,13 +126,6 @@ class LaneGraphEdgeMapObject(GraphEdgeMapObject):
         """Whether another one is of the same roadblock."""
         return self.get_roadblock_id() == other.get_roadblock_id()
 
-    def is_adjacent_to(self, other: "LaneGraphEdgeMapObject") -> bool:
-        """Whether another one of the same roadblock shares a boundary."""
-        return self.is_same_roadblock(other) and (
-            self.right_boundary.id == other.left_boundary.id
-            or self.left_boundary.id == other.right_boundary.id
-        )
-
 
 class Lane(LaneGraphEdgeMapObject):
     """A lane."""

@@ -76,22 +76,6 @@ class SceneObject:
         self.metadata = metadata
         self._box = oriented_box
 
-    @classmethod
-    def from_raw_params(
-        cls,
-        token: str,
-        track_token: str,
-        timestamp_us: int,
-        track_id: int,
-        center: StateSE2,
-        size: tuple[float, float, float],
-    ) -> "SceneObject":
-        """A generic object; `size` is width, length, height [m]."""
-        width, length, height = size
-        box = OrientedBox(center, length, width, height)
-        metadata = SceneObjectMetadata(timestamp_us, token, track_id, track_token)
-        return SceneObject(TrackedObjectType.GENERIC_OBJECT, box, metadata)
-
     box = part("_box", "Its box.")
     center = part("_box.center", "Pose of the box's centre.")
     token = part("metadata.token", "Id of this object in this sample.")
@@ -187,12 +171,6 @@ class Agent(AgentTemporalState, AgentState):
             self, tracked_object_type, oriented_box, velocity, metadata, angular_velocity
         )
 
-    @classmethod
-    def from_agent_state(cls, agent: AgentState) -> "Agent":
-        """An agent without past and future."""
-        kind, turning = agent.tracked_object_type, agent.angular_velocity
-        return cls(kind, agent.box, agent.velocity, agent.metadata, turning)
-
 
 TrackedObject: TypeAlias = Any
 
@@ -203,15 +181,6 @@ class TrackedObjects:
     def __init__(self, tracked_objects: Iterable[TrackedObject] | None = None) -> None:
         self.tracked_objects: list[TrackedObject] = sorted(
             tracked_objects or (), key=lambda item: int(item.tracked_object_type)
-        )
-
-    @classmethod
-    def from_oriented_boxes(cls, boxes: Sequence[OrientedBox]) -> "TrackedObjects":
-        """Generic objects, numbered."""
-        kind = TrackedObjectType.GENERIC_OBJECT
-        return cls(
-            SceneObject(kind, box, SceneObjectMetadata(number, str(number), None, None))
-            for number, box in enumerate(boxes)
         )
 
     def get_tracked_objects_of_type(self, wanted: TrackedObjectType) -> list[TrackedObject]:
@@ -319,11 +288,6 @@ def ego_path_to_se2(path: Sequence[Any]) -> list[StateSE2]:
     return [state.center for state in path]
 
 
-def ego_path_to_linestring(path: Sequence[Any]) -> shapely.LineString:
-    """The line through the centres of ego states."""
-    return path_to_linestring(ego_path_to_se2(path))
-
-
 def create_path_from_se2(states: list[StateSE2]) -> InterpolatedPath:
     """The path through poses, of which repeated ones count once."""
     path = convert_se2_path_to_progress_path(states)
@@ -332,8 +296,3 @@ def create_path_from_se2(states: list[StateSE2]) -> InterpolatedPath:
     return InterpolatedPath(
         [pose for pose, step in zip(path, steps, strict=False) if not np.isclose(step, 0.0)]
     )
-
-
-def create_path_from_ego_state(states: list[Any]) -> InterpolatedPath:
-    """`create_path_from_se2` of the centres of ego states."""
-    return create_path_from_se2(ego_path_to_se2(states))

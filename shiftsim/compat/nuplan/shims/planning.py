@@ -4,7 +4,7 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, TypeAlias
@@ -12,9 +12,9 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from shiftsim.compat.nuplan.shims.ego import EgoState, InterpolatableState, SplitState
-from shiftsim.compat.nuplan.shims.geometry import StateSE2, TimeDuration, TimePoint, derived, part
+from shiftsim.compat.nuplan.shims.geometry import StateSE2, TimePoint, derived, part
 from shiftsim.compat.nuplan.shims.map_types import AbstractMap, TrafficLightStatusData
-from shiftsim.compat.nuplan.shims.objects import DetectionsTracks, Observation
+from shiftsim.compat.nuplan.shims.objects import Observation
 from shiftsim.compat.nuplan.shims.transforms import AngularInterpolator
 
 _SAMPLING_TOLERANCE = 1e-10  # as in nuPlan
@@ -345,50 +345,8 @@ class AbstractPlanner(ABC):
 
 
 # nuplan.planning.scenario_builder.abstract_scenario
-class AbstractScenario(ABC):
-    """A recorded scenario. For annotations and subclasses: planners are not given one."""
-
-    @abstractmethod
-    def get_number_of_iterations(self) -> int:
-        """How many iterations it has."""
-
-    @abstractmethod
-    def get_time_point(self, iteration: int) -> TimePoint:
-        """Moment of an iteration."""
-
-    @abstractmethod
-    def get_ego_state_at_iteration(self, iteration: int) -> EgoState:
-        """Where the recorded driver was."""
-
-    @abstractmethod
-    def get_tracked_objects_at_iteration(
-        self, iteration: int, future_trajectory_sampling: Any = None
-    ) -> DetectionsTracks:
-        """The objects there were."""
-
-    start_time = derived(lambda self: self.get_time_point(0), "Moment of iteration 0.")
-    end_time = derived(
-        lambda self: self.get_time_point(self.get_number_of_iterations() - 1),
-        "Moment of the last iteration.",
-    )
-    duration_s = derived(
-        lambda self: TimeDuration.from_s(self.end_time.time_s - self.start_time.time_s),
-        "How long it lasts.",
-    )
-    initial_ego_state = derived(
-        lambda self: self.get_ego_state_at_iteration(0), "The recorded driver at iteration 0."
-    )
-    initial_tracked_objects = derived(
-        lambda self: self.get_tracked_objects_at_iteration(0), "The objects at iteration 0."
-    )
-
-    def get_ego_trajectory_slice(self, start_idx: int, end_idx: int) -> Iterator[EgoState]:
-        """The recorded driver at iterations `start_idx` … `end_idx` - 1."""
-        return (self.get_ego_state_at_iteration(index) for index in range(start_idx, end_idx))
-
-    def get_expert_ego_trajectory(self) -> Iterator[EgoState]:
-        """The recorded driver at all iterations."""
-        return self.get_ego_trajectory_slice(0, self.get_number_of_iterations())
+class AbstractScenario:
+    """A recorded scenario. For annotations: planners are not given one."""
 
 
 # nuplan.planning.training

@@ -67,14 +67,6 @@ def transform_matrix_to_state_se2_tensor_batch(input_data: torch.Tensor) -> torc
     return torch.cat([matrix[:, :2, 2], heading[:, None]], 1)
 
 
-def transform_matrix_to_state_se2_tensor(
-    input_data: torch.Tensor, precision: torch.dtype | None = None
-) -> torch.Tensor:
-    """(3,) pose of a transform (3, 3)."""
-    pose = transform_matrix_to_state_se2_tensor_batch(_shaped(input_data, 2, 3)[None])[0]
-    return pose.to(precision or pose.dtype)
-
-
 def global_state_se2_tensor_to_local(
     global_states: torch.Tensor, local_state: torch.Tensor, precision: torch.dtype | None = None
 ) -> torch.Tensor:

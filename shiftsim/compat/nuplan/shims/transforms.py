@@ -1,6 +1,5 @@
 """Functions that move points and poses about, and measure between them."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from enum import IntEnum
 from typing import Any
@@ -72,13 +71,6 @@ def _square(matrix: FloatArray, size: int) -> FloatArray:
 # nuplan.common.geometry.convert
 
 
-def pose_from_matrix(transform_matrix: FloatArray) -> StateSE2:
-    """The pose of a (3, 3) transform."""
-    if transform_matrix.shape != (3, 3):
-        raise RuntimeError(f"a 3x3 transform is needed, not {transform_matrix.shape}")
-    return StateSE2.from_matrix(transform_matrix)
-
-
 def matrix_from_pose(pose: StateSE2) -> FloatArray:
     """(3, 3) transform of a pose."""
     return pose.as_matrix()
@@ -115,11 +107,6 @@ def numpy_array_to_absolute_velocity(
     return [StateVector2D(pose.x, pose.y) for pose in moved]
 
 
-def vector_2d_from_magnitude_angle(magnitude: float, angle: float) -> StateVector2D:
-    """A vector from its length and direction [rad]."""
-    return StateVector2D(np.cos(angle) * magnitude, np.sin(angle) * magnitude)
-
-
 # nuplan.common.geometry.compute
 
 
@@ -133,11 +120,6 @@ def longitudinal_distance(reference: StateSE2, other: Point2D) -> float:
     """How far a point is ahead of a pose [m]."""
     cos, sin = np.cos(reference.heading), np.sin(reference.heading)
     return float(cos * (other.x - reference.x) + sin * (other.y - reference.y))
-
-
-def compute_distance(lhs: StateSE2, rhs: StateSE2) -> float:
-    """Distance between two positions [m]."""
-    return lhs.distance_to(rhs)
 
 
 def principal_value(angle: Any, min_: float = -np.pi) -> Any:
@@ -161,28 +143,8 @@ class AngularInterpolator:
 
 
 # nuplan.planning.simulation.path
-class AbstractPath(ABC):
+class AbstractPath:
     """Poses over the distance along a path [m]."""
-
-    @abstractmethod
-    def get_start_progress(self) -> float:
-        """Where it starts [m]."""
-
-    @abstractmethod
-    def get_end_progress(self) -> float:
-        """Where it ends [m]."""
-
-    @abstractmethod
-    def get_state_at_progress(self, progress: float) -> ProgressStateSE2:
-        """The pose at a distance."""
-
-    @abstractmethod
-    def get_state_at_progresses(self, progresses: list[float]) -> list[ProgressStateSE2]:
-        """The poses at distances."""
-
-    @abstractmethod
-    def get_sampled_path(self) -> list[ProgressStateSE2]:
-        """The poses it is made of."""
 
 
 class InterpolatedPath(AbstractPath):
@@ -270,21 +232,6 @@ def approximate_derivatives(
 def extract_ego_time_point(ego_states: Sequence[Any]) -> IntArray:
     """(K,) times [us]."""
     return np.array([state.time_us for state in ego_states])
-
-
-def extract_ego_center(ego_states: Sequence[Any]) -> list[Point2D]:
-    """Positions of the centres."""
-    return [state.center.point for state in ego_states]
-
-
-def extract_ego_center_with_heading(ego_states: Sequence[Any]) -> list[StateSE2]:
-    """Poses of the centres."""
-    return [state.center for state in ego_states]
-
-
-def extract_ego_corners(ego_states: Sequence[Any]) -> list[list[Point2D]]:
-    """Corners of the footprints."""
-    return [state.car_footprint.all_corners() for state in ego_states]
 
 
 def extract_ego_heading(ego_states: Sequence[Any]) -> FloatArray:
