@@ -18,12 +18,7 @@ class PerMap(Generic[Arrays]):
 
     def __call__(self, road: VectorMap) -> Arrays:
         """The arrays of a map; maps are told apart by identity."""
-        for index, (known, arrays) in enumerate(self._kept):
-            if known is road:
-                if index:
-                    self._kept.insert(0, self._kept.pop(index))
-                return arrays
-        arrays = self._build(road)
-        self._kept.insert(0, (road, arrays))
-        del self._kept[MAPS_KEPT:]
-        return arrays
+        found = [item for item in self._kept if item[0] is road] or [(road, self._build(road))]
+        others = [item for item in self._kept if item[0] is not road]
+        self._kept = [*found, *others][:MAPS_KEPT]
+        return found[0][1]
