@@ -58,9 +58,7 @@ _REMEDIES = {
     "lanes overlap": "convert the map again, or repair the polygons of these lanes",
     "repeated rows": "leave repeated rows out, and give every object an id of its own",
     "velocity": "check the unit and the axes of velocities and positions where they came from",
-    "heading": (
-        "check the unit (radians), zero (x axis) and sense (counter-clockwise) of headings"
-    ),
+    "heading": "check that headings are radians, 0 along the x axis, counter-clockwise",
     "off the map": "check that map and recording have one origin, or leave the scenario out",
     "range": CHECK,
     "length": "cut longer windows, or leave the scenario out",
