@@ -100,6 +100,43 @@ class Run(results.Run):
         gallery = self._gallery()
         return gallery.page(gallery.find(token))
 
+    def diff(self, other: results.Run, *, limit: int = 10, tolerance: float = 1e-6) -> Any:
+        """Scenarios whose score differs in another run, and where the rollouts part.
+
+        Printed in words; its fields are those of `shiftsim.runs.diff.Difference`. Rollouts part
+        where a quantity differs by more than the tolerance [m, rad, m/s, …].
+
+        Raises:
+            ConfigError: The runs have no rollout in common.
+        """
+        from shiftsim.runs.diff import diff_runs
+
+        return diff_runs(self, other, limit=limit, tolerance=tolerance)
+
+    def rescore(self, thresholds: str, **settings: Any) -> "Run":
+        """A new run: the stored rollouts under another threshold profile, or with more `metrics`.
+
+        Settings are `metrics`, `store`, `out` and `workers`.
+
+        Raises:
+            DataError: Rollouts are missing, or the store is another one.
+        """
+        from shiftsim.runs.derive import rescore
+
+        made = rescore(self, thresholds=thresholds, **settings)
+        return Run(made.path, made.manifest)
+
+    def bundle(self, store: str | None = None) -> "Run":
+        """Copy the scenarios and maps of the run into its folder, which then needs no store.
+
+        Raises:
+            DataError: The store is not there, or is another one.
+        """
+        from shiftsim.runs.scenarios import bundle_run
+
+        bundle_run(self, store)
+        return self
+
     def _gallery(self) -> Any:
         from shiftsim.runs.scenarios import open_run_store
         from shiftsim.view.build import Gallery

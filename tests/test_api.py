@@ -1,6 +1,7 @@
 """The public names: what they print, what notebooks show of them, and that their examples run."""
 
 import re
+import shutil
 import sys
 
 import pytest
@@ -124,6 +125,17 @@ def test_a_run_explains_and_plots_a_scenario(run, scenario, tmp_path):
     assert (tmp_path / "scene.png").stat().st_size > 5000
     with pytest.raises(shiftsim.ShiftsimError, match="time 99"):
         run.plot(scenario.token, at=99.0)
+
+
+def test_a_run_is_scored_again_compared_and_made_self_contained(run, tmp_path):
+    again = run.rescore("deepplan", out=tmp_path / "again")
+    assert again.manifest["determining"]["thresholds"]["name"] == "deepplan"
+    found = run.diff(again)
+    assert "thresholds" in found.settings
+    assert str(found).startswith(f" same {found.same} · better {found.better}")
+    moved = shiftsim.open_run(shutil.copytree(run.path, tmp_path / "moved"))
+    assert not (moved.path / "store").exists()
+    assert shiftsim.open_store(moved.bundle().path / "store").tokens
 
 
 def test_notebooks_show_pictures_of_scenarios_and_maps_and_tables_of_the_others(run, scenario, log):

@@ -80,6 +80,12 @@ class Difference:
     means: tuple[float, float] | None
     changes: tuple[Change, ...]  # the rollouts that changed most
 
+    def __repr__(self) -> str:
+        return f"<Difference: same {self.same}, better {self.better}, worse {self.worse}>"
+
+    def __str__(self) -> str:
+        return "\n".join(diff_lines(self))
+
     def to_dict(self) -> dict[str, Any]:
         """As JSON values."""
         out = asdict(self)
