@@ -101,21 +101,28 @@ Reward = Callable[[Episode], float]
 def regular(episode: Episode) -> float:
     """CaRL's simple reward: progress, less what was done wrong on the way; 100 in all."""
     t = episode.terms
-    return 0.0 if t.infraction else 100.0 * t.progress * _factor(t)
+    if episode.infraction:
+        return 0.0
+    return 100.0 * t.progress * _factor(t)
 
 
 def nuplan(episode: Episode) -> float:
     """CaRL's reward with the weights of nuPlan's score."""
     t = episode.terms
+    if episode.infraction:
+        return 0.0
     steady = 5.0 * (t.ttc == 1.0) + 4.0 * t.speed + 2.0 * (t.comfort == 1.0)
     total = (5.0 * t.progress + steady / NOMINAL_ITERATIONS) / 16.0
-    return 0.0 if t.infraction else 100.0 * t.on_route * t.lane * total
+    return 100.0 * t.on_route * t.lane * total
 
 
 def survival(episode: Episode) -> float:
     """CaRL's reward that also pays for every step without an infraction."""
-    t, paid = episode.terms, SURVIVAL / NOMINAL_ITERATIONS
-    return 0.0 if t.infraction else 100.0 * ((1.0 - SURVIVAL) * t.progress * _factor(t) + paid)
+    t = episode.terms
+    if episode.infraction:
+        return 0.0
+    paid = SURVIVAL / NOMINAL_ITERATIONS
+    return 100.0 * ((1.0 - SURVIVAL) * t.progress * _factor(t) + paid)
 
 
 def score(episode: Episode) -> float:

@@ -33,8 +33,8 @@ def test_the_options_are_those_of_before():
     flags = [max(option.opts, key=len) for option in options_of("run").values()]
     words = """--planner --noise --seeds --store --split --limit --all --edits --traffic
         --controller --thresholds --planner-arg --metric --checkpoint --device --batch-size
-        --isolate --planner-python --strict --out --workers --timeout --resume --retry-failed
-        --shard --executor --scheduler --save-rollouts
+        --isolate --planner-python --strict --open-loop --out --workers --timeout
+        --resume --retry-failed --shard --executor --scheduler --save-rollouts
         --bundle --allow-partial --config --dry-run --live --quiet --json"""
     assert flags == words.split()
 
