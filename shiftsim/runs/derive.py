@@ -182,8 +182,7 @@ def rescore(
         fingerprint=fingerprint,
         argv=argv,
     )
-    if edits := run.manifest.get("edits"):
-        manifest["edits"] = edits
+    manifest |= {key: run.manifest[key] for key in ("edits", "split_size") if key in run.manifest}
     with closing(RunWriter(target, manifest)) as writer:
         for result in stored_results(run.path):
             if result.status != OK:  # it stays so

@@ -108,3 +108,4 @@ def test_a_run_with_open_loop_keeps_its_rows_when_it_is_scored_again(tmp_path):
     kept = [row for row in scored_again if row["metric"] in NAMES]
     assert kept == [row | {"thresholds": "deepplan"} for row in added]
     assert runs[0].manifest["determining"] != runs[1].manifest["determining"]
+    assert again.manifest["split_size"] == runs[1].manifest["split_size"]
