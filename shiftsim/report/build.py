@@ -37,6 +37,7 @@ TABLES = {
     "planner-comparison-noise": "the same under every noise",
     "scenario-types": "clean scores by scenario type",
     "scores": "every planner, noise and metric",
+    "open-loop": "nuPlan's open-loop scores, of runs with --open-loop",
     "planning-time": "how long planners think, steps on a fallback plan",
     "data-statistics": "what the scenarios hold",
     "benchmark-comparison": "the data beside that of other benchmarks",
@@ -110,6 +111,7 @@ def _makers(
         "planner-comparison-noise": lambda: [details.planner_comparison(groups, noisy=True)],
         "scenario-types": lambda: details.scenario_types(groups),
         "scores": lambda: [scores(groups, by=options.by)],
+        "open-loop": lambda: [details.open_loop_scores(groups)],
         "planning-time": lambda: [details.planning_times(groups)],
         "data-statistics": lambda: [dataset.data_statistics(statistics())],
         "benchmark-comparison": lambda: (

@@ -8,6 +8,7 @@ import pyarrow.compute as pc
 
 from shiftsim.edits.sampling import GRADES, graded
 from shiftsim.kernels import FloatArray
+from shiftsim.metrics import open_loop
 from shiftsim.report.groups import Group, by_set, distinct_sets
 from shiftsim.report.statistics import (
     FEW_CLUSTERS,
@@ -168,6 +169,48 @@ def _driven_as(group: Group) -> tuple[object, ...]:
     data = group.data
     labels = (group.traffic, group.planner, group.noise, group.seeds)
     return (*labels, data.windows, *data.traits[:3])
+
+
+def open_loop_scores(groups: Sequence[Group]) -> Table | None:
+    """Open loop beside closed loop, of the runs that asked for it."""
+    asked = [group for group in groups if group.run.manifest["config"].get("open_loop")]
+    each = {(group.run.path, group.planner): group for group in reversed(asked)}
+    if not each:
+        return None
+    errors = tuple(f"{name} {unit}" for name, unit, *_ in open_loop.METRICS.values())
+    header = ("set", "traffic", "planner", "noise", "CLS", "open loop", *errors, "missed", "plans")
+    notes = (
+        "CLS: closed loop under that noise; open loop: nuPlan's score of the plans along the "
+        "recording; errors: means over plans and horizons of 3, 5 and 8 s; missed: largest share "
+        "of plans that are too far away",
+        "plans: compared ones of all; where some were not, as the recording ends, the score is "
+        "not nuPlan's",
+    )
+    rows = [_open_loop_row(group) for group in reversed(each.values())]
+    title = "Open loop beside closed loop, scores x 100"
+    return Table("open-loop", title, header, rows, 4, notes)
+
+
+def _open_loop_row(group: Group) -> Row:
+    metrics = group.run.metrics
+    mine = pc.and_(
+        pc.equal(metrics["planner"], group.name), pc.equal(metrics["noise"], group.noise)
+    )
+    found = metrics.filter(mine).group_by("metric").aggregate([("value", "sum"), ("value", "mean")])
+    sums, means = (
+        dict(zip(found["metric"].to_pylist(), found[f"value_{of}"].to_pylist(), strict=True))
+        for of in ("sum", "mean")
+    )
+    plans = metrics.filter(pc.and_(mine, pc.equal(metrics["metric"], open_loop.COUNT)))
+    counted, there = sums.get(open_loop.COUNT), pc.sum(plans["threshold"]).as_py()
+    score = means.get(open_loop.TOTAL)
+    return (
+        *(group.data.label, group.traffic, group.planner, group.noise, group.estimate()),
+        None if score is None else Number(100.0 * score),
+        *(None if (e := means.get(name)) is None else Number(e) for name in open_loop.METRICS),
+        None if (rate := means.get(open_loop.MISS)) is None else Number(rate),
+        f"{counted:.0f} of {there:.0f}" if counted else None,
+    )
 
 
 def planning_times(groups: Sequence[Group]) -> Table:

@@ -8,6 +8,8 @@ from hypothesis import strategies as st
 import shiftsim
 from shiftsim.errors import DataError, PlannerError
 from shiftsim.metrics.open_loop import EVERY, NAMES, Poses, metric_rows, open_loop, recording
+from shiftsim.report.details import open_loop_scores
+from shiftsim.report.groups import read_groups
 from shiftsim.runs.derive import rescore
 from shiftsim.sim.loop import plans_on_recording
 from shiftsim.world.state import Command
@@ -108,4 +110,11 @@ def test_a_run_with_open_loop_keeps_its_rows_when_it_is_scored_again(tmp_path):
     kept = [row for row in scored_again if row["metric"] in NAMES]
     assert kept == [row | {"thresholds": "deepplan"} for row in added]
     assert runs[0].manifest["determining"] != runs[1].manifest["determining"]
+    assert open_loop_scores(read_groups(runs[:1])) is None
+    table = open_loop_scores(read_groups(runs[1:]))
+    (row,) = table.rows
+    values = {row["metric"]: row["value"] for row in added}
+    assert row[5].value == pytest.approx(100.0 * values["open_loop_score"])
+    assert row[6].value == pytest.approx(values["planner_expert_average_l2_error_within_bound"])
+    assert row[-1] == f"{values['open_loop_plans']:.0f} of {added[-1]['threshold']:.0f}"
     assert again.manifest["split_size"] == runs[1].manifest["split_size"]
