@@ -151,8 +151,7 @@ class Tracks:
 
     def readonly(self) -> "Tracks":
         """The same tracks in arrays that cannot be written."""
-        arrays = self.valid, self.poses, self.velocities, self.sizes, self.kinds
-        return Tracks(*map(readonly, arrays), self.tokens)
+        return replace(self._with(readonly), kinds=readonly(self.kinds))
 
     @staticmethod
     def empty(num_rows: int) -> "Tracks":
