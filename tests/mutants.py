@@ -38,6 +38,7 @@ METRIC_TESTS = (
     "metrics/test_comfort.py",
     "metrics/test_examples.py",
     "metrics/test_errors.py",
+    "metrics/test_open_loop.py",
     "parity/test_metric_worlds.py::test_world",
     "parity/test_nuplan_runs.py",
 )
@@ -50,6 +51,7 @@ TESTS_OF = {
     "shiftsim.sim.loop": (
         "sim/test_plan_check.py",
         "sim/test_lock_step.py",
+        "metrics/test_open_loop.py",
     ),
 }
 Name = tuple[str, str]  # a module and a top-level name of it

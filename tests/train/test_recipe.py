@@ -35,7 +35,7 @@ def test_the_same_seed_gives_the_same_curve_and_network(small, trained):
     for settings in (again, other):
         train(settings)
     assert curve_of(first) == curve_of(again) != curve_of(other)
-    assert first.network.read_bytes() == again.network.read_bytes()
+    assert (first.out / LATEST).read_bytes() == (again.out / LATEST).read_bytes()
 
 
 def test_a_training_that_was_ended_goes_on_as_if_it_had_not(small, trained, monkeypatch):
