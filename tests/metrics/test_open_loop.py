@@ -7,7 +7,16 @@ from hypothesis import strategies as st
 
 import shiftsim
 from shiftsim.errors import DataError, PlannerError
-from shiftsim.metrics.open_loop import EVERY, NAMES, Poses, metric_rows, open_loop, recording
+from shiftsim.metrics.open_loop import (
+    EVERY,
+    METRICS,
+    MISSED,
+    NAMES,
+    Poses,
+    metric_rows,
+    open_loop,
+    recording,
+)
 from shiftsim.report.details import open_loop_scores
 from shiftsim.report.groups import read_groups
 from shiftsim.runs.derive import rescore
@@ -49,6 +58,24 @@ def test_a_plan_beside_the_recording_is_off_by_its_distance(aside):
     assert scores["planner_miss_rate_within_bound"].score == float(aside <= 6.0)
     expected = 0.0 if aside > 6.0 else (2.0 * (1.0 - aside / 8.0) + 4.0) / 6.0
     assert result.score == pytest.approx(expected, abs=1e-9)
+
+
+def test_errors_are_those_up_to_each_horizon_and_at_its_end():
+    """Plans that drift aside by 1 m/s."""
+    drifting = []
+    for times, poses in plans():
+        aside = (times - times[0]) * 1e-6
+        drifting.append(Poses(times, poses + np.outer(aside, [0.0, 1.0, 0.0])))
+    result = open_loop(drifting, EXPERT)
+    for name, expected in (("ADE", [2.0, 3.0, 4.5]), ("FDE", [3.0, 5.0, 8.0])):
+        np.testing.assert_allclose(result.errors[name].T, [expected] * FRAMES, atol=1e-9)
+    np.testing.assert_allclose(result.farthest.T, [[3.0, 5.0, 8.0]] * FRAMES, atol=1e-9)
+
+
+def test_the_bounds_are_those_of_nuplan():
+    assert MISSED == (6.0, 8.0, 16.0)
+    bounds = {name: (bound, weight) for name, _, bound, weight in METRICS.values()}
+    assert bounds == {"ADE": (8.0, 1.0), "FDE": (8.0, 1.0), "FHE": (0.8, 2.0), "AHE": (0.8, 2.0)}
 
 
 def test_a_full_turn_is_no_error_of_heading():
