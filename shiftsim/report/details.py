@@ -178,7 +178,18 @@ def open_loop_scores(groups: Sequence[Group]) -> Table | None:
     if not each:
         return None
     errors = tuple(f"{name} {unit}" for name, unit, *_ in open_loop.METRICS.values())
-    header = ("set", "traffic", "planner", "noise", "CLS", "open loop", *errors, "missed", "plans")
+    header = (
+        "set",
+        "traffic",
+        "planner",
+        "noise",
+        "CLS",
+        "open loop",
+        *errors,
+        "missed",
+        "rollouts",
+        "plans",
+    )
     notes = (
         "CLS: closed loop under that noise; open loop: nuPlan's score of the plans along the "
         "recording; errors: means over plans and horizons of 3, 5 and 8 s; missed: largest share "
@@ -209,6 +220,7 @@ def _open_loop_row(group: Group) -> Row:
         None if score is None else Number(100.0 * score),
         *(None if (e := means.get(name)) is None else Number(e) for name in open_loop.METRICS),
         None if (rate := means.get(open_loop.MISS)) is None else Number(rate),
+        Number(len(plans), 0),
         f"{counted:.0f} of {there:.0f}" if counted else None,
     )
 

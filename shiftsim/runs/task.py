@@ -147,7 +147,8 @@ class TaskRunner:
     ) -> TaskResult:
         if isinstance(log, BaseException):
             raise log
-        scenario, per_step = rollout.scenario, log.planning_seconds * 1e3
+        scenario, warning = rollout.scenario, rollout.warning
+        per_step = log.planning_seconds * 1e3
         seconds["planner_seconds"] = float(log.planning_seconds.sum())
         seconds["planning_ms_mean"] = float(per_step.mean())
         seconds["planning_ms_p95"] = float(np.percentile(per_step, 95))
@@ -155,8 +156,11 @@ class TaskRunner:
             scores, metrics = score_rollout(scenario, log, self.config)
         if self.config.open_loop and rollout.planner is not None:
             profile = {name: scores[name] for name in ("thresholds", "metric_version")}
-            rows = self._open_loop(task, scenario)
-            metrics += [_metric_row(row, int(log.time_us[0]), profile) for row in rows]
+            try:
+                rows = self._open_loop(task, scenario)
+                metrics += [_metric_row(row, int(log.time_us[0]), profile) for row in rows]
+            except ShiftsimError as error:  # closed loop has its score
+                warning = f"no open-loop score: {error.message}"
         keep, encoded = self.config.save_rollouts, b""
         if keep == "all" or (keep == "failed" and scores["cls"] == 0.0):
             # pedestrians of an edit wait for the ego
@@ -170,7 +174,7 @@ class TaskRunner:
             scores=scores,
             metrics=metrics,
             rollout=encoded,
-            warning=rollout.warning,
+            warning=warning,
         )
 
     def _open_loop(self, task: Task, scenario: Scenario) -> list[MetricRow]:
@@ -178,7 +182,7 @@ class TaskRunner:
         planner = self._planner(task)
         assert planner is not None
         try:
-            plans = plans_on_recording(scenario, planner, open_loop.EVERY, self._setting(task))
+            plans = plans_on_recording(scenario, planner, open_loop.EVERY, seed=task.seed)
         finally:
             self._release(task, planner)
         poses = [open_loop.Poses(plan.time_us, plan.states[:, :3]) for plan in plans]

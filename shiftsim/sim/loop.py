@@ -266,14 +266,14 @@ def simulate(
 
 
 def plans_on_recording(
-    scenario: Scenario, planner: Planner, every: int, setting: Setting = DEFAULT
+    scenario: Scenario, planner: Planner, every: int, *, seed: int = 0
 ) -> list[Trajectory]:
-    """The plans of every n-th iteration, in log time, where the ego drives as it was recorded.
+    """The plans of every n-th iteration, in log time, where all drive as they were recorded.
 
     Raises:
         PlannerError: The planner failed, or returns commands.
     """
-    rollout, plans = Rollout(scenario, planner, setting, controller="log-playback"), []
+    rollout, plans = Rollout(scenario, planner, seed=seed, controller="log-playback"), []
     while not rollout.done:
         observation = rollout.observe()
         plan = planner.plan(observation)

@@ -111,13 +111,6 @@ def test_the_recorded_future_has_the_full_score(scenario):
 
 
 def test_commands_are_no_plans(scenario):
-    class Coast:
-        def reset(self, scene):
-            pass
-
-        def plan(self, observation):
-            return Command(0.0, 0.0)
-
     with pytest.raises(PlannerError, match="returns commands"):
         plans_on_recording(scenario, Coast(), EVERY)
 
@@ -145,3 +138,29 @@ def test_a_run_with_open_loop_keeps_its_rows_when_it_is_scored_again(tmp_path):
     assert row[6].value == pytest.approx(values["planner_expert_average_l2_error_within_bound"])
     assert row[-1] == f"{values['open_loop_plans']:.0f} of {added[-1]['threshold']:.0f}"
     assert again.manifest["split_size"] == runs[1].manifest["split_size"]
+
+
+class Coast:
+    """Returns commands, which are no plans."""
+
+    def reset(self, scene):
+        pass
+
+    def plan(self, observation):
+        return Command(0.0, 0.0)
+
+
+def test_what_has_no_open_loop_score_keeps_that_of_closed_loop(tmp_path, caplog):
+    run = shiftsim.run(Coast, limit=1, workers=1, out=tmp_path / "out", open_loop=True)
+    assert run.is_complete
+    assert not any(row["metric"] in NAMES for row in run.metrics.to_pylist())
+    assert "no open-loop score: open loop compares trajectories" in caplog.text
+
+
+def test_others_drive_as_recorded_whatever_the_traffic(tmp_path):
+    rows = []
+    for traffic in ("nonreactive", "reactive"):
+        out = tmp_path / traffic
+        run = shiftsim.run("idm", limit=1, workers=1, out=out, open_loop=True, traffic=traffic)
+        rows.append([row for row in run.metrics.to_pylist() if row["metric"] in NAMES])
+    assert rows[0] == rows[1] != []
