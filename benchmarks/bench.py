@@ -27,7 +27,7 @@ from shiftsim.runs.config import make_config
 from shiftsim.runs.edited import EditSet, edits_text, make_edits
 from shiftsim.runs.execute import Progress, execute
 from shiftsim.runs.prepare import RUNS, RunPlan, prepare
-from shiftsim.runs.results import Run, open_run
+from shiftsim.runs.results import Run, label_runs, open_run
 from shiftsim.runs.scenarios import default_split, open_edits
 from shiftsim.runs.tables import stored_results
 from shiftsim.sim.traffic import traffic_name
@@ -180,7 +180,8 @@ def _without_limit(run: RunPlan) -> RunPlan:
     if not run.config.limit:
         return run
     config = replace(run.config, limit=0, out=str(run.folder / "whole"), resume=False)
-    return prepare(config, edits=run.selection.edits)
+    planners = [run.planners[name].source for name in config.planners]
+    return prepare(config, planners=planners, edits=run.selection.edits)
 
 
 def _list_of(run: RunPlan) -> KnownSet:
@@ -246,8 +247,10 @@ class OpenedRuns(NamedTuple):
         return [coverage(track, groups) for track in dict.fromkeys(self.tracks)]
 
 
-def open_runs(folders: Iterable[Path]) -> OpenedRuns:
+def open_runs(folders: Iterable[Path], labels: Iterable[str] = ()) -> OpenedRuns:
     """The runs of folders, where the folder of a benchmark stands for all of its runs.
+
+    `labels`, as those of `label_runs`, are what planners are called.
 
     Raises:
         ShiftsimError: A folder is neither, or damaged.
@@ -262,16 +265,20 @@ def open_runs(folders: Iterable[Path]) -> OpenedRuns:
         for one in (found["own"], *found.get("edited", ())):
             out.own.append(KnownSet(label=one["name"], thresholds="", **one))
         out.tracks.append(load_track(found["track"]))
-    return out
+    return out._replace(runs=label_runs(out.runs, labels))
 
 
-def paired_runs(first: Path, second: Path) -> list[tuple[Run, Run]]:
+def paired_runs(first: Path, second: Path, labels: Iterable[str] = ()) -> list[tuple[Run, Run]]:
     """Two run folders, or the runs of two benchmarks that have the same name.
+
+    `labels`, as those of `label_runs`, are what planners are called.
 
     Raises:
         ShiftsimError: A folder is neither, or there is no such pair.
     """
     ours, theirs = (open_runs([folder]).runs for folder in (first, second))
+    runs = label_runs([*ours, *theirs], labels)
+    ours, theirs = runs[: len(ours)], runs[len(ours) :]
     if len(ours) == len(theirs) == 1:
         return [(ours[0], theirs[0])]
     named = {run.path.name: run for run in theirs}

@@ -28,7 +28,7 @@ _GIVEN = (
     *(state.Tracks, state.TrafficLights, state.VehicleParameters),
 )
 # how many values answer what is asked
-_PARTS = {("done", "make"): 2, ("done", "map"): 0, ("done", "reset"): 0, ("done", "plan"): 2}
+_PARTS = {("done", "make"): 3, ("done", "map"): 0, ("done", "reset"): 0, ("done", "plan"): 2}
 _PARTS |= {("failed", verb): 3 for _, verb in _PARTS}
 _RETURNED = {kind.__name__: kind for kind in (Trajectory, Command)}
 
@@ -65,6 +65,11 @@ class Isolated:
     def sees_recording(self) -> bool:
         """Whether the planner declares that it looks at the recording."""
         return bool(self._started()[1])
+
+    @property
+    def called(self) -> str:
+        """The planner's own name; empty where it has none."""
+        return str(self._started()[2])
 
     def _started(self) -> Any:
         """What the child says of its planner; it is started where there is none."""

@@ -171,6 +171,7 @@ class RunPlanner:
     arguments: Mapping[str, Any]  # passed to the constructor of a name or class
     fingerprint: Mapping[str, Any]  # all that tells it from another planner, as JSON values
     in_batches: bool = False  # whether it answers for several scenarios at once
+    batch_size: int = 0  # how many of them; 0 for as many as the run says
     ask: Any = None  # of `LearnedPlanner.asking`, where another process has the network
 
     @cached_property
@@ -223,13 +224,15 @@ class RunPlanner:
         return True
 
 
-def run_planner(source: Any, arguments: Mapping[str, Any]) -> RunPlanner:
+def run_planner(source: Any, arguments: Mapping[str, Any], name: str = "") -> RunPlanner:
     """A planner given by name, class or instance; it is made here, to see that it works.
+
+    It is called `name` in tables, by default as `planner_name` says.
 
     Raises:
         ShiftsimError: It does not exist, or cannot be made.
     """
-    name = planner_name(source)
+    name = name or planner_name(source)
     if isinstance(source, str):
         fingerprint = planner_fingerprint(source, arguments)
     elif hasattr(source, "identify"):
@@ -251,6 +254,18 @@ def planner_name(source: Any) -> str:
         return source
     kind = _class_of(source)
     return str(getattr(source, "name", "") or kind.__name__)
+
+
+def own_name(planner: RunPlanner) -> str:
+    """The `name` of a custom planner's class or instance; where it has none, what it is called.
+
+    Names of registered planners, which a class may inherit, are theirs alone.
+    """
+    found = planner.prototype.planner
+    is_isolated = hasattr(planner.source, "identify")
+    own = getattr(found, "called" if is_isolated else "name", "")
+    is_free = isinstance(own, str) and own.isprintable() and "=" not in own and own.strip()
+    return str(own) if is_free and own not in PLANNERS else planner.name
 
 
 def takes_argument(source: Any, name: str) -> bool:

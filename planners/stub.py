@@ -232,7 +232,8 @@ def _main() -> None:
                     if not callable(getattr(planner, name, None)):
                         raise TypeError(f"{type(planner).__name__} has no method {name}()")
                 recording = getattr(planner, "sees_recording", False) is True
-                answer = (answer, recording)
+                own_name = getattr(planner, "name", "")
+                answer = (answer, recording, own_name if isinstance(own_name, str) else "")
             elif verb == "map":
                 road = value
             elif verb == "reset":

@@ -5,12 +5,13 @@ notebook shows of scenarios, maps and logs is registered here: these know nothin
 """
 
 import html
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import shiftsim.edits  # noqa: F401  # attaches Scenario.edited
 from shiftsim.data import open_store as open_store
+from shiftsim.errors import ConfigError
 from shiftsim.planners import registry
 from shiftsim.runs import results
 from shiftsim.sim import loop
@@ -162,8 +163,9 @@ def run(
     """Simulate and score planners on scenarios, as `shiftsim run` does.
 
     Args:
-        planner: A name, `package.module:Class`, a class or an instance, or a list of those.
-            Classes and instances of the main script run in this process.
+        planner: A name, `package.module:Class`, a class or an instance; a list of those, or a
+            dict by what tables call them. Classes and instances of the main script run in this
+            process.
         noise: Name or model, or a list of them.
         seeds: Seeds of the noise.
         on_progress: Called with a `Progress` after every task.
@@ -178,20 +180,26 @@ def run(
 
     Example:
         ```python
-        run = shiftsim.run(["idm", "log-future"], noise="ou-high", split="demo-mini", limit=2)
+        planners = {"slow": shiftsim.load_planner("idm", headway=3.0), "idm": "idm"}
+        run = shiftsim.run(planners, noise="ou-high", split="demo-mini", limit=2)
         ```
     """
     from shiftsim.runs.config import make_config
     from shiftsim.runs.execute import execute
     from shiftsim.runs.prepare import prepare
 
-    planners = list(planner) if isinstance(planner, (list, tuple)) else [planner]
+    several = planner if isinstance(planner, (list, tuple)) else [planner]
+    named = planner if isinstance(planner, Mapping) else {}
+    planners = list(named.values()) or list(several)
+    labels = list(named) or [registry.planner_name(source) for source in planners]
+    if wrong := [label for label in named if "=" in label]:
+        raise ConfigError(f"label {wrong[0]!r} of a planner holds '='", hint="choose another one")
     noises = [noise] if isinstance(noise, (str, NoiseModel)) else list(noise)
     models = [m if isinstance(m, NoiseModel) else parse_noise(m) for m in noises if m != "all"]
     if any(isinstance(m, str) and m == "all" for m in noises):
         models += [parse_noise(name) for name in NOISE_NAMES]
     values = {
-        "planners": [registry.planner_name(source) for source in planners],
+        "planners": labels,
         "noise": [model.name for model in models],
         "seeds": [seeds] if isinstance(seeds, int) else list(seeds),
         **settings,

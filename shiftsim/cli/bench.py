@@ -11,6 +11,7 @@ from shiftsim.cli import Json, Quiet, plural, print_json, print_result, stdout_t
 from shiftsim.cli.report import read_tables
 from shiftsim.cli.run import DryRun, Live, announce, progress_of
 from shiftsim.errors import MissingExtraError
+from shiftsim.runs.config import split_label
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -96,7 +97,8 @@ def _official(settings: cli.Settings) -> list[str]:
     named = {text.partition("=")[0] for text in given}
     arguments = settings.get("planner_args", {})
     named |= {name for name, values in arguments.items() if "checkpoint" in values}
-    names = [name for name in settings.get("planners", ()) if shipped_file(name) is not None]
+    labels = map(split_label, settings.get("planners", ()))
+    names = [label for label, source in labels if shipped_file(source) is not None]
     return [f"{name}={OFFICIAL}" for name in names if name not in named]
 
 

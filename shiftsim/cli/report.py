@@ -31,6 +31,13 @@ def _list_tables(wanted: bool) -> None:
         raise Exit
 
 
+Labels = Annotated[
+    list[str] | None,
+    Option(
+        "--label",
+        help="NAME=LABEL, or RUN/NAME=LABEL: what a planner is called; repeatable.",
+    ),
+]
 RunFolder = Annotated[Path, Argument(metavar="RUN", help="A run folder, or that of a benchmark.")]
 
 
@@ -49,6 +56,7 @@ def report(
     published: bool = Option(False, "--published", help="The paper's figures beside the own ones."),
     figures: bool = Option(False, "--figures", help="Pictures as well, into --out (RUN/report)."),
     worst: int = Option(5, help="Name the N worst scenarios."),
+    labels: Labels = None,
     out: Path | None = Option(None, help="Write everything into this folder."),
     site: Path | None = Option(
         None, "--html", help="Pages into this folder: tables, pictures, scenarios with replays."
@@ -66,7 +74,7 @@ def report(
     from shiftsim.report.scores import summary
     from shiftsim.report.tables import FORMATS, render
 
-    opened = open_runs(folders)
+    opened = open_runs(folders, labels or ())
     if as_json:
         print_json([summary(run) for run in opened.runs])
         return
@@ -208,6 +216,7 @@ def diff(
     tolerance: float = Option(
         1e-6, min=0.0, help="Rollouts part where they differ by more [m, rad, m/s …]."
     ),
+    labels: Labels = None,
     as_json: Json = False,
 ) -> None:
     """Scenarios whose score differs between two runs, and where the rollouts part."""
@@ -215,7 +224,7 @@ def diff(
     from shiftsim.report.words import LONG, legend
     from shiftsim.runs.diff import diff_lines, diff_runs
 
-    pairs = paired_runs(first, second)
+    pairs = paired_runs(first, second, labels or ())
     found = [diff_runs(one, other, limit=limit, tolerance=tolerance) for one, other in pairs]
     if as_json:
         values = [pair.to_dict() for pair in found]

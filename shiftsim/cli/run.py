@@ -27,6 +27,7 @@ from shiftsim.cli import (
 from shiftsim.cli.report import print_worst
 from shiftsim.errors import ConfigError
 from shiftsim.files import DEFAULT_STORE, read_toml, store_path
+from shiftsim.planners.registry import planner_name
 from shiftsim.runs.config import default_workers, make_config
 
 if TYPE_CHECKING:
@@ -210,10 +211,12 @@ def _plan_lines(plan: "RunPlan") -> Iterator[str]:
     found = len({task.token for task in plan.tasks})
     missing = len({task.token for task in plan.missing})
     for name in config.planners:
-        arguments = plan.planners[name].arguments
-        given = "".join(f"  {key}={value}" for key, value in arguments.items())
-        yield f"planner     {name}{given}"
-        if weights := _weights(plan.planners[name].fingerprint):
+        planner = plan.planners[name]
+        size = {"batch_size": planner.batch_size} if planner.batch_size else {}
+        given = "".join(f"  {k}={value}" for k, value in {**planner.arguments, **size}.items())
+        source = planner_name(planner.source)
+        yield f"planner     {name}{f' = {source}' if source != name else ''}{given}"
+        if weights := _weights(planner.fingerprint):
             yield f"weights     {name}, {weights}"
     yield f"noise       {' '.join(config.noise)}   seeds {' '.join(map(str, config.seeds))}"
     first = ""

@@ -8,7 +8,7 @@ from typer import Argument, Option, echo
 
 from shiftsim import cli
 from shiftsim.cli import Quiet, plural, progress_bar, show_in_browser
-from shiftsim.cli.report import RunFolder
+from shiftsim.cli.report import Labels, RunFolder
 from shiftsim.errors import ConfigError
 from shiftsim.files import safe_join
 
@@ -38,6 +38,7 @@ def view(
     noise: Noises = None,
     seed: Seeds = None,
     store: Store = None,
+    labels: Labels = None,
     limit: int = Option(200, help="Only the N with the lowest scores, 0 for all."),
     out: Path | None = Option(None, help="Folder to write to. [RUN/view]"),
     browser: Browser = True,
@@ -46,7 +47,7 @@ def view(
     """Replay rollouts in the browser: pages that need no server and no network."""
     from shiftsim.view.build import page_name, write_site
 
-    found = _galleries([run, *(others or ())], store, planner, noise, seed)
+    found = _galleries([run, *(others or ())], labels, store, planner, noise, seed)
     folder = out or safe_join(run, "view")
     if token is not None:
         gallery, token = _holding(found, token)
@@ -80,11 +81,12 @@ def plot(
     noise: Noises = None,
     seed: Seeds = None,
     store: Store = None,
+    labels: Labels = None,
 ) -> None:
     """The driven paths of several rollouts over the map, as a still or a film."""
     from shiftsim.view.still import save_figure
 
-    found = _galleries([run, *(others or ())], store, planner, noise, seed)
+    found = _galleries([run, *(others or ())], labels, store, planner, noise, seed)
     gallery, token = _holding(found, token)
     scenario = gallery.store.read(token)
     shown = gallery.shown(token, scenario)
@@ -135,14 +137,17 @@ def inspect(
 
 
 def _galleries(
-    folders: list[Path], store: str | None, *chosen: "Sequence[Any] | None"
+    folders: list[Path],
+    labels: list[str] | None,
+    store: str | None,
+    *chosen: "Sequence[Any] | None",
 ) -> "list[Gallery]":
     """The rollouts of runs and benchmarks by planner, noise and seed, a gallery for each store."""
     from shiftsim.benchmarks.bench import open_runs
     from shiftsim.runs.scenarios import open_run_store
     from shiftsim.view.build import Choice, galleries
 
-    runs = open_runs(folders).runs
+    runs = open_runs(folders, labels or ()).runs
     choice = Choice(*(tuple(values or ()) for values in chosen))
     return galleries(runs, [open_run_store(run, store) for run in runs], choice)
 

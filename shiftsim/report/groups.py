@@ -5,10 +5,10 @@ table is decided by their `DataSet`: the same scenarios under the same threshold
 """
 
 import hashlib
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, compress, product
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -119,7 +119,8 @@ class Group:
     run: Run  # the run
     data: DataSet  # its scenarios
     traffic: str  # `NR`, `R`, or another mode's name
-    planner: str  # name, made unique among the runs of a report
+    name: str  # what the run calls the planner
+    planner: str  # the same, made unique among the runs of a report
     noise: str  # name
     seeds: tuple[int, ...]  # the seeds
     # (S, N, C) seeds, scenarios, `COLUMNS`, in [0, 1]; NaN where nothing finished
@@ -130,11 +131,6 @@ class Group:
     def is_complete(self) -> bool:
         """Whether every rollout finished."""
         return bool(np.isfinite(self.values[:, :, 0]).all())
-
-    @property
-    def name(self) -> str:
-        """The planner as its run calls it."""
-        return self.planner.removesuffix(f" @{self.run.path.name}")
 
     @property
     def weights(self) -> str:
@@ -244,24 +240,24 @@ def read_groups(
 ) -> list[Group]:
     """The groups of runs, in the order of runs, planners and noises.
 
-    Sets of scenarios are recognised by the published lists that are known. `allow_partial` gives
-    labelled means of groups that are not complete.
+    Sets of scenarios are recognised by the published lists that are known. Planners of one name
+    that are not the same, or were run otherwise and did otherwise, say what tells them apart.
+    `allow_partial` gives labelled means of groups that are not complete.
 
     Raises:
         DataError: Runs contradict each other, or hold no tasks.
     """
-    labels = _planner_labels(runs)
+    found = [group for run in runs for group in _groups(run, known)]
+    by_name: dict[str, list[Group]] = {}
+    for group in found:
+        by_name.setdefault(group.name, []).append(group)
+    labels = {name: _planner_labels(mine) for name, mine in by_name.items()}
     seen: dict[tuple[object, ...], Group] = {}
-    for group in (group for run in runs for group in _groups(run, known, labels[run.path])):
-        key = (group.data.key, group.traffic, group.planner, group.noise)
-        other = seen.setdefault(key, replace(group, allow_partial=allow_partial))
-        alike = np.array_equal(group.values, other.values, equal_nan=True)
-        if group.seeds != other.seeds or not alike:
-            raise DataError(
-                f"{group.run.path.name!r} and {other.run.path.name!r} both hold "
-                f"{group.planner} {group.noise} {group.traffic} on {group.data.name}, and differ",
-                hint="name one of them, or compare them with `shiftsim diff`",
-            )
+    for group in found:
+        named = replace(
+            group, planner=labels[group.name][group.run.path], allow_partial=allow_partial
+        )
+        seen.setdefault((group.data.key, group.traffic, named.planner, group.noise), named)
     return _labelled_apart(list(seen.values()))
 
 
@@ -279,24 +275,79 @@ def _labelled_apart(groups: list[Group]) -> list[Group]:
     return out
 
 
-def _planner_labels(runs: Sequence[Run]) -> dict[Path, dict[str, str]]:
-    """Names of planners by run; a name that means different planners gets its run's name added."""
-    prints: dict[str, set[str]] = {}
-    for run in runs:
-        determining = run.manifest["determining"]
-        for name in run.manifest["config"]["planners"]:
-            identity = (determining["planners"].get(name), determining.get("code"))
-            prints.setdefault(name, set()).add(repr(identity))
-    return {
-        run.path: {
-            name: name if len(prints[name]) == 1 else f"{name} @{run.path.name}"
-            for name in run.manifest["config"]["planners"]
-        }
-        for run in runs
-    }
+def _planner_labels(groups: Sequence[Group]) -> dict[Path, str]:
+    """What groups of one name are called, by run: what tells them apart stands behind the name.
+
+    Raises:
+        DataError: Groups contradict each other, and nothing tells them apart.
+    """
+    facts = {group.run.path: _planner_facts(group) for group in groups}
+    if _contradiction(groups, facts):  # then the way in which they were run tells them apart
+        facts = {group.run.path: facts[group.run.path] | _run_facts(group.run) for group in groups}
+    if pair := _contradiction(groups, facts):
+        group, other = pair
+        name = f"{group.run.path.name}/{group.name}"
+        raise DataError(
+            f"{group.run.path.name!r} and {other.run.path.name!r} both hold "
+            f"{group.name} {group.noise} {group.traffic} on {group.data.name}, and differ",
+            hint=f"name one of them, compare them with `shiftsim diff`, or --label {name}=other",
+        )
+    name, kinds = groups[0].name, {repr(of): path for path, of in reversed(facts.items())}
+    if len(kinds) == 1:
+        return dict.fromkeys(facts, name)
+    differing = [
+        key
+        for key in dict.fromkeys(chain(*facts.values()))
+        if key.strip() and len({repr(of.get(key)) for of in facts.values()}) > 1
+    ]
+    words = {p: ", ".join(f"{k} {of[k]}" for k in differing if k in of) for p, of in facts.items()}
+    if len({*words.values()}) == len(kinds):
+        return {path: f"{name} ({text})" if text else name for path, text in words.items()}
+    alike = len({path.name for path in kinds.values()}) < len(kinds)
+    first = {path: kinds[repr(of)] for path, of in facts.items()}
+    return {path: f"{name} @{one if alike else one.name}" for path, one in first.items()}
 
 
-def _groups(run: Run, known: Sequence[KnownSet], labels: dict[str, str]) -> Iterator[Group]:
+def _planner_facts(group: Group) -> dict[str, Any]:
+    """What identifies a planner; what people can read of it has a name."""
+    determining, config = (group.run.manifest[part] for part in ("determining", "config"))
+    identity = determining["planners"].get(group.name)
+    out: dict[str, Any] = {"": (identity, determining.get("code"))}
+    if isinstance(identity, dict):
+        out |= {k: PurePath(str(v)).name for k, v in identity.get("arguments", {}).items()}
+        out |= {"batch size": identity["batch_size"]} if "batch_size" in identity else {}
+    if isinstance(identity, dict) and "checkpoint" in identity:
+        given = (text.rpartition("=") for text in config.get("checkpoints", ()))
+        named = {owner: file for owner, _, file in given if owner in ("", group.name)}
+        file = config.get("planner_args", {}).get(group.name, {}).get("checkpoint", "")
+        out["checkpoint"] = PurePath(file or next(iter(named.values()), "official")).name
+    return out
+
+
+def _run_facts(run: Run) -> dict[str, Any]:
+    """What scores of the same planner depend on as well."""
+    rules = run.manifest["determining"]
+    rest = tuple(rules.get(name) for name in ("noise", "traffic_made_of", "store"))
+    out = {"batch size": rules.get("batch_size"), "strict": rules.get("strict"), " ": rest}
+    return out | {"seeds": " ".join(map(str, run.manifest["config"]["seeds"]))}
+
+
+def _contradiction(
+    groups: Sequence[Group], facts: Mapping[Path, Mapping[str, Any]]
+) -> tuple[Group, Group] | None:
+    """Two groups of the same planner, set, traffic and noise that hold other values, if any."""
+    seen: dict[tuple[object, ...], Group] = {}
+    for group in groups:
+        identity = repr(facts[group.run.path])
+        key = (group.data.key, group.traffic, group.noise, identity)
+        other = seen.setdefault(key, group)
+        alike = np.array_equal(group.values, other.values, equal_nan=True)
+        if group.seeds != other.seeds or not alike:
+            return group, other
+    return None
+
+
+def _groups(run: Run, known: Sequence[KnownSet]) -> Iterator[Group]:
     tasks, scores = run.tasks, run.scores
     if not len(tasks):
         raise DataError(f"run {run.path.name!r} holds no tasks", hint="make the run again")
@@ -316,8 +367,8 @@ def _groups(run: Run, known: Sequence[KnownSet], labels: dict[str, str]) -> Iter
         rows = np.flatnonzero(_matching(scores, planner, noise))
         row_seeds = np.searchsorted(seeds, scores["seed"].to_numpy()[rows])
         values[row_seeds, places[rows].astype(np.int64)] = table[rows]
-        mode, name = TRAFFIC.get(traffic, traffic), labels.get(planner, planner)
-        whole = Group(run, data, mode, name, noise, tuple(seeds.tolist()), values)
+        mode, names = TRAFFIC.get(traffic, traffic), (planner, planner)
+        whole = Group(run, data, mode, *names, noise, tuple(seeds.tolist()), values)
         for part, chosen in parts if len(seeds) else ():
             yield replace(whole.only(chosen), data=part)
 

@@ -17,6 +17,7 @@ from shiftsim.files import DEFAULT_STORE, make_table
 
 Value: TypeAlias = bool | int | float | str | list[Any]
 
+_LABELS = "give each a label: --planner LABEL=PLANNER, or shiftsim.run({label: planner})"
 MAX_SEED = 2**63 - 1
 MAX_SEEDS = 10_000  # of one range
 
@@ -79,13 +80,16 @@ def setting(default: Any, help: str, *flags: str, **more: Any) -> Any:
 class RunConfig:
     """Everything that one run depends on; the text of each setting is that of its option.
 
-    `planner_args` holds arguments of the planners, by planner as named in `planners`. A `limit` or
+    `planner_args` holds arguments of the planners, by label (see `split_label`). A `limit` or
     `timeout` of 0 is none, `workers` of 0 chooses from cores and memory. Results of another
     `batch_size` may differ in the last digits.
     """
 
     planners: tuple[str, ...] = setting(
-        (), "Name, ./file.py:Class or [nuplan:]package.module:Class; repeatable.", "--planner", "-p"
+        (),
+        "Name, ./file.py:Class or [nuplan:]package.module:Class, or LABEL=…; repeatable.",
+        "--planner",
+        "-p",
     )
     noise: tuple[str, ...] = setting(
         ("none",), "none, awgn-low … ou-high, all; repeatable. [none]", "--noise", "-n"
@@ -111,14 +115,14 @@ class RunConfig:
     planner_args: dict[str, dict[str, Value]] = field(
         default_factory=dict,
         metadata={
-            "option": Option("key=value, or PLANNER.key=value; repeatable.", ("--planner-arg",))
+            "option": Option("key=value, or LABEL.key=value; repeatable.", ("--planner-arg",))
         },
     )
     metrics: tuple[str, ...] = setting(
         (), "Own metric as package.module:function; repeatable.", "--metric"
     )
     checkpoints: tuple[str, ...] = setting(
-        (), "PATH, official or shiftsim; or PLANNER=…; repeatable.", "--checkpoint"
+        (), "PATH, official or shiftsim; or LABEL=…; repeatable.", "--checkpoint"
     )
     device: str = setting("cpu", "cpu, cuda or auto. [cpu]", choices=("cpu", "cuda", "auto"))
     batch_size: int = setting(1, "Scenarios per forward pass of a network. [1]")
@@ -143,12 +147,13 @@ class RunConfig:
     allow_partial: bool = setting(False, "Print a labelled mean over what finished.")
 
     def __post_init__(self) -> None:
+        labels = [split_label(planner)[0] for planner in self.planners]
         for name in ("planners", "noise", "metrics", "checkpoints", "seeds"):
-            values = getattr(self, name)
+            values = labels if name == "planners" else getattr(self, name)
             if len(set(values)) != len(values):
                 raise ConfigError(
                     f"{name} {list(values)!r}: a value is listed twice",
-                    hint="give each planner a `name` of its own" if name == "planners" else "",
+                    hint=_LABELS if name == "planners" else "",
                 )
         if not self.planners:
             raise ConfigError("no planner", hint="name one, for example --planner idm")
@@ -164,7 +169,7 @@ class RunConfig:
         if self.shard:
             parse_shard(self.shard)
         for planner in self.planner_args:
-            one_of("planner in planner_args", planner, self.planners)
+            one_of("planner in planner_args", planner, labels)
 
     @property
     def resumes(self) -> bool:
@@ -202,14 +207,31 @@ def make_config(values: Mapping[str, Any], *, where: str = "run") -> RunConfig:
     return make_table(RunConfig, values, where, _check)
 
 
+def split_label(planner: str) -> tuple[str, str]:
+    """Label and source of a planner in settings: `LABEL=SOURCE`, or a source, its own label.
+
+    The label is what tasks, tables and pictures call the planner. It holds neither `:` nor a slash.
+
+    Raises:
+        ConfigError: The label or the source is empty.
+    """
+    label, equals, source = planner.partition("=")
+    if not equals or any(c in label for c in ":/\\"):
+        return planner, planner
+    if not label.strip() or not label.isprintable() or not source:
+        raise ConfigError(f"planner {planner!r} is not LABEL=PLANNER", hint="--planner ours=idm")
+    return label, source
+
+
 def parse_argument(text: str, planners: tuple[str, ...]) -> tuple[str, str, Value]:
-    """Planner, name and value of one `key=value`, or `planner.key=value` with several planners.
+    """Label, name and value of one `key=value`, or `label.key=value` with several planners.
 
     The value is read as a TOML value; anything that is none is taken as a string.
 
     Raises:
         ConfigError: It has another form, or it does not say which planner is meant.
     """
+    planners = tuple(split_label(planner)[0] for planner in planners)
     key, equals, raw = text.partition("=")
     if not equals or not key:
         raise ConfigError(

@@ -152,6 +152,7 @@ def rescore(
     Raises:
         DataError: Rollouts are missing, or the store is another one.
     """
+    run = open_run(run.path)  # with its own names
     for metric in metrics:
         load_metric(metric)
     found = open_run_store(run, store)

@@ -19,11 +19,12 @@ from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.planners.registry import (
     PLANNERS,
     RunPlanner,
+    own_name,
     planner_name,
     run_planner,
     takes_argument,
 )
-from shiftsim.runs.config import RunConfig, Value, default_workers, parse_shard
+from shiftsim.runs.config import RunConfig, Value, default_workers, parse_shard, split_label
 from shiftsim.runs.manifest import State, check_resumable, check_target, code_digest
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.scenarios import Selection, select_scenarios
@@ -111,9 +112,14 @@ def prepare(
     for metric in config.metrics:
         load_metric(metric)
     entries = _planners(config, planners or config.planners)
+    config = _with_names(config, entries)
     store = open_store(config.store)
     selection = select_scenarios(config, store, edits)
-    grouped = {entry.name for entry in entries if entry.in_batches or is_batched}
+    grouped = {
+        entry.name: entry.batch_size or config.batch_size
+        for entry in entries
+        if entry.in_batches or is_batched
+    }
     fingerprint = {
         **selection.fingerprint,
         **_fingerprint(config, entries, models, thresholds),
@@ -132,7 +138,7 @@ def prepare(
     # scenario by scenario, so that a worker can often reuse the one it has read
     tasks = [Task(*run, token) for token in selection.present for run in runs]
     missing: list[Batch] = [(Task(*run, token),) for token in selection.missing for run in runs]
-    batches = _of_shard(config.shard, _batches(grouped, tasks, config.batch_size))
+    batches = _of_shard(config.shard, _batches(grouped, tasks))
     by_name = {entry.name: entry for entry in entries}
     by_name |= {config.traffic: traffic} if traffic else {}
     # of this machine; workers on others would not reach the process
@@ -183,26 +189,63 @@ def _traffic(config: RunConfig) -> tuple[RunPlanner | None, dict[str, Any], bool
     return None, {"traffic_made_of": dict(fingerprint)} if fingerprint else {}, in_batches
 
 
-def _planners(config: RunConfig, sources: Sequence[Any]) -> list[RunPlanner]:
+def _planners(config: RunConfig, given: Sequence[Any]) -> list[RunPlanner]:
+    """The planners in the order of the settings; those without a label have their own name."""
     isolates = bool(config.isolate or config.planner_python)
 
     def takes(source: Any, argument: str) -> bool:
         # the code of an isolated planner of users is not looked at in this process
         return (not isolates or source in PLANNERS) and takes_argument(source, argument)
 
-    named = dict(zip(config.planners, sources, strict=True))
+    labels = [split_label(planner)[0] for planner in config.planners]
+    sources = [split_label(one)[1] if isinstance(one, str) else one for one in given]
+    named = dict(zip(labels, sources, strict=True))
     with_checkpoint = [name for name, source in named.items() if takes(source, "checkpoint")]
     checkpoints = _checkpoints(config, with_checkpoint)
-    entries = []
+    entries, names = [], []
     for name, source in named.items():
         arguments: dict[str, Value] = dict(config.planner_args.get(name, {}))
         if name in checkpoints:
             arguments["checkpoint"] = checkpoints[name]
         if takes(source, "device"):
             arguments.setdefault("device", config.device)
+        size = 0 if isolates or takes_argument(source, "batch_size") else _batch_size(arguments)
         isolated = _isolated(config, source, arguments) if isolates else source
-        entries.append(run_planner(isolated, arguments))
+        entry = run_planner(isolated, arguments, name)
+        if size and not entry.in_batches:
+            raise ConfigError(
+                f"planner {name!r} takes no batch_size: it answers for one scenario at a time",
+                hint="leave it out",
+            )
+        if size:
+            entry.batch_size, entry.fingerprint = size, {**entry.fingerprint, "batch_size": size}
+        entries.append(entry)
+        is_custom = isinstance(source, str) and source == name and source not in PLANNERS
+        names.append(own_name(entry) if is_custom else name)
+    for entry, name in zip(entries, names, strict=True):
+        entry.name = name if names.count(name) == 1 else entry.name
     return entries
+
+
+def _batch_size(arguments: dict[str, Value]) -> int:
+    """Scenarios per forward pass of one planner, taken out of its arguments; 0 for the run's."""
+    size = arguments.pop("batch_size", 0)
+    if not isinstance(size, int) or isinstance(size, bool) or size < 0:
+        raise ConfigError(f"batch_size {size!r} is no number from 1 on")
+    return size
+
+
+def _with_names(config: RunConfig, entries: Sequence[RunPlanner]) -> RunConfig:
+    """The settings with the planners' names in place of what was given."""
+    labels = [split_label(planner)[0] for planner in config.planners]
+    names = {label: entry.name for label, entry in zip(labels, entries, strict=True)}
+    checkpoints = (text.partition("=") for text in config.checkpoints)
+    return replace(
+        config,
+        planners=tuple(names.values()),
+        planner_args={names[label]: values for label, values in config.planner_args.items()},
+        checkpoints=tuple("".join((names.get(a, a), *rest)) for a, *rest in checkpoints),
+    )
 
 
 def _isolated(config: RunConfig, source: Any, arguments: dict[str, Value]) -> "Isolated":
@@ -219,13 +262,14 @@ def _isolated(config: RunConfig, source: Any, arguments: dict[str, Value]) -> "I
 def _checkpoints(config: RunConfig, takers: Sequence[str]) -> dict[str, str]:
     """Checkpoint by planner; `takers` are those that take one."""
     out: dict[str, str] = {}
+    labels = [split_label(planner)[0] for planner in config.planners]
     for text in config.checkpoints:
         name, equals, path = text.partition("=")
-        if not equals or name not in config.planners:
+        if not equals or name not in labels:
             name, path = (takers[0], text) if len(takers) == 1 else ("", text)
         if not name and not takers:
             raise ConfigError(
-                f"checkpoint {text!r}: {', '.join(config.planners)} takes none",
+                f"checkpoint {text!r}: {', '.join(labels)} takes none",
                 hint="leave --checkpoint out",
             )
         if not name:
@@ -275,14 +319,14 @@ def _workers(
     return 1 if stuck else max(1, min(workers, num_batches))
 
 
-def _batches(grouped: set[str], tasks: list[Task], size: int) -> list[Batch]:
-    """The tasks, those of planners whose scenarios are driven in lock step grouped.
+def _batches(grouped: Mapping[str, int], tasks: list[Task]) -> list[Batch]:
+    """The tasks, those of planners whose scenarios are driven in lock step by their batch size.
 
     The groups depend on the whole run only, not on workers, shards or what is finished already. The
     first is a single task: other workers wait until it has compiled the planner's kernels.
     """
     batches: list[Batch] = [(task,) for task in tasks if task.planner not in grouped]
-    for name in sorted(grouped):
+    for name, size in sorted(grouped.items()):
         of_planner = tuple(task for task in tasks if task.planner == name)
         batches += [of_planner[:1]]
         batches += [of_planner[i : i + size] for i in range(1, len(of_planner), size)]

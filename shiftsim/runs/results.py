@@ -1,15 +1,16 @@
 """The run folder, read back: its manifest, tables and rollouts."""
 
 import json
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from shiftsim.errors import ConfigError, DataError, listed
+from shiftsim.errors import ConfigError, DataError, listed, one_of
 from shiftsim.files import write_text
 from shiftsim.runs.rollouts import Task, complete_rollout, describe
 from shiftsim.runs.rollouts.files import FOLDER, RolloutLocation, RolloutReader
@@ -36,29 +37,69 @@ class Run:
     Attributes:
         path: Its folder.
         manifest: Everything the run depended on, and its counts.
+        labels: What planners are called, by their names on disk, where that is something else.
     """
 
     path: Path
     manifest: dict[str, Any]
+    labels: Mapping[str, str] = field(default_factory=dict, repr=False)
+
+    def labelled(self, labels: Mapping[str, str]) -> Self:
+        """The same run with planners called otherwise in tables and pictures; the disk stays.
+
+        Args:
+            labels: New names by those that the run has.
+
+        Raises:
+            ConfigError: The run has no such planner, or two would have one name.
+        """
+        config, determining = self.manifest["config"], self.manifest["determining"]
+        for name in labels:
+            one_of(f"run {self.path.name!r}: planner", name, config["planners"])
+        new = {name: labels.get(name, name) for name in config["planners"]}
+        if len({*new.values()}) < len(new):
+            raise ConfigError(
+                f"run {self.path.name!r}: two planners would be called the same",
+                hint=f"its planners: {', '.join(new)}",
+            )
+        given = (text.partition("=") for text in config.get("checkpoints", ()))
+        config = config | {
+            "planners": [*new.values()],
+            "planner_args": {new[n]: v for n, v in config.get("planner_args", {}).items()},
+            "checkpoints": ["".join((new.get(name, name), *rest)) for name, *rest in given],
+        }
+        planners = {new.get(name, name): v for name, v in determining["planners"].items()}
+        manifest = {"config": config, "determining": determining | {"planners": planners}}
+        kept = {disk: new[name] for disk, name in self.labels.items()}
+        return replace(self, manifest=self.manifest | manifest, labels=kept or new)
+
+    def _table(self, name: str) -> pa.Table:
+        """A table of the folder, with the planners as they are called here."""
+        table = read_table(self.path / f"{name}.parquet")
+        if not self.labels:
+            return table
+        column = table.column_names.index("planner")
+        names = [self.labels.get(one, one) for one in table["planner"].to_pylist()]
+        return table.set_column(column, table.field(column), pa.array(names, pa.string()))
 
     @cached_property
     def scores(self) -> pa.Table:
         """One row per finished task: closed-loop score and metric scores."""
-        path, key = self.path / "scores.parquet", ["planner", "noise", "seed", "token"]
-        scores, is_done = read_table(path), pc.equal(self.tasks["status"], OK)
+        key = ["planner", "noise", "seed", "token"]
+        scores, is_done = self._table("scores"), pc.equal(self.tasks["status"], OK)
         if not scores.select(key).equals(self.tasks.filter(is_done).select(key)):
-            raise damaged(path, "its rows are not the finished tasks")
+            raise damaged(self.path / "scores.parquet", "its rows are not the finished tasks")
         return scores
 
     @cached_property
     def metrics(self) -> pa.Table:
         """One row per finished task and metric: value, threshold, first violation."""
-        return read_table(self.path / "metrics.parquet")
+        return self._table("metrics")
 
     @cached_property
     def tasks(self) -> pa.Table:
         """One row per task: status, error, durations."""
-        return read_table(self.path / "tasks.parquet")
+        return self._table("tasks")
 
     @cached_property
     def rollout_places(self) -> dict[Task, RolloutLocation | None]:
@@ -128,6 +169,30 @@ def open_run(path: str | Path) -> Run:
             hint="the command that started it, with --resume, finishes it",
         )
     return Run(folder, manifest)
+
+
+def label_runs(runs: Sequence[Run], labels: Iterable[str]) -> list[Run]:
+    """Runs with planners called otherwise: `NAME=LABEL`, or `RUN/NAME=LABEL` in one of them.
+
+    Raises:
+        ConfigError: No run has such a planner, or two of one would have one name.
+    """
+    wanted: list[dict[str, str]] = [{} for _ in runs]
+    named = [
+        (run.path.name, name, new)
+        for run, new in zip(runs, wanted, strict=True)
+        for name in run.manifest["config"]["planners"]
+    ]
+    for text in labels:
+        name, _, label = text.partition("=")
+        known = {full for where, one, _ in named for full in (one, f"{where}/{one}")}
+        one_of(f"label {text!r}: planner", name, known)
+        if not label.strip() or not label.isprintable():
+            raise ConfigError(f"label {text!r} is empty", hint=f"for example {name}=ours")
+        for where, one, new in named:
+            if name in (one, f"{where}/{one}"):
+                new[one] = label
+    return [run.labelled(new) if new else run for run, new in zip(runs, wanted, strict=True)]
 
 
 def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:

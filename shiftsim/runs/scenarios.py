@@ -19,7 +19,7 @@ from shiftsim.data.store.tables import REVIEW
 from shiftsim.errors import ConfigError, DataError, listed, nearest, one_of
 from shiftsim.files import DEFAULT_STORE, read_toml, safe_join, store_path
 from shiftsim.runs.config import RunConfig
-from shiftsim.runs.results import Run, write_manifest
+from shiftsim.runs.results import Run, read_manifest, write_manifest
 
 if TYPE_CHECKING:
     from shiftsim.runs.edited import EditSet
@@ -118,7 +118,7 @@ def bundle_run(run: Run, store: str | None = None) -> ScenarioStore:
     partial.rename(target)
     bundle = open_store(target)
     run.manifest["bundle"] = {"hash": bundle.hash}
-    write_manifest(run.path, run.manifest)
+    write_manifest(run.path, read_manifest(run.path) | {"bundle": run.manifest["bundle"]})
     return bundle
 
 

@@ -44,8 +44,9 @@ class Choice:
 
     def __contains__(self, task: Task) -> bool:
         # a planner's name may end in the remark that tells runs apart
+        name = task.planner
         return (
-            (not self.planners or task.planner.partition(" (")[0] in self.planners)
+            (not self.planners or any(f"{name} (".startswith(f"{p} (") for p in self.planners))
             and (not self.noises or task.noise in self.noises)
             and (not self.seeds or task.seed in self.seeds or task.noise == "none")
         )
@@ -329,8 +330,13 @@ def galleries(runs: Sequence[Run], stores: Sequence[Any], choice: Choice) -> lis
 
 
 def _names(runs: Sequence[Run]) -> list[str]:
-    """What tells the rollouts of each run from those of the others: traffic, or the run's name."""
-    if len(runs) == 1:
-        return [""]
+    """What tells the rollouts of each run from those of the others: traffic, or the run's name.
+
+    Nothing where the names of the planners do already, in the same traffic.
+    """
+    planners = [name for run in runs for name in run.manifest["config"]["planners"]]
+    modes = {run.manifest["determining"]["traffic"] for run in runs}
+    if len(modes) == 1 and len({*planners}) == len(planners):
+        return [""] * len(runs)
     traffic = [str(run.manifest["determining"]["traffic"]) for run in runs]
     return traffic if len(set(traffic)) == len(runs) else [run.path.name for run in runs]

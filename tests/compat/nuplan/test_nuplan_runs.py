@@ -35,7 +35,7 @@ def test_the_command_line_drives_a_planner_of_the_present_folder(toy, tmp_path):
     store = ("--store", str(toy), "--workers", "2", "--out", "out")
     done = call(tmp_path, "run", *words, argument, *store)
     assert done.returncode == 0, done.stderr
-    theirs = _scores(tmp_path / "out", name)
+    theirs = _scores(tmp_path / "out", "Coast")
     assert len(theirs) == 4
     assert theirs == pytest.approx(_scores(tmp_path / "out", "constant-velocity"), abs=1e-9)
 
