@@ -160,10 +160,13 @@ def write_report(
             head = [f"# {markdown_escape(title)}", markdown_escape(subtitle)]
             parts = [*head, *parts, *shown, f"```bibtex\n{cite}\n```"]
         elif style == "latex":
-            files = {figure.save(folder, "pdf"): figure.title for figure in drawn}
+            files = {figure.save(folder, "pdf"): figure for figure in drawn}
             out += files
             texts[CITED] = cite
-            shown = [latex_picture(path.name, t) for path, t in files.items()]
+            shown = [
+                latex_picture(path.name, one.title, is_wide=one.is_wide)
+                for path, one in files.items()
+            ]
             parts = [f"% {title}\n% {subtitle}\n% cite from {CITED}", *parts, *shown]
         else:
             parts = [f"{title}\n{subtitle}", *parts, cite]

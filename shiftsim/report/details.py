@@ -58,7 +58,7 @@ def planner_comparison(groups: Sequence[Group], *, noisy: bool = False) -> Table
     return Table(
         "planner-comparison-noise" if noisy else "planner-comparison",
         f"Planners compared scenario by scenario{', under noise' if noisy else ', clean'}: "
-        "difference of closed-loop scores x 100, first minus second",
+        "difference of closed-loop scores × 100, first minus second",
         (*labels, "difference", "95 % CI", "better/same/worse", "p", "p (Holm)"),
         rows,
         len(labels),
@@ -98,7 +98,7 @@ def scenario_types(groups: Sequence[Group]) -> list[Table]:
             for name, part in parts[0].items()
         ]
         header = ("type", "scenarios", *(f"{g.planner} {g.traffic}" for g in mine))
-        title = f"Scores by scenario type: {data.label}, clean, closed-loop score x 100"
+        title = f"Scores by scenario type: {data.label}, clean, closed-loop score × 100"
         if len(rows) > 1:
             out.append(Table(f"scenario-types_{data.name}", title, header, rows, 1, (data.rules,)))
     return out
@@ -142,8 +142,9 @@ def edited_scores(groups: Sequence[Group]) -> list[Table]:
                 f"difficulty: braking that avoids it [m/s²], up to {each}; hard also where only "
                 "PDM-Closed avoids it"
             )
-        title = f"Edited scenarios: {data.label}, closed-loop score x 100"
-        out.append(Table(f"edits_{data.name}", title, tuple(header), rows, num_labels, notes))
+        title = f"Edited scenarios: {data.label}, closed-loop score × 100"
+        name, best = f"edits_{data.name}", dict.fromkeys(header[num_labels + 1 :], max)
+        out.append(Table(name, title, tuple(header), rows, num_labels, notes, best=best))
     return out
 
 
@@ -198,8 +199,9 @@ def open_loop_scores(groups: Sequence[Group]) -> Table | None:
         "not nuPlan's",
     )
     rows = [_open_loop_row(group) for group in reversed(each.values())]
-    title = "Open loop beside closed loop, scores x 100"
-    return Table("open-loop", title, header, rows, 4, notes)
+    title = "Open loop beside closed loop, scores × 100"
+    best = dict.fromkeys(("CLS", "open loop"), max) | dict.fromkeys((*errors, "missed"), min)
+    return Table("open-loop", title, header, rows, 4, notes, best=best)
 
 
 def _open_loop_row(group: Group) -> Row:
@@ -230,7 +232,8 @@ def planning_times(groups: Sequence[Group]) -> Table:
     each = {(group.run.path, group.planner): group for group in groups}
     runs = {group.run.path: group.run for group in groups}
     times = ("ms per step", "95 % ms", "worst 95 % ms", "s per rollout")
-    header = ("set", "traffic", "planner", "rollouts", *times, "degraded steps", "in rollouts")
+    degraded = ("degraded steps", "in rollouts")
+    header = ("set", "traffic", "planner", "rollouts", *times, *degraded)
     notes = (
         "per step: mean and 95th percentile within a rollout, of both the median over the "
         "rollouts, which compilation at the start of a run does not touch; per rollout: the "
@@ -238,7 +241,8 @@ def planning_times(groups: Sequence[Group]) -> Table:
         *dict.fromkeys(f"machine: {_machine(run)}" for run in runs.values()),
     )
     title = "Planning time, and steps driven on a degraded (fallback) plan"
-    return Table("planning-time", title, header, [*map(_times_row, each.values())], 3, notes)
+    rows, best = [*map(_times_row, each.values())], dict.fromkeys((*times, *degraded), min)
+    return Table("planning-time", title, header, rows, 3, notes, best=best)
 
 
 def _times_row(group: Group) -> Row:

@@ -30,6 +30,7 @@ _TRAFFIC = {"NR": "non-reactive traffic", "R": "reactive traffic"}
 _SPREAD = 0.62  # how much of a place on the axis the planners share
 _GREY = "0.45"
 _NOTE = 6.5  # points
+_COLUMN = 5.0  # inches; wider pictures are too small in one column of a paper
 _NONE: Mapping[str, str] = MappingProxyType({})
 _BARS = "bars: 95 % bootstrap interval over recordings"
 
@@ -41,6 +42,11 @@ class Figure:
     name: str  # of its file, without ending
     title: str  # what it shows
     drawn: Any  # the matplotlib figure
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether it needs both columns of a paper."""
+        return bool(self.drawn.get_figwidth() > _COLUMN)
 
     def save(self, folder: Path, ending: str = "png") -> Path:
         """Write the picture and return where it is; the same picture gives the same bytes."""

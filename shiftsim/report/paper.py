@@ -16,6 +16,7 @@ INTERVALS = (
     "95 % CI: cluster bootstrap over recordings, 10 000 draws; it says how much the choice "
     "of scenarios matters, not the seeds"
 )
+INTERVAL = "95 % CI"
 PUBLISHED = "(published)"
 _SETS = {"val14": "Val14", "all": "DeepPlan", "deepplan": "DeepPlan"}
 
@@ -83,9 +84,9 @@ def semantic_shift(
             notes.append(f"{PUBLISHED[1:-1]}: {paper.source}")
         rows = _semantic_rows(mine, columns, paper if with_published else None)
         header = ("traffic", "planner", *(column.heading for column in columns))
-        title = f"Zero-shot generalization: {data.label}, clean, scores x 100"
+        title = f"Scores × 100 without noise: {data.label}"
         name = f"semantic-shift_{data.name}"
-        out.append(Table(name, title, header, rows, 2, notes, words=_words(published)))
+        out.append(_semantic_table(name, title, header, rows, notes, published))
     alike = [data for data, _ in sets if published and _is_paper_like(data, published)]
     if published is not None and with_published and not alike:
         out.append(published_semantic(published))
@@ -112,7 +113,7 @@ def _columns(
     return [
         *(_Column(one.label, VAL14, of_val14(mine)) for one, mine in val14),
         _Column(data.label, "all", Group.estimate),
-        _Column("95 % CI", "", score_interval),
+        _Column(INTERVAL, "", score_interval),
         *(_Column(name, name, of_city(city)) for city, name in _cities(data, published).items()),
         *(_Column(COLUMNS[n], COLUMNS[n], methodcaller("estimate", n)) for n in NAMES),
     ]
@@ -180,9 +181,20 @@ def published_semantic(published: Published) -> Table:
     ]
     header = ("traffic", "planner", *(column.heading for column in columns))
     notes = (published.source, "Val14 thresholds nuplan, DeepPlan thresholds deepplan")
-    title = "Zero-shot generalization as published"
-    words = _words(published)
-    return Table("semantic-shift_published", title, header, rows, 2, notes, words=words)
+    title = "Zero-shot generalization as published, scores × 100"
+    return _semantic_table("semantic-shift_published", title, header, rows, notes, published)
+
+
+def _semantic_table(
+    name: str,
+    title: str,
+    header: Sequence[str],
+    rows: Sequence[Row],
+    notes: Sequence[str],
+    published: Published | None,
+) -> Table:
+    best = dict.fromkeys((one for one in header[2:] if one != INTERVAL), max)
+    return Table(name, title, header, rows, 2, notes, words=_words(published), best=best)
 
 
 def _words(published: Published | None) -> dict[str, str]:
@@ -209,8 +221,8 @@ def noise_robustness(groups: Sequence[Group], published: Published | None = None
         notes.append(f"published: {published.source}")
     rows = [(*labels, *map(row.get, noises)) for labels, row in scores.items()]
     header = ("set", "traffic", "planner", *noises)
-    title = "Noise robustness: closed-loop score x 100"
-    return Table("noise-robustness", title, header, rows, 3, notes)
+    title, best = "Noise robustness: closed-loop score × 100", dict.fromkeys(noises, max)
+    return Table("noise-robustness", title, header, rows, 3, notes, best=best)
 
 
 def _seeds_note(groups: Sequence[Group]) -> str:

@@ -44,6 +44,7 @@ def scores(groups: Sequence[Group], *, by: str | None = None) -> Table:
     heading = [*(["set", "traffic"] if several else []), "planner", "noise", *([by] if by else [])]
     rows: list[Row] = []
     full: list[Row] = []
+    paper: list[Row] = []
     for group in groups:
         where = (group.data.label, group.traffic) if several else ()
         for name, part in group.split(by):
@@ -51,11 +52,16 @@ def scores(groups: Sequence[Group], *, by: str | None = None) -> Table:
             shown, complete = _lines(labels, part, _describe(group))
             rows += shown
             full += complete
+            paper.append((*labels, *map(part.estimate, COLUMNS)))
     header = (*heading, *COLUMNS.values())
     in_full = (*header, "statistic", "done", "expected", "label")
     machine = Table("scores", "", in_full, full, len(heading))
-    title, notes = "All planners and noises, scores x 100", dict.fromkeys(map(_describe, groups))
-    return Table("scores", title, header, rows, len(heading), tuple(notes), machine)
+    notes = tuple(dict.fromkeys(map(_describe, groups)))
+    sets = dict.fromkeys(f"{group.data.label}, traffic {group.traffic}" for group in groups)
+    title = f"Scores × 100 of all planners and noises: {'; '.join(sets)}"
+    best = dict.fromkeys(COLUMNS.values(), max)
+    in_paper = Table("scores", title, header, paper, len(heading), notes, best=best)
+    return Table("scores", title, header, rows, len(heading), notes, machine, paper=in_paper)
 
 
 def _describe(group: Group) -> str:
@@ -68,7 +74,7 @@ def _describe(group: Group) -> str:
             f"controller {data.controller}",
             f"thresholds {data.thresholds}",
             f"metrics v{data.metric_version}",
-            "scores x 100",
+            "scores × 100",
             *planner_notes([group.run]),
         ]
     )

@@ -5,7 +5,7 @@ import html
 import io
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from textwrap import wrap
 from typing import TypeAlias
@@ -16,6 +16,8 @@ from shiftsim.report.words import LONG, legend
 ENDINGS = {"text": "txt", "md": "md", "csv": "csv", "latex": "tex", "html": "html"}
 FORMATS = tuple(ENDINGS)
 _GAP = 2  # blanks between columns of text
+_COLUMN, _PAGE = 240.0, 504.0  # points, widths of a paper of two columns
+_SETTINGS = ("set", "traffic", "noise")  # labels that a caption can say for all rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +85,9 @@ class Table:
     notes: Sequence[str] = ()  # what a reader must know to use the numbers
     full: "Table | None" = None  # the same for machines, where it is another table
     words: Mapping[str, str] = field(default_factory=lambda: LONG)  # what headings are short for
+    # measured columns, and what chooses the best number of each, `max` or `min`
+    best: Mapping[str, Callable[[Iterable[float]], float]] = field(default_factory=dict)
+    paper: "Table | None" = None  # the same for a paper, where it is another table
 
     def __post_init__(self) -> None:
         for row in self.rows:
@@ -210,6 +215,11 @@ _LATEX = {
     "–": "--",
     "…": r"\dots{}",
     "→": r"$\rightarrow$",
+    "Δ": r"$\Delta$",
+    "ρ": r"$\rho$",
+    "²": "$^2$",
+    "³": "$^3$",
+    "°": r"$^\circ$",
 }
 _LATEX_TABLE = str.maketrans(_LATEX)
 
@@ -220,36 +230,150 @@ def latex_escape(value: str) -> str:
 
 
 def _latex(table: Table) -> str:
-    columns = "l" * table.num_labels + "r" * (len(table.header) - table.num_labels)
+    """A float for a paper of two columns; the best numbers are bold, notes stand below."""
+    table = _for_paper(table)
+    settings = [row[: table.num_labels - 1] if table.best else () for row in table.rows]
+    bold = _best(table, settings)
+    body, before = list[str](), None
+    for number, (row, setting) in enumerate(zip(table.rows, settings, strict=True)):
+        cells = [_latex_cell(cell, is_bold=(number, i) in bold) for i, cell in enumerate(row)]
+        if setting == before:
+            cells[: len(setting)] = [""] * len(setting)
+        elif body:
+            body.append(r"\midrule")
+        body.append(_latex_row(cells))
+        before = setting
+    columns = [*zip(*table.lines, strict=True)]
+    sides = "".join("l" if i < table.num_labels else "r" for i in range(len(columns)))
+    heads = [_stacked(name, cells) for name, *cells in columns]
+    names = [_latex_heading(head, side) for head, side in zip(heads, sides, strict=True)]
+    # a subscript is about as wide as its digits would be
+    texts = (
+        [*h, *(c.replace(" ± ", "") for c in cells)]
+        for h, (_, *cells) in zip(heads, columns, strict=True)
+    )
+    sizes = [max(map(len, each)) for each in texts]
+    top = [f"\\begin{{tabular}}{{{sides}}}", r"\toprule", _latex_row(names), r"\midrule"]
+    return _float(table, [*top, *body, r"\bottomrule", r"\end{tabular}"], sizes)
 
-    def line(cells: Sequence[str]) -> str:
-        # a cell that begins with "[" would be read as an option of the \\ or \toprule before it
-        safe = (f"{{{cell}}}" if cell.startswith("[") else cell for cell in cells)
-        return f"  {' & '.join(safe)} \\\\"
 
-    head, *rows = (line([latex_escape(cell) for cell in cells]) for cells in table.lines)
-    notes = "; ".join(latex_escape(note) for note in table.remarks)
-    caption = ". ".join(filter(None, (latex_escape(table.title), notes)))
-    begin = [
-        r"\begin{table}  % needs \usepackage{booktabs}",
-        r"\centering",
-        f"\\caption{{{caption}}}",
-        f"\\label{{tab:{table.name}}}",
-        f"\\begin{{tabular}}{{{columns}}}",
+def _for_paper(table: Table) -> Table:
+    """The measured columns of a table, where it says which these are, and the labels that differ.
+
+    What all rows share is said in the title. Rows of one setting, which are all labels but the
+    planner, stand together.
+    """
+    table = table.paper or table
+    labels = {name: [row[i] for row in table.rows] for i, name in enumerate(table.header)}
+    shared = [
+        (name, shown(cells[0]))
+        for name, cells in [*labels.items()][: table.num_labels]
+        if name in _SETTINGS and len(set(cells)) == 1
     ]
-    end = [r"\bottomrule", r"\end{tabular}", r"\end{table}"]
-    return "\n".join([*begin, r"\toprule", head, r"\midrule", *rows, *end])
+    names = list(enumerate(table.header))
+    kept = [i for i, name in names[: table.num_labels] if name not in dict(shared)]
+    if table.best:
+        kept.sort(key=lambda i: table.header[i] == "planner")
+    measured = [i for i, name in names[table.num_labels :] if not table.best or name in table.best]
+    rows = [tuple(row[i] for i in (*kept, *measured)) for row in table.rows]
+    if table.best:
+        places = list(dict.fromkeys(row[: len(kept) - 1] for row in rows))
+        rows.sort(key=lambda row: places.index(row[: len(kept) - 1]))
+    said = ", ".join(f"{name} {value}" for name, value in shared if value not in table.title)
+    return replace(
+        table,
+        title="; ".join(filter(None, (table.title, said))),
+        header=[table.header[i] for i in (*kept, *measured)],
+        rows=rows,
+        num_labels=len(kept),
+        paper=None,
+    )
 
 
-def latex_picture(name: str, title: str) -> str:
-    """A picture in LaTeX by the name of its file."""
+def _best(table: Table, settings: Sequence[Row]) -> set[tuple[int, int]]:
+    """Row and column of the best numbers under each setting, as printed, if any is worse."""
+    out = set()
+    for setting in dict.fromkeys(settings):
+        for name, choose in table.best.items():
+            column = list(table.header).index(name)
+            numbers = {
+                (row, column): round(cell.value, cell.digits)
+                for row, cells in enumerate(table.rows)
+                if settings[row] == setting
+                and isinstance(cell := cells[column], Number)
+                and cell.value is not None
+                and not cell.label
+            }
+            if len(set(numbers.values())) > 1:
+                best = choose(numbers.values())
+                out |= {place for place, value in numbers.items() if value == best}
+    return out
+
+
+def _float(table: Table, tabular: Sequence[str], sizes: Sequence[int]) -> str:
+    """The float around a tabular whose columns are so many characters wide."""
+    width = 4.0 * sum(sizes) + 8.0 * len(sizes)
+    kind, font, gap, needs = "table" if width <= _COLUMN else "table*", "footnotesize", 4, ""
+    if width > _PAGE:
+        width, font, gap = 3.5 * sum(sizes) + 4.0 * len(sizes), "scriptsize", 2
+    if width > _PAGE:
+        needs, tabular = ",graphicx", [r"\resizebox{\textwidth}{!}{%", *tabular, "}"]
+    notes = " ".join(f"{latex_escape(note)}." for note in table.remarks)
+    below = ["", r"\smallskip", r"\begin{minipage}{\linewidth}\scriptsize\raggedright", notes]
+    lines = [
+        f"\\begin{{{kind}}}  % needs \\usepackage{{booktabs{needs}}}",
+        r"\centering",
+        f"\\caption{{{latex_escape(table.title)}.}}",
+        f"\\label{{tab:{table.name}}}",
+        f"\\{font}\\setlength{{\\tabcolsep}}{{{gap}pt}}",
+        *tabular,
+        *([*below, r"\end{minipage}"] if notes else []),
+        f"\\end{{{kind}}}",
+    ]
+    return "\n".join(lines)
+
+
+def _latex_row(cells: Sequence[str]) -> str:
+    return f"  {' & '.join(cells)} \\\\"
+
+
+def _latex_cell(cell: Cell, *, is_bold: bool = False) -> str:
+    """A cell in LaTeX; the deviation over the seeds is a subscript."""
+    text = latex_escape(shown(cell))
+    if isinstance(cell, Number) and cell.value is not None:
+        text = f"{cell.value:.{cell.digits}f}"
+        text = f"\\textbf{{{text}}}" if is_bold else text
+        text += "" if cell.std is None else f"$_{{\\pm {cell.std:.2f}}}$"
+        text = f"{text} {cell.label}".rstrip()
+    if not isinstance(cell, str):
+        text = re.sub(r"-(?=\d)", "$-$", text)
+    # one that begins with "[" would be read as an option of the \\ or \toprule before it
+    return f"{{{text}}}" if text.startswith("[") else text
+
+
+def _latex_heading(lines: Sequence[str], side: str) -> str:
+    """A heading of one line or of several; `side` is where its column is aligned."""
+    cells = [_latex_cell(line) for line in lines]
+    text = r" \\ ".join(cells)
+    return f"\\shortstack[{side}]{{{text}}}" if len(cells) > 1 else text
+
+
+def _stacked(name: str, cells: Sequence[str]) -> list[str]:
+    """The lines of a heading that is not much wider than its column."""
+    words = name.split()
+    return wrap(name, max(map(len, (*cells, *words)))) if words else [""]
+
+
+def latex_picture(name: str, title: str, *, is_wide: bool = False) -> str:
+    """A picture in LaTeX by the name of its file, in one column of the paper or over both."""
+    kind = "figure*" if is_wide else "figure"
     lines = (
-        r"\begin{figure}  % needs \usepackage{graphicx}",
+        f"\\begin{{{kind}}}  % needs \\usepackage{{graphicx}}",
         r"\centering",
         f"\\includegraphics[width=\\linewidth]{{{name}}}",
-        f"\\caption{{{latex_escape(title)}}}",
+        f"\\caption{{{latex_escape(title)}.}}",
         f"\\label{{fig:{name.partition('.')[0]}}}",
-        r"\end{figure}",
+        f"\\end{{{kind}}}",
     )
     return "\n".join(lines)
 
