@@ -15,22 +15,33 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shiftsim.benchmarks import INTERPLAN_THRESHOLDS, Drawn, Track, load_track
+from shiftsim.benchmarks import INTERPLAN_THRESHOLDS, Drawn, Track, known_sets, load_track
+from shiftsim.benchmarks import published as published_figures
 from shiftsim.data import open_store
 from shiftsim.edits.sampling import sample_edits
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.files import DEFAULT_STORE, write_text
-from shiftsim.report.groups import TRAFFIC, Group, KnownSet, distinct_sets, token_digest
-from shiftsim.report.tables import Cell, Number, Table
+from shiftsim.report import build
+from shiftsim.report.figures import figures
+from shiftsim.report.groups import (
+    TRAFFIC,
+    Group,
+    KnownSet,
+    distinct_sets,
+    read_groups,
+    token_digest,
+)
+from shiftsim.report.tables import FORMATS, Cell, Number, Table
 from shiftsim.runs.avoidable import grade
 from shiftsim.runs.config import make_config
 from shiftsim.runs.edited import EditSet, edits_text, make_edits
 from shiftsim.runs.execute import Progress, execute
 from shiftsim.runs.prepare import RUNS, RunPlan, prepare
 from shiftsim.runs.results import Run, label_runs, open_run
-from shiftsim.runs.scenarios import default_split, open_edits
+from shiftsim.runs.scenarios import default_split, open_edits, open_run_store
 from shiftsim.runs.tables import stored_results
 from shiftsim.sim.traffic import traffic_name
+from shiftsim.view.build import Choice, galleries, write_site
 
 MANIFEST = "bench.json"
 EDITS = "edits.toml"  # what was edited, in the folder of the benchmark
@@ -245,6 +256,62 @@ class OpenedRuns(NamedTuple):
     def coverage(self, groups: Sequence[Group]) -> list[Table]:
         """The tables that only a benchmark has."""
         return [coverage(track, groups) for track in dict.fromkeys(self.tracks)]
+
+    def groups(self, *, allow_partial: bool = False) -> list[Group]:
+        """The scores by planner and noise."""
+        known = (*known_sets(), *self.own)
+        return read_groups(self.runs, known, allow_partial=allow_partial)
+
+    def tables(
+        self, options: build.Options, *, with_coverage: bool = False, allow_partial: bool = False
+    ) -> list[Table]:
+        """The tables that are asked for, also those that only a benchmark has if wanted."""
+        found = self.groups(allow_partial=allow_partial)
+        tables = build.make_tables(found, published_figures(), options)
+        return [*(self.coverage(found) if with_coverage else []), *tables]
+
+    def report(
+        self,
+        folder: Path,
+        options: build.Options,
+        *,
+        formats: Sequence[str] = FORMATS,
+        pictures: bool = True,
+        pages: bool = False,
+        allow_partial: bool = False,
+        title: str = "",
+        on_progress: Callable[[int, int], None] = lambda done, total: None,
+    ) -> list[Path]:
+        """Write tables and pictures to a folder, and return the files.
+
+        There is a file per format; with `pages` there are HTML pages in place of these: tables,
+        pictures, and every scenario with its replay.
+
+        Raises:
+            MissingExtraError: Pictures are asked for, and matplotlib is missing.
+        """
+        is_whole = options.tables == tuple(build.TABLES)
+        tables = self.tables(options, with_coverage=is_whole, allow_partial=allow_partial)
+        drawn = figures(self.groups(allow_partial=allow_partial)) if pictures or pages else []
+        title = title or f"Report on {', '.join(run.path.name for run in self.runs)}"
+        if not pages:
+            return build.write_report(folder, title, self.runs, tables, drawn, formats)
+        folder.mkdir(parents=True, exist_ok=True)
+        images = {figure.save(folder).name: figure.title for figure in drawn}
+        shown = galleries(self.runs, [_store_of(run) for run in self.runs], Choice())
+        above = build.report_html(self.runs, tables, images)
+        write_site(folder, shown, title=title, above=above, on_progress=on_progress)
+        return [folder / "index.html"]
+
+
+def _store_of(run: Run) -> Any:
+    """The store of a run; None where it is away and there is nothing to draw."""
+    try:
+        return open_run_store(run)
+    except DataError:
+        if any(run.rollout_places.values()):
+            raise
+        return None
 
 
 def open_runs(folders: Iterable[Path], labels: Iterable[str] = ()) -> OpenedRuns:

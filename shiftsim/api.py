@@ -11,8 +11,9 @@ from typing import Any
 
 import shiftsim.edits  # noqa: F401  # attaches Scenario.edited
 from shiftsim.data import open_store as open_store
-from shiftsim.errors import ConfigError
+from shiftsim.errors import ConfigError, one_of
 from shiftsim.planners import registry
+from shiftsim.report.tables import FORMATS, Table, render, to_pandas
 from shiftsim.runs import results
 from shiftsim.sim import loop
 from shiftsim.sim.log import SimulationLog
@@ -32,6 +33,31 @@ class Explanation(str):
         return str(self)
 
 
+class Comparison:
+    """Planners compared scenario by scenario, in pairs; printed as text.
+
+    Attributes:
+        tables: The tables, of clean rollouts and of those under noise.
+    """
+
+    def __init__(self, tables: Sequence[Table]) -> None:
+        self.tables = tuple(tables)
+
+    def table(self, format: str = "text") -> Any:
+        """The tables as `text`, `md`, `latex`, `csv` or `html`, or a DataFrame of `pandas`."""
+        return _in_format(self.tables, format)
+
+    def __str__(self) -> str:
+        return str(self.table())
+
+    def __repr__(self) -> str:
+        count = sum(len(table.rows) for table in self.tables)
+        return f"<Comparison of {count} pair{'' if count == 1 else 's'} of planners>"
+
+    def _repr_html_(self) -> str:
+        return str(self.table("html"))
+
+
 class Run(results.Run):
     """A finished run on disk, with its tables and pictures.
 
@@ -45,11 +71,81 @@ class Run(results.Run):
         ```
     """
 
-    def table(self, *, allow_partial: bool = False) -> str:
-        """The score table as text."""
-        from shiftsim.report.scores import score_table
+    def table(
+        self,
+        name: str = "scores",
+        format: str = "text",
+        *,
+        by: str | None = None,
+        allow_partial: bool = False,
+    ) -> Any:
+        """A table of `shiftsim report --list`.
 
-        return score_table([self], allow_partial=allow_partial)
+        Args:
+            name: Name of the table.
+            format: `text`, `md`, `latex`, `csv` or `html`, or `pandas` for a DataFrame.
+            by: Splits the scores by `scenario_type`, `city` or `seed`.
+            allow_partial: Whether means over what finished are shown, labelled so.
+
+        Raises:
+            ConfigError: There is no such table or format, or the run holds nothing of it.
+            MissingExtraError: pandas is asked for and missing.
+        """
+        from shiftsim.report.build import Options
+
+        options = Options((name,), by)
+        tables = self._opened().tables(options, allow_partial=allow_partial)
+        if not tables:
+            raise ConfigError(f"run {str(self.path)!r} holds nothing of the table {name!r}")
+        return _in_format(tables, format)
+
+    def compare(self, *others: results.Run) -> Comparison:
+        """Every pair of planners of this and other runs on the same scenarios, with intervals.
+
+        Raises:
+            ConfigError: No two planners drove the same scenarios in the same traffic and noise.
+        """
+        from shiftsim.report.build import Options
+
+        options = Options(("planner-comparison", "planner-comparison-noise"))
+        if tables := self._opened(*others).tables(options):
+            return Comparison(tables)
+        names = ", ".join(run.path.name for run in (self, *others))
+        raise ConfigError(
+            f"nothing to compare in {names}",
+            hint="needs two planners that finished the same scenarios, traffic, noise and seeds",
+        )
+
+    def report(
+        self,
+        folder: str | Path,
+        *others: results.Run,
+        formats: Sequence[str] = FORMATS,
+        tables: Sequence[str] = (),
+        by: str | None = None,
+        **settings: Any,
+    ) -> list[Path]:
+        """Write tables and pictures to a folder, of other runs as well, and return the files.
+
+        Args:
+            folder: Where to; made if needed.
+            others: Other runs.
+            formats: Formats of tables, each a file, of `csv` a file per table.
+            tables: Names of tables, as `shiftsim report --list` has them; all of them by default.
+            by: Splits the scores by `scenario_type`, `city` or `seed`.
+            settings: `pictures=False` leaves them out; `pages=True` writes HTML pages with a
+                replay of every scenario; `allow_partial=True` labels means over what finished.
+
+        Raises:
+            ConfigError: There is no such table or format.
+            MissingExtraError: matplotlib is missing.
+        """
+        from shiftsim.report.build import TABLES, Options
+
+        for name in formats:
+            one_of("format", name, FORMATS)
+        options = Options(tuple(tables or TABLES), by)
+        return self._opened(*others).report(Path(folder), options, formats=formats, **settings)
 
     def worst(self, count: int = 10) -> list[dict[str, Any]]:
         """The worst of each recording and cause: key, `cls`, `reason`, how many `others`."""
@@ -75,21 +171,40 @@ class Run(results.Run):
         tasks = select_tasks(self, token, planner=planner, noise=noise, seed=seed)
         return Explanation("\n\n".join("\n".join(explain_lines(task)) for task in tasks))
 
-    def plot(self, token: str, *, at: float = 0.0) -> Any:
+    def plot(
+        self, token: str, *, at: float | Sequence[float] = 0.0, grid: bool = False, **chosen: Any
+    ) -> Any:
         """The driven paths of one scenario `at` seconds from the start, as a matplotlib figure.
+
+        Several times, or `grid`, give a row per rollout and a column per time. `planner`, `noise`
+        and `seed`, a value or a list of them each, choose rollouts.
 
         Raises:
             ConfigError: There is no stored rollout of it, or no such time.
             DataError: The store of the run is not there.
             MissingExtraError: matplotlib is missing.
         """
-        from shiftsim.view.still import still
+        from shiftsim.view import still
 
-        gallery = self._gallery()
+        gallery = self._gallery(**chosen)
         found = gallery.find(token)
         scenario = gallery.store.read(found)
         shown, note = gallery.shown(found, scenario), gallery.shown_words(found)
-        return still(scenario, shown, at=at, note=note)
+        times = [at] if isinstance(at, (int, float)) else list(at)
+        if grid or len(times) > 1:
+            return still.grid(scenario, shown, at=times, note=note)
+        return still.still(scenario, shown, at=times[0], note=note)
+
+    def plot_open_against_closed(self, *others: results.Run) -> Any:
+        """Open-loop scores and errors against closed-loop scores, as a matplotlib figure.
+
+        Raises:
+            ConfigError: The runs were not made with `open_loop=True`.
+            MissingExtraError: matplotlib is missing.
+        """
+        from shiftsim.report.figures import open_against_closed
+
+        return open_against_closed(self._opened(*others).groups(allow_partial=True)).drawn
 
     def view(self, token: str) -> Any:
         """The replay of one scenario: a `Page`, which notebooks show and `.save(path)` writes.
@@ -138,18 +253,25 @@ class Run(results.Run):
         bundle_run(self, store)
         return self
 
-    def _gallery(self) -> Any:
+    def _gallery(self, *, planner: Any = (), noise: Any = (), seed: Any = ()) -> Any:
         from shiftsim.runs.scenarios import open_run_store
-        from shiftsim.view.build import Gallery
+        from shiftsim.view.build import Choice, Gallery
 
-        return Gallery([self], open_run_store(self))
+        given = (planner, noise, seed)
+        choice = Choice(*((one,) if isinstance(one, (str, int)) else tuple(one) for one in given))
+        return Gallery([self], open_run_store(self), choice)
+
+    def _opened(self, *others: results.Run) -> Any:
+        from shiftsim.benchmarks.bench import OpenedRuns
+
+        return OpenedRuns([self, *others], [], [])
 
     def __repr__(self) -> str:
         counts = self.manifest["counts"]
         return f"<Run {self.path}: {counts['ok']} of {counts['expected']} tasks finished>"
 
     def _repr_html_(self) -> str:
-        return _preformatted(self.table(allow_partial=True))
+        return str(self.table(format="html", allow_partial=True))
 
 
 def run(
@@ -273,6 +395,14 @@ def simulate(
     require_scenario("simulate", scenario)
     driver = load_planner(planner) if isinstance(planner, str) else planner
     return loop.simulate(scenario, driver, setting, **changes)
+
+
+def _in_format(tables: Sequence[Table], format: str) -> Any:
+    """Tables as text in a format, or as a DataFrame."""
+    one_of("format", format, (*FORMATS, "pandas"))
+    if format == "pandas":
+        return to_pandas(tables)
+    return Explanation("\n\n".join(render(table, format) for table in tables))
 
 
 def _preformatted(text: str) -> str:

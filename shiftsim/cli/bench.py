@@ -8,7 +8,6 @@ from typer import Argument, Option, echo
 
 from shiftsim import cli
 from shiftsim.cli import Json, Quiet, plural, print_json, print_result, stdout_to_stderr
-from shiftsim.cli.report import read_tables
 from shiftsim.cli.run import DryRun, Live, announce, progress_of
 from shiftsim.errors import MissingExtraError
 from shiftsim.runs.config import split_label
@@ -130,9 +129,9 @@ def _report(plan: "Plan", *, published: bool, allow_partial: bool, as_json: bool
 
     opened = open_runs([plan.folder])
     options = Options(with_published=published)
-    groups, tables = read_tables(opened, options, with_coverage=True, allow_partial=allow_partial)
+    tables = opened.tables(options, with_coverage=True, allow_partial=allow_partial)
     try:
-        drawn = figures(groups)
+        drawn = figures(opened.groups(allow_partial=allow_partial))
     except MissingExtraError as error:
         echo(f" no pictures: {error.message}; {error.hint}", err=True)
         drawn = []

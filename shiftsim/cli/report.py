@@ -1,22 +1,18 @@
 """Commands that read runs: report, explain, diff."""
 
-from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument, Exit, Option, echo
 
 from shiftsim import cli
 from shiftsim.cli import Json, Quiet, plural, print_json, progress_bar
-from shiftsim.errors import DataError, one_of
+from shiftsim.errors import one_of
 from shiftsim.files import safe_join
 
 if TYPE_CHECKING:
-    from shiftsim.benchmarks.bench import OpenedRuns
-    from shiftsim.report.build import Options
-    from shiftsim.report.figures import Figure
-    from shiftsim.report.groups import Group
-    from shiftsim.report.tables import Table
+    from collections.abc import Sequence
+
     from shiftsim.runs.results import Run
 
 _WORST = 10
@@ -69,8 +65,7 @@ def report(
 ) -> None:
     """Tables and pictures of one or several runs, or of a benchmark's folder."""
     from shiftsim.benchmarks.bench import open_runs
-    from shiftsim.report.build import BRIEF, TABLES, Options, write_report
-    from shiftsim.report.figures import figures as draw
+    from shiftsim.report.build import BRIEF, TABLES, Options
     from shiftsim.report.scores import summary
     from shiftsim.report.tables import FORMATS, render
 
@@ -82,78 +77,42 @@ def report(
         one_of("format", name, FORMATS)
     if figures and out is None:
         out = safe_join(folders[0], "report")
-    kind = (style or ["text"])[0]
-    default = tuple(TABLES) if out or site else ("scores",) if kind == "csv" else BRIEF
-    options = Options(tuple(table or default), by, published)
-    groups, tables = read_tables(
-        opened, options, with_coverage=not table, allow_partial=allow_partial
-    )
-    drawn = draw(groups) if figures or site else []
     title = f"Report on {', '.join(folder.resolve().name for folder in folders)}"
+    options = Options(tuple(table or TABLES), by, published)
     if out is not None:
-        files = write_report(out, title, opened.runs, tables, drawn, style or FORMATS)
+        files = opened.report(
+            out,
+            options,
+            formats=style or FORMATS,
+            pictures=figures,
+            allow_partial=allow_partial,
+            title=title,
+        )
         echo(f"{plural(len(files), 'file')} in {out}: {', '.join(path.name for path in files)}")
     if site is not None:
         with progress_bar(quiet=quiet) as advance:
-            _write_pages(site, title, opened.runs, tables, drawn, advance)
-        echo(f"written: {site / 'index.html'}")
+            (page,) = opened.report(
+                site,
+                options,
+                pages=True,
+                allow_partial=allow_partial,
+                title=title,
+                on_progress=advance,
+            )
+        echo(f"written: {page}")
     if out is not None or site is not None:
         return
+    kind = (style or ["text"])[0]
+    default = ("scores",) if kind == "csv" else BRIEF
+    options = Options(tuple(table or default), by, published)
+    whole = not table and kind != "csv"
+    tables = opened.tables(options, with_coverage=whole, allow_partial=allow_partial)
     echo("\n\n".join(render(one, kind, width=cli.terminal_width()) for one in tables))
     for name in table:
         if not any(one.name.split("_")[0] == name for one in tables):
             echo(f"no table {name}: these runs hold nothing of it", err=True)
     if kind == "text" and not table:
         print_worst(opened.runs, worst)
-
-
-def read_tables(
-    opened: "OpenedRuns", options: "Options", *, with_coverage: bool, allow_partial: bool
-) -> "tuple[list[Group], list[Table]]":
-    """The scores of runs by planner and noise, and tables, also those of benchmarks if asked."""
-    from shiftsim.benchmarks import known_sets
-    from shiftsim.benchmarks import published as published_figures
-    from shiftsim.report.build import make_tables
-    from shiftsim.report.groups import read_groups
-
-    groups = read_groups(opened.runs, (*known_sets(), *opened.own), allow_partial=allow_partial)
-    tables = make_tables(groups, published_figures(), options)
-    if with_coverage and options.tables != ("scores",):
-        tables = [*opened.coverage(groups), *tables]
-    return groups, tables
-
-
-def _write_pages(
-    folder: Path,
-    title: str,
-    runs: "Sequence[Run]",
-    tables: "Sequence[Table]",
-    drawn: "Sequence[Figure]",
-    on_progress: Callable[[int, int], None],
-) -> None:
-    """A folder of pages: tables and pictures, and every scenario with its replay."""
-    from shiftsim.report.build import report_html
-    from shiftsim.runs.scenarios import open_run_store
-    from shiftsim.view.build import Choice, galleries, write_site
-
-    folder.mkdir(parents=True, exist_ok=True)
-    images = {figure.save(folder).name: figure.title for figure in drawn}
-    stores: list[Any] = []
-    for run in runs:
-        try:
-            stores.append(open_run_store(run))
-        except DataError:
-            if any(run.rollout_places.values()):
-                raise
-            stores.append(None)  # then there is nothing to draw
-    write_site(
-        folder,
-        galleries(runs, stores, Choice()),
-        title=title,
-        limit=0,
-        above=report_html(runs, tables, images),
-        on_progress=on_progress,
-    )
 
 
 def print_worst(runs: "Sequence[Run]", count: int) -> None:

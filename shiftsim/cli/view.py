@@ -70,9 +70,14 @@ def view(
 
 def plot(
     run: RunFolder,
-    token: str = Argument(metavar="TOKEN", help="A scenario."),
+    token: str | None = Argument(None, metavar="[TOKEN]", help="A scenario."),
     at: str = Option("0", help="Time of a still from the start [s]; several, such as 0,5,10."),
     grid: bool = Option(False, "--grid", help="A row per rollout, a column per time."),
+    open_against_closed: bool = Option(
+        False,
+        "--open-against-closed",
+        help="In place of a scenario: open-loop against closed-loop scores of all of them.",
+    ),
     out: Path = Option(
         Path("figure.pdf"), "--out", "-o", help="A .pdf, .png or .svg, or a film: .mp4 or .gif."
     ),
@@ -84,8 +89,18 @@ def plot(
     labels: Labels = None,
 ) -> None:
     """The driven paths of several rollouts over the map, as a still or a film."""
+    from shiftsim.benchmarks.bench import open_runs
+    from shiftsim.report.figures import open_against_closed as scatter
+    from shiftsim.report.palette import save_picture
     from shiftsim.view.still import save_figure
 
+    if open_against_closed:
+        opened = open_runs([run, *(others or ())], labels or ())
+        save_picture(scatter(opened.groups(allow_partial=True)).drawn, out)
+        echo(f"written: {out}")
+        return
+    if token is None:
+        raise ConfigError("no scenario", hint="shiftsim plot RUN TOKEN, or --open-against-closed")
     found = _galleries([run, *(others or ())], labels, store, planner, noise, seed)
     gallery, token = _holding(found, token)
     scenario = gallery.store.read(token)

@@ -172,9 +172,14 @@ def _driven_as(group: Group) -> tuple[object, ...]:
     return (*labels, data.windows, *data.traits[:3])
 
 
+def has_open_loop(group: Group) -> bool:
+    """Whether the run was asked for open-loop scores."""
+    return bool(group.run.manifest["config"].get("open_loop"))
+
+
 def open_loop_scores(groups: Sequence[Group]) -> Table | None:
     """Open loop beside closed loop, of the runs that asked for it."""
-    asked = [group for group in groups if group.run.manifest["config"].get("open_loop")]
+    asked = [group for group in groups if has_open_loop(group)]
     each = {(group.run.path, group.planner): group for group in reversed(asked)}
     if not each:
         return None
@@ -194,14 +199,26 @@ def open_loop_scores(groups: Sequence[Group]) -> Table | None:
     notes = (
         "CLS: closed loop under that noise; open loop: nuPlan's score of the plans along the "
         "recording; errors: means over plans and horizons of 3, 5 and 8 s; missed: largest share "
-        "of plans that are too far away",
-        "plans: compared ones of all; where some were not, as the recording ends, the score is "
-        "not nuPlan's",
+        "of plans that are too far away; where plans were not compared, as the recording ends, "
+        "the score is not nuPlan's",
+        "plans: compared ones of all",
     )
     rows = [_open_loop_row(group) for group in reversed(each.values())]
     title = "Open loop beside closed loop, scores × 100"
     best = dict.fromkeys(("CLS", "open loop"), max) | dict.fromkeys((*errors, "missed"), min)
     return Table("open-loop", title, header, rows, 4, notes, best=best)
+
+
+def open_loop_values(group: Group, metric: str) -> FloatArray:
+    """(N,) an open-loop metric's mean over the seeds of every scenario; NaN where there is none."""
+    table = group.run.metrics
+    chosen = {"planner": group.name, "noise": group.noise, "metric": metric}
+    for name, value in chosen.items():
+        table = table.filter(pc.equal(table[name], value))
+    means = table.group_by("token").aggregate([("value", "mean")])
+    found = dict(zip(means["token"].to_pylist(), means["value_mean"].to_pylist(), strict=True))
+    values = (found.get(token) for token in group.data.tokens)
+    return np.array([np.nan if value is None else value for value in values])
 
 
 def _open_loop_row(group: Group) -> Row:

@@ -16,11 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from shiftsim.edits.sampling import GRADES, graded
-from shiftsim.kernels import BoolArray
-from shiftsim.report.details import recorded_score
+from shiftsim.errors import ConfigError
+from shiftsim.kernels import BoolArray, FloatArray
+from shiftsim.metrics import open_loop
+from shiftsim.report.details import has_open_loop, open_loop_values, recorded_score
 from shiftsim.report.groups import COLUMNS, DataSet, Group, by_set
 from shiftsim.report.palette import Style, dashes, new_figure, planner_styles, save_picture
-from shiftsim.report.statistics import score_interval
+from shiftsim.report.statistics import rank_correlation, score_interval
 from shiftsim.report.tables import Interval, Number
 from shiftsim.report.words import LONG
 
@@ -30,6 +32,9 @@ _TRAFFIC = {"NR": "non-reactive traffic", "R": "reactive traffic"}
 _SPREAD = 0.62  # how much of a place on the axis the planners share
 _GREY = "0.45"
 _NOTE = 6.5  # points
+_MEAN = {"markeredgecolor": "black", "markeredgewidth": 0.9}
+_ADE = "average displacement error (ADE) [m]"
+_RHO = "ρ: Spearman's rank correlation, of scenarios by planner, and of the planners' means"
 _COLUMN = 5.0  # inches; wider pictures are too small in one column of a paper
 _NONE: Mapping[str, str] = MappingProxyType({})
 _BARS = "bars: 95 % bootstrap interval over recordings"
@@ -112,7 +117,73 @@ def figures(groups: Sequence[Group]) -> list[Figure]:
         drawn = _scores(clean, {"": places}, styles, labels=("", "score"))
         _finish(drawn, data, "Metrics", f"clean rollouts; {_BARS}")
         out.append(Figure(f"metrics_{name}", f"Metrics on {data.label}", drawn))
-    return out
+    return [*out, open_against_closed(groups)] if any(map(has_open_loop, groups)) else out
+
+
+def open_against_closed(groups: Sequence[Group]) -> Figure:
+    """Open loop against closed loop: a mark per planner and scenario, clean where there is that.
+
+    The legends have Spearman's rank correlations over scenarios, and over the planners' means.
+
+    Raises:
+        ConfigError: No run has open-loop scores.
+        MissingExtraError: matplotlib is not installed.
+    """
+    asked = [group for group in groups if has_open_loop(group)]
+    if not asked:
+        raise ConfigError("no open-loop scores", hint="shiftsim run --open-loop makes them")
+    shown = [group for group in asked if group.noise == "none"] or asked
+    styles = planner_styles(dict.fromkeys(group.planner for group in shown))
+    ade = next(name for name, (short, *_) in open_loop.METRICS.items() if short == "ADE")
+    kinds = {"open-loop score × 100": (open_loop.TOTAL, 100.0), _ADE: (ade, 1.0)}
+    rows = list(dict.fromkeys(group.traffic for group in shown))
+    figure, panels = _panels(rows, [*kinds], (3.6, 3.4))
+    for axes, traffic, label in panels:
+        metric, scale = kinds[label]
+        points = [
+            (group, scale * open_loop_values(group, metric), 100.0 * group.scenario_means())
+            for group in shown
+            if group.traffic == traffic
+        ]
+        _scatter(axes, points, styles)
+        _finish_axes(axes, _TRAFFIC.get(traffic, traffic))
+        axes.set_xlabel(label, fontsize=9)
+        axes.legend(fontsize=6.5, framealpha=0.8)
+    labels = ", ".join(dict.fromkeys(group.data.label for group in shown))
+    figure.suptitle(f"Open loop against closed loop: {labels}", fontsize=10)
+    rules = dict.fromkeys(group.data.rules for group in shown)
+    lines = [line for rule in (*rules, _RHO) for line in wrap(rule, _per_line(figure, _NOTE))]
+    figure.supxlabel("\n".join(lines), fontsize=_NOTE, color=_GREY)
+    return Figure("open-against-closed", f"Open loop against closed loop on {labels}", figure)
+
+
+def _scatter(
+    axes: Any,
+    points: Sequence[tuple[Group, FloatArray, FloatArray]],
+    styles: Mapping[str, Style],
+) -> None:
+    """(N,) values of scenarios by group, and the means of the groups where there are several."""
+    means = []
+    for group, x, y in points:
+        known = np.isfinite(x) & np.isfinite(y)
+        label = f"{group.planner}: {_correlation(x[known], y[known])}"
+        marks = styles[group.planner].marks(group.noise, 4.0)
+        axes.plot(x[known], y[known], linestyle="none", alpha=0.55, label=label, **marks)
+        means += [(group, x[known].mean(), y[known].mean())] if known.any() else []
+    if len(means) < 2:
+        return
+    for group, x, y in means:
+        look = styles[group.planner].marks(group.noise, 9.0) | _MEAN
+        axes.plot([x], [y], linestyle="none", zorder=5, **look)
+    correlation = _correlation(*np.array([(x, y) for _, x, y in means]).T)
+    look = Style(_GREY, "o").marks("none") | _MEAN
+    axes.plot([], [], linestyle="none", label=f"means of planners: {correlation}", **look)
+
+
+def _correlation(first: FloatArray, second: FloatArray) -> str:
+    found = rank_correlation(first, second)
+    words = "undefined" if found is None else f"= {found:.2f}".replace("-", "−")
+    return f"ρ {words}, n = {len(first)}"
 
 
 def _place(heading: str, where: BoolArray, column: str = "cls") -> _Place:

@@ -113,6 +113,15 @@ def sign_flip_test(
     return (count + 1.0) / (draws + 1.0), 1.0 / (draws + 1.0)
 
 
+def rank_correlation(first: FloatArray, second: FloatArray) -> float | None:
+    """Spearman's correlation of (S,) values; None for fewer than three, or constant ones."""
+    if len(first) < 3 or np.ptp(first) == 0.0 or np.ptp(second) == 0.0:
+        return None
+    from scipy.stats import rankdata
+
+    return float(np.corrcoef(rankdata(first), rankdata(second))[0, 1])
+
+
 def holm(p_values: Sequence[float]) -> list[float]:
     """Holm's step-down correction: p-values that may all be compared with one level."""
     values = np.asarray(p_values, np.float64)

@@ -6,11 +6,12 @@ import io
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from itertools import chain
 from textwrap import wrap
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
-from shiftsim.errors import one_of
+from shiftsim.errors import MissingExtraError, one_of
 from shiftsim.report.words import LONG, legend
 
 ENDINGS = {"text": "txt", "md": "md", "csv": "csv", "latex": "tex", "html": "html"}
@@ -184,6 +185,33 @@ def csv_text(rows: Iterable[Sequence[str]]) -> str:
     return out.getvalue().rstrip("\n")
 
 
+def to_pandas(tables: Sequence[Table]) -> Any:
+    """Tables as one DataFrame of pandas, with numbers in full; `attrs["notes"]` are the notes.
+
+    A column `table` tells several apart.
+
+    Raises:
+        MissingExtraError: pandas is not installed.
+    """
+    try:
+        pandas = import_module("pandas")
+    except ImportError as error:
+        raise MissingExtraError(
+            "data frames need pandas", hint="pip install 'shiftsim[plots]'"
+        ) from error
+    frames = {}
+    for table in tables:
+        whole = replace(table.full or table, notes=())
+        texts = dict.fromkeys(whole.header[: whole.num_labels], str)
+        rules = {"dtype": texts, "keep_default_na": False, "na_values": [""]}
+        frames[table.name] = pandas.read_csv(io.StringIO(_csv(whole)), **rules)
+    out = next(iter(frames.values()))
+    if len(frames) > 1:
+        out = pandas.concat(frames, names=["table"]).reset_index("table").reset_index(drop=True)
+    out.attrs["notes"] = list(dict.fromkeys(note for table in tables for note in table.notes))
+    return out
+
+
 def _parts(cell: Cell) -> dict[str, str]:
     """What CSV holds of a cell, by the ending of the column's name."""
     return {"": cell} if isinstance(cell, str) else {} if cell is None else cell.parts
@@ -247,12 +275,11 @@ def _latex(table: Table) -> str:
     sides = "".join("l" if i < table.num_labels else "r" for i in range(len(columns)))
     heads = [_stacked(name, cells) for name, *cells in columns]
     names = [_latex_heading(head, side) for head, side in zip(heads, sides, strict=True)]
-    # a subscript is about as wide as its digits would be
-    texts = (
-        [*h, *(c.replace(" ± ", "") for c in cells)]
-        for h, (_, *cells) in zip(heads, columns, strict=True)
-    )
-    sizes = [max(map(len, each)) for each in texts]
+    # a subscript is about as wide as its text would be without blanks
+    sizes = [
+        max(map(len, (*head, *(cell.replace(" ± ", "±") for cell in cells))))
+        for head, (_, *cells) in zip(heads, columns, strict=True)
+    ]
     top = [f"\\begin{{tabular}}{{{sides}}}", r"\toprule", _latex_row(names), r"\midrule"]
     return _float(table, [*top, *body, r"\bottomrule", r"\end{tabular}"], sizes)
 
@@ -279,6 +306,7 @@ def _for_paper(table: Table) -> Table:
     if table.best:
         places = list(dict.fromkeys(row[: len(kept) - 1] for row in rows))
         rows.sort(key=lambda row: places.index(row[: len(kept) - 1]))
+    left_out = {name for i, name in names if i not in (*kept, *measured)}
     said = ", ".join(f"{name} {value}" for name, value in shared if value not in table.title)
     return replace(
         table,
@@ -286,6 +314,7 @@ def _for_paper(table: Table) -> Table:
         header=[table.header[i] for i in (*kept, *measured)],
         rows=rows,
         num_labels=len(kept),
+        notes=[note for note in table.notes if note.partition(":")[0] not in left_out],
         paper=None,
     )
 
