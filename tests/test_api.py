@@ -4,11 +4,14 @@ import re
 import shutil
 import sys
 
+import numpy as np
 import pytest
 from stores import write_toy_store
 
 import shiftsim
 from shiftsim.files import PACKAGE
+from shiftsim.report.build import TABLES
+from shiftsim.report.tables import FORMATS
 from shiftsim.sim.planner import scene_info
 
 
@@ -125,6 +128,110 @@ def test_a_run_explains_and_plots_a_scenario(run, scenario, tmp_path):
     assert (tmp_path / "scene.png").stat().st_size > 5000
     with pytest.raises(shiftsim.ShiftsimError, match="time 99"):
         run.plot(scenario.token, at=99.0)
+
+
+class Straight:
+    """Keeps heading and speed."""
+
+    name = "straight"
+
+    def __init__(self, share: float = 1.0):
+        self.share = share
+
+    def reset(self, scene): ...
+    def plan(self, observation):
+        times = [0.0, 4.0, 8.0]
+        x, y, heading = observation.ego.pose
+        ways = [self.share * observation.ego.speed * time for time in times]
+        poses = [(x + w * np.cos(heading), y + w * np.sin(heading), heading) for w in ways]
+        return shiftsim.Trajectory.from_poses(times, poses)
+
+
+@pytest.fixture(scope="module")
+def pair(store, tmp_path_factory):
+    """A run of two labelled planners, with open-loop scores."""
+    settings = {"store": str(store.path), "workers": 1, "open_loop": True}
+    out = str(tmp_path_factory.mktemp("pair") / "out")
+    return shiftsim.run({"fast": Straight(), "slow": Straight(0.9)}, out=out, **settings)
+
+
+def test_a_dict_of_planners_gives_them_their_names(pair, store):
+    assert pair.scores["planner"].unique().to_pylist() == ["fast", "slow"]
+    assert list(pair.manifest["determining"]["planners"]) == ["fast", "slow"]
+    with pytest.raises(shiftsim.ShiftsimError, match="holds '='"):
+        shiftsim.run({"lr=1": Straight()}, store=str(store.path))
+    with pytest.raises(shiftsim.ShiftsimError, match=r"shiftsim\.run\(\{label: planner\}\)"):
+        shiftsim.run([Straight(), Straight(0.9)], store=str(store.path))
+
+
+@pytest.mark.parametrize("name", [*TABLES])
+def test_every_table_comes_in_every_format(pair, name):
+    pandas = pytest.importorskip("pandas")
+    if name in ("noise-robustness", "edits", "planner-comparison-noise", "scenario-types"):
+        with pytest.raises(shiftsim.ShiftsimError, match="holds nothing of the table"):
+            pair.table(name)
+        return
+    for style in FORMATS:
+        text = pair.table(name, style)
+        assert repr(text) == str(text)
+    frame = pair.table(name, "pandas")
+    assert isinstance(frame, pandas.DataFrame)
+    assert len(frame) == len(pair.table(name, "csv").splitlines()) - 1
+    assert isinstance(frame.attrs["notes"], list)
+
+
+def test_a_data_frame_has_numbers_in_full(pair):
+    pytest.importorskip("pandas")
+    frame = pair.table("scores", "pandas").set_index("planner")
+    rows = pair.scores.to_pandas().groupby("planner").cls.mean()
+    assert frame.CLS["fast"] == pytest.approx(100.0 * rows["fast"], abs=1e-12)
+    with pytest.raises(shiftsim.ShiftsimError, match="did you mean 'scores'"):
+        pair.table("score")
+    with pytest.raises(shiftsim.ShiftsimError, match="format 'excel' unknown"):
+        pair.table(format="excel")
+
+
+def test_runs_are_compared_in_pairs(pair, run):
+    found = pair.compare(run)
+    assert repr(found) == "<Comparison of 3 pairs of planners>"
+    assert "fast" in str(found)
+    assert "constant-velocity" in found.table("latex")
+    assert "<table>" in found._repr_html_()
+    with pytest.raises(shiftsim.ShiftsimError, match="nothing to compare"):
+        run.compare(run)
+
+
+def test_a_run_writes_its_report(pair, run, tmp_path):
+    files = pair.report(tmp_path / "a", formats=["latex", "csv"], tables=["scores"])
+    assert {"report.tex", "scores.csv", "open-against-closed.pdf"} <= {path.name for path in files}
+    (page,) = pair.report(tmp_path / "b", run, pages=True, tables=["scores"])
+    assert "constant-velocity" in page.read_text("utf-8")
+    assert list((tmp_path / "b/replay").glob("*.html"))
+    with pytest.raises(shiftsim.ShiftsimError, match="format 'word' unknown"):
+        pair.report(tmp_path / "c", formats=["word"])
+
+
+def test_a_grid_has_a_row_per_rollout_and_a_column_per_time(pair, scenario):
+    assert len(pair.plot(scenario.token, at=(0.0, 1.0)).axes) == 4
+    assert len(pair.plot(scenario.token, at=1.0, grid=True, planner="slow").axes) == 1
+    with pytest.raises(shiftsim.ShiftsimError, match="planner nobody"):
+        pair.plot(scenario.token, planner=["nobody"])
+
+
+def test_open_loop_is_drawn_against_closed_loop(pair, run):
+    figure = pair.plot_open_against_closed()
+    assert [axes.get_xlabel()[:9] for axes in figure.axes] == ["open-loop", "average d"]
+    for axes in figure.axes:
+        labels = [text.get_text() for text in axes.get_legend().get_texts()]
+        assert [label.partition(":")[0] for label in labels] == [
+            "fast",
+            "slow",
+            "means of planners",
+        ]
+        assert labels[0].endswith("n = 4")
+        assert labels[2].endswith("ρ undefined, n = 2")
+    with pytest.raises(shiftsim.ShiftsimError, match="no open-loop scores"):
+        run.plot_open_against_closed()
 
 
 def test_a_run_is_scored_again_compared_and_made_self_contained(run, tmp_path):

@@ -42,7 +42,7 @@ def test_the_report_page_holds_tables_pictures_and_replays(call, clean_run, tmp_
     page = (tmp_path / "index.html").read_text("utf-8")
     rows = json.loads(sections(page)["rows"])
     assert done.exit_code == 0, done.output
-    assert "All planners and noises" in page
+    assert "of all planners and noises" in page
     assert list(tmp_path.glob("*.png"))
     assert all((tmp_path / row["page"]).is_file() for row in rows)
     assert len(rows) == 24  # all seeds
@@ -50,7 +50,7 @@ def test_the_report_page_holds_tables_pictures_and_replays(call, clean_run, tmp_
 
 def test_a_report_compares_under_noise_too_and_names_its_tables(call, clean_run):
     printed = call("report", clean_run.path)
-    assert "difference of closed-loop scores x 100, first minus second" in printed.output
+    assert "difference of closed-loop scores × 100, first minus second" in printed.output
     assert "scenario by scenario, clean" in printed.output
     assert "scenario by scenario, under noise" in printed.output
 

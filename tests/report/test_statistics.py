@@ -13,6 +13,7 @@ from shiftsim.report.statistics import (
     cluster_codes,
     compare,
     holm,
+    rank_correlation,
     sign_flip_test,
 )
 
@@ -137,3 +138,13 @@ def test_holm_lies_between_no_correction_and_bonferronis(p_values):
 def test_the_deviation_over_seeds_is_the_sample_deviation():
     assert seed_deviation(np.array([1.0, 2.0, 4.0])) == pytest.approx(np.sqrt(7.0 / 3.0))
     assert seed_deviation(np.array([1.0])) is None
+
+
+def test_rank_correlation_is_that_of_the_ranks():
+    first = np.array([1.0, 2.0, 3.0, 4.0])
+    assert rank_correlation(first, np.exp(first)) == pytest.approx(1.0)
+    assert rank_correlation(first, -(first**3)) == pytest.approx(-1.0)
+    # of ties the mean rank: ranks 1, 2.5, 2.5, 4 of the second
+    assert rank_correlation(first, np.array([0.0, 5.0, 5.0, 6.0])) == pytest.approx(0.9486833)
+    assert rank_correlation(first, np.zeros(4)) is None
+    assert rank_correlation(first[:2], first[:2]) is None

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import re
 
 import numpy as np
 import pytest
@@ -31,6 +32,7 @@ from shiftsim.report.tables import (
 )
 from shiftsim.report.words import LONG
 from shiftsim.runs.diff import diff_lines, diff_runs
+from shiftsim.runs.results import label_runs
 
 TOKENS = ("t0", "t1", "t2", "t3")
 
@@ -196,12 +198,82 @@ def test_a_name_that_means_two_planners_is_told_apart(tmp_path):
     assert [row[1] for row in table.rows] == ["alpha @a", "alpha @b"]
 
 
+def fingerprint(**arguments):
+    return {"planner": "m:P", "arguments": arguments, "source": "5a"}
+
+
+def test_two_planners_of_one_name_say_what_differs(tmp_path):
+    runs = [
+        write_run(tmp_path / "a", fingerprint=fingerprint(headway=2.0, file="x/one.npy")),
+        write_run(tmp_path / "b", fingerprint=fingerprint(headway=2.0, file="y/two.npy")),
+        write_run(tmp_path / "c", fingerprint=fingerprint(headway=2.0, file="y/two.npy")),
+        write_run(tmp_path / "d", fingerprint=fingerprint(headway=2.0)),
+    ]
+    names = [group.planner for group in read_groups(runs)]
+    assert names == ["alpha (file one.npy)", "alpha (file two.npy)", "alpha"]
+
+
+def test_the_checkpoint_of_a_learned_planner_is_named(tmp_path):
+    runs = []
+    for name, given in (("a", "w/one.ckpt"), ("b", "alpha=two.ckpt")):
+        run = write_run(tmp_path / name, fingerprint=fingerprint() | {"checkpoint": name})
+        run.manifest["config"]["checkpoints"] = [given]
+        runs.append(run)
+    names = [group.planner for group in read_groups(runs)]
+    assert names == ["alpha (checkpoint one.ckpt)", "alpha (checkpoint two.ckpt)"]
+
+
+def test_the_same_planner_run_otherwise_says_so_where_it_did_otherwise(tmp_path):
+    runs = [write_run(tmp_path / "a"), write_run(tmp_path / "b", score=random_scores(1))]
+    for run, size in zip(runs, (1, 16), strict=True):
+        run.manifest["determining"]["batch_size"] = size
+    names = [group.planner for group in read_groups(runs)]
+    assert names == ["alpha (batch size 1)", "alpha (batch size 16)"]
+    runs[1] = write_run(tmp_path / "c")
+    runs[1].manifest["determining"]["batch_size"] = 16
+    assert [group.planner for group in read_groups(runs)] == ["alpha"]
+
+
+def test_other_seeds_are_rows_of_their_own(tmp_path):
+    runs = [write_run(tmp_path / str(s), noise=("ou-low",), seeds=s) for s in ((0, 1), (2, 3))]
+    names = [group.planner for group in read_groups(runs)]
+    assert names == ["alpha (seeds 0 1)", "alpha (seeds 2 3)"]
+
+
+def test_a_run_is_labelled_in_all_its_tables(tmp_path):
+    run = write_run(tmp_path / "a", planners=("alpha", "beta"), fingerprint=fingerprint())
+    run.manifest["config"] |= {"planner_args": {"beta": {"x": 1}}, "checkpoints": ["beta=f"]}
+    named = run.labelled({"alpha": "ours"}).labelled({"beta": "theirs", "ours": "mine"})
+    for table in (named.scores, named.tasks):
+        assert set(table["planner"].to_pylist()) == {"mine", "theirs"}
+    assert named.manifest["config"]["planner_args"] == {"theirs": {"x": 1}}
+    assert named.manifest["config"]["checkpoints"] == ["theirs=f"]
+    assert list(named.manifest["determining"]["planners"]) == ["mine", "theirs"]
+    assert {task.planner for task in named.rollout_places} == {"mine", "theirs"}
+    assert [group.planner for group in read_groups([named])] == ["mine", "theirs"]
+    assert set(run.scores["planner"].to_pylist()) == {"alpha", "beta"}
+    with pytest.raises(ConfigError, match="called the same"):
+        run.labelled({"alpha": "beta"})
+
+
+def test_labels_are_of_all_runs_or_of_one(tmp_path):
+    runs = [write_run(tmp_path / name) for name in "ab"]
+    both = label_runs(runs, ["alpha=lr=1e-4", "b/alpha=new"])
+    assert [run.manifest["config"]["planners"] for run in both] == [["lr=1e-4"], ["new"]]
+    with pytest.raises(ConfigError, match=r"planner 'alhpa' unknown\nhint: did you mean 'alpha'"):
+        label_runs(runs, ["alhpa=ours"])
+    with pytest.raises(ConfigError, match="is empty"):
+        label_runs(runs, ["alpha="])
+
+
 def test_the_same_result_twice_is_shown_once_and_a_contradiction_is_refused(tmp_path):
     runs = [write_run(tmp_path / name) for name in "ab"]
     assert len(read_groups(runs)) == 1
     other = write_run(tmp_path / "c", score=lambda *key: 0.1)
-    with pytest.raises(DataError, match="both hold alpha none NR"):
+    with pytest.raises(DataError, match=r"both hold alpha none NR[^\0]*--label c/alpha=other"):
         read_groups([*runs, other])
+    labelled = label_runs([*runs, other], ["c/alpha=other"])
+    assert [group.planner for group in read_groups(labelled)] == ["alpha", "other"]
 
 
 def test_planners_are_compared_on_complete_scores_only(tmp_path):
@@ -283,6 +355,78 @@ def test_a_latex_cell_is_not_taken_for_an_option():
     assert "{[1]} & 2.00" in render(table, "latex")
 
 
+def paper_tables(tmp_path, **settings):
+    """Every kind of table of a run, in LaTeX, by name."""
+    values = {"planners": ("alpha", "beta_2"), "noise": ("none", "ou-low"), "seeds": (0, 1)}
+    run = write_run(tmp_path / "a", **{**values, "score": random_scores(6), **settings})
+    kinds = tuple(name for name in TABLES if "data" not in name and "benchmark" not in name)
+    tables = make_tables(read_groups([run]), published(), Options(tables=kinds))
+    return {table.name: render(table, "latex") for table in tables}
+
+
+def test_latex_is_sound(tmp_path):
+    types = ["left", "left", "right", "right"]
+    for name, text in paper_tables(tmp_path, types=types).items():
+        begun = re.findall(r"\\(begin|end)\{(\S+?)\}", text)
+        opened = []
+        for verb, kind in begun:
+            opened += [kind] if verb == "begin" else []
+            assert verb == "begin" or opened.pop() == kind
+        assert not opened, name
+        assert text.isascii(), name
+        assert text.count("{") - text.count(r"\{") == text.count("}") - text.count(r"\}")
+        body = text.partition(r"\toprule")[2].partition(r"\bottomrule")[0]
+        rows = [line for line in body.splitlines() if "&" in line or line.endswith(r"\\")]
+        columns = len(re.search(r"tabular\}\{([lr]+)\}", text)[1])
+        assert {row.replace(r"\&", "").count("&") + 1 for row in rows} == {columns}, name
+        assert text.index(r"\caption") < text.index(r"\begin{tabular}")
+        assert name == "runs" or text.index(r"\end{tabular}") < text.index(r"\begin{minipage}")
+
+
+def test_latex_has_measured_columns_the_best_in_bold_and_seeds_as_subscripts(tmp_path):
+    score = {"alpha": 0.5, "beta_2": 0.75}
+    noisy = lambda planner, noise, seed, number: score[planner] - 0.1 * seed  # noqa: E731
+    found = paper_tables(tmp_path, score=noisy)
+    lines = found["noise-robustness"].splitlines()
+    assert (
+        r"\caption{Noise robustness: closed-loop score $\times$ 100; set made-up, traffic NR.}"
+        in lines
+    )
+    assert r"  planner & none & ou-low \\" in lines
+    assert r"  alpha & 50.00 & 45.00$_{\pm 7.07}$ \\" in lines
+    assert r"  beta\_2 & \textbf{75.00} & \textbf{70.00}$_{\pm 7.07}$ \\" in lines
+    rows = found["scores"].splitlines()
+    assert rows[7].startswith("  none & alpha & 50.00 & ")
+    assert rows[8].startswith(r"   & beta\_2 & \textbf{75.00} & ")
+    assert rows[9] == r"\midrule"
+    assert "seeds" not in found["scores"]
+    assert "95" not in found["semantic-shift_made-up"]
+    assert "95" in found["planner-comparison"]
+
+
+def test_the_best_is_the_smallest_error_and_nothing_where_all_are_alike():
+    rows = [("a", Number(1.0), Number(2.0)), ("b", Number(3.0), Number(2.0))]
+    rows.append(("c", Number(0.5, done=1, expected=2), Number(2.0)))
+    text = render(
+        Table("t", "", ("planner", "e", "s"), rows, 1, best={"e": min, "s": max}), "latex"
+    )
+    assert re.findall(r"textbf\{(.*?)\}", text) == ["1.00"]
+    assert r"0.50 partial (1/2)" in text
+
+
+def test_a_wide_table_goes_over_both_columns_and_a_wider_one_is_made_smaller():
+    def float_of(count):
+        header = ("planner", *(f"c{i}" for i in range(count)))
+        rows = [("a", *[Number(100.0)] * count)]
+        return render(Table("t", "", header, rows, 1), "latex")
+
+    assert r"\begin{table} " in float_of(3)
+    assert r"\begin{table*} " in float_of(10)
+    assert r"\scriptsize\setlength" in float_of(18)
+    assert r"\resizebox{\textwidth}" in float_of(30)
+    assert "booktabs,graphicx" in float_of(30)
+
+
 def test_html_prints_names_as_they_are():
     import html.parser
 
@@ -356,6 +500,7 @@ def test_a_report_is_a_folder_with_a_file_per_format(tmp_path):
         text = (tmp_path / "out" / f"report.{ending}").read_text("utf-8")
         assert "thresholds nuplan" in text
         assert "Noise robustness" in text
+        assert "Zero-shot" not in text
         escaped = {"html": "On &lt;a&gt;", "md": r"# On \<a\>"}
         assert escaped.get(ending, "On <a>") in text
         assert "2026-01-02 03:04 UTC" in text

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from shiftsim.errors import ConfigError
 from shiftsim.runs.config import make_config
 from shiftsim.runs.execute import execute
 from shiftsim.runs.prepare import prepare
@@ -102,3 +103,31 @@ def test_a_traffic_network_moves_the_scenarios_of_a_batch_together(toy, tmp_path
     assert content(one) == content(two)
     alone = run(toy, tmp_path / "alone", **values | {"batch_size": 1})
     assert one.scores["cls"].to_pylist() == pytest.approx(alone.scores["cls"].to_pylist())
+
+
+def test_one_planner_may_have_a_batch_size_of_its_own(toy, tmp_path, one_by_one):
+    name, both = "drivers:Together", ["one=drivers:Together", "two=drivers:Together"]
+    arguments = {"one": {"trouble": ""}, "two": {"trouble": "", "batch_size": 2}}
+    plan = prepare(
+        make_config(
+            {"planners": both, "planner_args": arguments, "store": str(toy), "workers": 1}
+            | NOISY
+            | {"out": str(tmp_path / "run")}
+        )
+    )
+    sizes = {batch[0].planner: len(batch) for batch in plan.batches}
+    assert plan.fingerprint["planners"]["two"]["batch_size"] == 2
+    assert sizes == {"one": 1, "two": 2}
+    run = execute(plan)
+    scores = run.scores.drop_columns(["planner"])
+    assert scores.slice(0, len(scores) // 2) == scores.slice(len(scores) // 2)
+    assert run.manifest["config"]["planners"] == ["one", "two"]
+    assert name == run.manifest["determining"]["planners"]["two"]["planner"]
+
+
+def test_a_batch_size_is_refused_where_there_are_no_batches(toy):
+    values = {"planners": ["a=idm"], "store": str(toy), "workers": 1}
+    with pytest.raises(ConfigError, match="answers for one scenario at a time"):
+        prepare(make_config({**values, "planner_args": {"a": {"batch_size": 2}}}))
+    with pytest.raises(ConfigError, match="batch_size 'many'"):
+        prepare(make_config({**values, "planner_args": {"a": {"batch_size": "many"}}}))

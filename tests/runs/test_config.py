@@ -7,7 +7,7 @@ import pytest
 
 from shiftsim.errors import ConfigError
 from shiftsim.files import read_toml, store_path
-from shiftsim.runs.config import make_config, parse_argument, parse_seeds
+from shiftsim.runs.config import make_config, parse_argument, parse_seeds, split_label
 
 GOOD = {"planners": ["idm", "my.module:Mine"], "noise": ["ou-high"], "seeds": [0, 2]}
 
@@ -26,7 +26,11 @@ def test_settings_survive_as_plain_values():
         ({**GOOD, "noize": ["none"]}, "key 'noize' unknown", "did you mean 'noise'?"),
         ({"planners": "idm"}, "must be a list", ""),
         ({"planners": []}, "no planner", "--planner"),
-        ({"planners": ["idm", "idm"]}, "listed twice", ""),
+        ({"planners": ["idm", "idm"]}, "listed twice", "--planner LABEL=PLANNER"),
+        ({"planners": ["a=idm", "a=simple"]}, "listed twice", "--planner LABEL=PLANNER"),
+        ({"planners": ["=idm"]}, "'=idm' is not LABEL=PLANNER", "--planner ours=idm"),
+        ({"planners": ["ours="]}, "'ours=' is not LABEL=PLANNER", "--planner ours=idm"),
+        ({"planners": ["a=idm"], "planner_args": {"idm": {}}}, "'idm' unknown", "available: a"),
         ({**GOOD, "seeds": [1.5]}, "seeds is 1.5; it must be an integer", ""),
         ({**GOOD, "seeds": [True]}, "seeds is True; it must be an integer", ""),
         ({**GOOD, "seeds": [-1]}, "from 0 on", ""),
@@ -63,6 +67,7 @@ def test_a_file_that_is_missing_or_no_toml_is_named(tmp_path):
         ("file=a/b.csv", ("scripted",), ("scripted", "file", "a/b.csv")),
         ("on=true", ("idm",), ("idm", "on", True)),
         ("m:P.k=v=w", ("m:P", "idm"), ("m:P", "k", "v=w")),
+        ("b.gap=2", ("a=idm", "b=m:P"), ("b", "gap", 2)),
     ],
 )
 def test_planner_arguments_are_read_as_toml_values(text, planners, expected):
@@ -99,3 +104,9 @@ def test_seeds_are_numbers_or_ranges():
     for text in ("a", "1-", "1-b", "", "1,,2", "0-99999999", "3-1"):
         with pytest.raises(ConfigError, match="seeds"):
             parse_seeds(text)
+
+
+def test_a_label_stands_before_the_planner_and_holds_no_path():
+    assert split_label("ours=m:P") == ("ours", "m:P")
+    assert split_label("idm") == ("idm", "idm")
+    assert split_label("policy:a=b.zip") == ("policy:a=b.zip", "policy:a=b.zip")

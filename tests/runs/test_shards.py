@@ -99,3 +99,23 @@ def test_shards_have_folders_of_their_own(toy, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = [prepare(settings(toy, "", shard=f"{i}/2")).folder.name for i in (1, 2)]
     assert names[0].removesuffix(".1-of-2") == names[1].removesuffix(".2-of-2")
+
+
+def test_shards_of_labelled_planners_join_to_the_run_itself(toy, tmp_path):
+    planners = ["near=idm", "far=idm", "drivers:Together"]
+    more = {"planners": planners, "planner_args": {"far": {"headway": 4.0}}, "noise": ["none"]}
+    runs = [execute(prepare(settings(toy, tmp_path / "whole", **more)))]
+    runs += [
+        execute(prepare(settings(toy, tmp_path / n, shard=f"{n}/2", **more))) for n in ("1", "2")
+    ]
+    merged = merge_runs(runs[1:], out=str(tmp_path / "merged"))
+    for name in RESULTS:
+        assert (merged.path / name).read_bytes() == (runs[0].path / name).read_bytes()
+    assert set(merged.scores["planner"].to_pylist()) == {"near", "far", "drivers:Together"}
+    assert prepare(settings(toy, tmp_path / "whole", resume=True, **more)).before == "complete"
+    swapped = more | {
+        "planners": ["near=idm", "distant=idm", "drivers:Together"],
+        "planner_args": {},
+    }
+    with pytest.raises(ConfigError, match="planners differ"):
+        prepare(settings(toy, tmp_path / "whole", resume=True, **swapped))
