@@ -13,7 +13,7 @@ import shiftsim.edits  # noqa: F401  # attaches Scenario.edited
 from shiftsim.data import open_store as open_store
 from shiftsim.errors import ConfigError, one_of
 from shiftsim.planners import registry
-from shiftsim.report.tables import FORMATS, Table, render, to_pandas
+from shiftsim.report.tables import FORMATS
 from shiftsim.runs import results
 from shiftsim.sim import loop
 from shiftsim.sim.log import SimulationLog
@@ -31,31 +31,6 @@ class Explanation(str):
 
     def __repr__(self) -> str:
         return str(self)
-
-
-class Comparison:
-    """Planners compared scenario by scenario, in pairs; printed as text.
-
-    Attributes:
-        tables: The tables, of clean rollouts and of those under noise.
-    """
-
-    def __init__(self, tables: Sequence[Table]) -> None:
-        self.tables = tuple(tables)
-
-    def table(self, format: str = "text") -> Any:
-        """The tables as `text`, `md`, `latex`, `csv` or `html`, or a DataFrame of `pandas`."""
-        return _in_format(self.tables, format)
-
-    def __str__(self) -> str:
-        return str(self.table())
-
-    def __repr__(self) -> str:
-        count = sum(len(table.rows) for table in self.tables)
-        return f"<Comparison of {count} pair{'' if count == 1 else 's'} of planners>"
-
-    def _repr_html_(self) -> str:
-        return str(self.table("html"))
 
 
 class Run(results.Run):
@@ -79,33 +54,31 @@ class Run(results.Run):
         by: str | None = None,
         allow_partial: bool = False,
     ) -> Any:
-        """A table of `shiftsim report --list`.
+        """A table of `shiftsim report --list`, `by` `scenario_type`, `city` or `seed` if asked.
 
-        Args:
-            name: Name of the table.
-            format: `text`, `md`, `latex`, `csv` or `html`, or `pandas` for a DataFrame.
-            by: Splits the scores by `scenario_type`, `city` or `seed`.
-            allow_partial: Whether means over what finished are shown, labelled so.
+        Formats are `text`, `md`, `latex`, `csv`, `html`, and `pandas` for a DataFrame;
+        `allow_partial` shows means over what finished, labelled so.
 
         Raises:
             ConfigError: There is no such table or format, or the run holds nothing of it.
             MissingExtraError: pandas is asked for and missing.
         """
-        from shiftsim.report.build import Options
+        from shiftsim.report.build import Options, in_format
 
         options = Options((name,), by)
         tables = self._opened().tables(options, allow_partial=allow_partial)
         if not tables:
             raise ConfigError(f"run {str(self.path)!r} holds nothing of the table {name!r}")
-        return _in_format(tables, format)
+        found = in_format(tables, format)
+        return Explanation(found) if isinstance(found, str) else found
 
-    def compare(self, *others: results.Run) -> Comparison:
+    def compare(self, *others: results.Run) -> Any:
         """Every pair of planners of this and other runs on the same scenarios, with intervals.
 
         Raises:
             ConfigError: No two planners drove the same scenarios in the same traffic and noise.
         """
-        from shiftsim.report.build import Options
+        from shiftsim.report.build import Comparison, Options
 
         options = Options(("planner-comparison", "planner-comparison-noise"))
         if tables := self._opened(*others).tables(options):
@@ -125,16 +98,10 @@ class Run(results.Run):
         by: str | None = None,
         **settings: Any,
     ) -> list[Path]:
-        """Write tables and pictures to a folder, of other runs as well, and return the files.
+        """Write tables (all of them by default) and pictures of runs to a folder; the files.
 
-        Args:
-            folder: Where to; made if needed.
-            others: Other runs.
-            formats: Formats of tables, each a file, of `csv` a file per table.
-            tables: Names of tables, as `shiftsim report --list` has them; all of them by default.
-            by: Splits the scores by `scenario_type`, `city` or `seed`.
-            settings: `pictures=False` leaves them out; `pages=True` writes HTML pages with a
-                replay of every scenario; `allow_partial=True` labels means over what finished.
+        There is a file per format. `pictures=False` leaves pictures out, `pages=True` writes HTML
+        pages with a replay of every scenario, `allow_partial=True` labels means over what finished.
 
         Raises:
             ConfigError: There is no such table or format.
@@ -145,7 +112,7 @@ class Run(results.Run):
         for name in formats:
             one_of("format", name, FORMATS)
         options = Options(tuple(tables or TABLES), by)
-        return self._opened(*others).report(Path(folder), options, formats=formats, **settings)
+        return list(self._opened(*others).report(Path(folder), options, formats, **settings))
 
     def worst(self, count: int = 10) -> list[dict[str, Any]]:
         """The worst of each recording and cause: key, `cls`, `reason`, how many `others`."""
@@ -395,14 +362,6 @@ def simulate(
     require_scenario("simulate", scenario)
     driver = load_planner(planner) if isinstance(planner, str) else planner
     return loop.simulate(scenario, driver, setting, **changes)
-
-
-def _in_format(tables: Sequence[Table], format: str) -> Any:
-    """Tables as text in a format, or as a DataFrame."""
-    one_of("format", format, (*FORMATS, "pandas"))
-    if format == "pandas":
-        return to_pandas(tables)
-    return Explanation("\n\n".join(render(table, format) for table in tables))
 
 
 def _preformatted(text: str) -> str:

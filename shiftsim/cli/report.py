@@ -1,7 +1,7 @@
 """Commands that read runs: report, explain, diff."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Exit, Option, echo
 
@@ -79,26 +79,13 @@ def report(
         out = safe_join(folders[0], "report")
     title = f"Report on {', '.join(folder.resolve().name for folder in folders)}"
     options = Options(tuple(table or TABLES), by, published)
+    shared: dict[str, Any] = {"allow_partial": allow_partial, "title": title}
     if out is not None:
-        files = opened.report(
-            out,
-            options,
-            formats=style or FORMATS,
-            pictures=figures,
-            allow_partial=allow_partial,
-            title=title,
-        )
+        files = opened.report(out, options, style or FORMATS, pictures=figures, **shared)
         echo(f"{plural(len(files), 'file')} in {out}: {', '.join(path.name for path in files)}")
     if site is not None:
         with progress_bar(quiet=quiet) as advance:
-            (page,) = opened.report(
-                site,
-                options,
-                pages=True,
-                allow_partial=allow_partial,
-                title=title,
-                on_progress=advance,
-            )
+            (page,) = opened.report(site, options, pages=True, on_progress=advance, **shared)
         echo(f"written: {page}")
     if out is not None or site is not None:
         return

@@ -2,25 +2,23 @@
 
 import base64
 import html
+import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from string import Template
+from typing import Any
 
-from shiftsim.errors import ConfigError, one_of
+from shiftsim.errors import ConfigError, MissingExtraError, one_of
 from shiftsim.files import write_text
 from shiftsim.report import dataset, details, paper
 from shiftsim.report.figures import Figure
-from shiftsim.report.groups import (
-    Group,
-    has_default_weights,
-    planner_identities,
-    planner_notes,
-)
+from shiftsim.report.groups import Group, planner_identities
 from shiftsim.report.paper import Published
-from shiftsim.report.scores import scores
-from shiftsim.report.tables import ENDINGS, Table, latex_picture, markdown_escape, render
+from shiftsim.report.scores import planner_notes, scores
+from shiftsim.report.tables import ENDINGS, FORMATS, Table, latex_picture, markdown_escape, render
 from shiftsim.runs.results import Run
 
 _HASH = 12  # characters shown of a hash
@@ -72,7 +70,7 @@ def make_tables(
         ConfigError: Nothing is left beside them.
     """
     chosen = options or Options()
-    left_out = [group for group in groups if chosen.with_published and has_default_weights(group)]
+    left_out = [group for group in groups if chosen.with_published and _has_default_weights(group)]
     weights = {f"{group.name}, {group.weights}" for group in left_out}
     default_weights = "; ".join(sorted(weights))
     groups = [group for group in groups if group not in left_out]
@@ -92,6 +90,15 @@ def make_tables(
             named = _unused(table.name, out)
             out.append(replace(table, name=named, notes=(*table.notes, *more)))
     return out
+
+
+def _has_default_weights(group: Group) -> bool:
+    """Whether a planner drove with weights of our own that nobody asked for by `--checkpoint`."""
+    config = group.run.manifest["config"]
+    given = [text.partition("=") for text in config.get("checkpoints", ())]
+    named = any(not equals or owner == group.name for owner, equals, _ in given)
+    named = named or "checkpoint" in config.get("planner_args", {}).get(group.name, {})
+    return bool(group.weights) and not named
 
 
 def _makers(
@@ -125,6 +132,66 @@ def _unused(name: str, tables: Sequence[Table]) -> str:
     """The name, numbered where tables have it already."""
     numbered = (name, *(f"{name}-{number + 2}" for number in range(len(tables))))
     return next(one for one in numbered if one not in {table.name for table in tables})
+
+
+class Comparison:
+    """Planners compared scenario by scenario, in pairs; printed as text.
+
+    Attributes:
+        tables: The tables, of clean rollouts and of those under noise.
+    """
+
+    def __init__(self, tables: Sequence[Table]) -> None:
+        self.tables = tuple(tables)
+
+    def table(self, format: str = "text") -> Any:
+        """The tables as `text`, `md`, `latex`, `csv` or `html`, or a DataFrame of `pandas`."""
+        return in_format(self.tables, format)
+
+    def __str__(self) -> str:
+        return str(self.table())
+
+    def __repr__(self) -> str:
+        count = sum(len(table.rows) for table in self.tables)
+        return f"<Comparison of {count} pair{'' if count == 1 else 's'} of planners>"
+
+    def _repr_html_(self) -> str:
+        return str(self.table("html"))
+
+
+def in_format(tables: Sequence[Table], format: str) -> Any:
+    """Tables as text in a format, or as a DataFrame."""
+    one_of("format", format, (*FORMATS, "pandas"))
+    if format == "pandas":
+        return to_pandas(tables)
+    return "\n\n".join(render(table, format) for table in tables)
+
+
+def to_pandas(tables: Sequence[Table]) -> Any:
+    """Tables as one DataFrame of pandas, with numbers in full; `attrs["notes"]` are the notes.
+
+    A column `table` tells several apart.
+
+    Raises:
+        MissingExtraError: pandas is not installed.
+    """
+    try:
+        pandas = import_module("pandas")
+    except ImportError as error:
+        raise MissingExtraError(
+            "data frames need pandas", hint="pip install 'shiftsim[plots]'"
+        ) from error
+    frames = {}
+    for table in tables:
+        whole = replace(table.full or table, notes=())
+        texts = dict.fromkeys(whole.header[: whole.num_labels], str)
+        rules = {"dtype": texts, "keep_default_na": False, "na_values": [""]}
+        frames[table.name] = pandas.read_csv(io.StringIO(render(whole, "csv")), **rules)
+    out = next(iter(frames.values()))
+    if len(frames) > 1:
+        out = pandas.concat(frames, names=["table"]).reset_index("table").reset_index(drop=True)
+    out.attrs["notes"] = list(dict.fromkeys(note for table in tables for note in table.notes))
+    return out
 
 
 def write_report(

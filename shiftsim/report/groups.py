@@ -186,33 +186,6 @@ def planner_identities(run: Run) -> dict[str, dict[str, Any]]:
     return {name: identity for name, identity in planners if isinstance(identity, dict)}
 
 
-def planner_notes(runs: Iterable[Run]) -> list[str]:
-    """What a reader must know of planners: whose weights they had, and who saw the recording."""
-    made_up, own, informed = set[str](), set[str](), set[str]()
-    for name, identity in (pair for run in runs for pair in planner_identities(run).items()):
-        if str(identity.get("checkpoint", "")).startswith("deterministic:"):
-            made_up.add(name)
-        if identity.get("weights"):
-            own.add(f"{name}, {identity['weights']}")
-        if identity.get("sees_recording"):
-            informed.add(name)
-    notes = {
-        f"MEANINGLESS: made-up weights of {', '.join(sorted(made_up))}": made_up,
-        "; ".join(sorted(own)): own,
-        f"given the recorded future: {', '.join(sorted(informed))}": informed,
-    }
-    return [note for note, names in notes.items() if names]
-
-
-def has_default_weights(group: Group) -> bool:
-    """Whether a planner drove with weights of our own that nobody asked for by `--checkpoint`."""
-    config = group.run.manifest["config"]
-    given = [text.partition("=") for text in config.get("checkpoints", ())]
-    named = any(not equals or owner == group.name for owner, equals, _ in given)
-    named = named or "checkpoint" in config.get("planner_args", {}).get(group.name, {})
-    return bool(group.weights) and not named
-
-
 def token_digest(tokens: Iterable[str]) -> str:
     """SHA-256 of a set of tokens, as lists of nuPlan scenarios are identified."""
     return hashlib.sha256("\n".join(sorted(tokens)).encode()).hexdigest()

@@ -5,14 +5,20 @@ metric without a score counts as 0. With several seeds it is the mean of the see
 are printed times 100. Where tasks failed or are missing no score is printed, or one that says so.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pyarrow.compute as pc
 
-from shiftsim.report.groups import COLUMNS, Group, planner_notes, read_groups, seed_deviation
+from shiftsim.report.groups import (
+    COLUMNS,
+    Group,
+    planner_identities,
+    read_groups,
+    seed_deviation,
+)
 from shiftsim.report.tables import Number, Row, Table, text
 from shiftsim.report.words import (
     Violation,
@@ -62,6 +68,24 @@ def scores(groups: Sequence[Group], *, by: str | None = None) -> Table:
     best = dict.fromkeys(COLUMNS.values(), max)
     in_paper = Table("scores", title, header, paper, len(heading), notes, best=best)
     return Table("scores", title, header, rows, len(heading), notes, machine, paper=in_paper)
+
+
+def planner_notes(runs: Iterable[Run]) -> list[str]:
+    """What a reader must know of planners: whose weights they had, and who saw the recording."""
+    made_up, own, informed = set[str](), set[str](), set[str]()
+    for name, identity in (pair for run in runs for pair in planner_identities(run).items()):
+        if str(identity.get("checkpoint", "")).startswith("deterministic:"):
+            made_up.add(name)
+        if identity.get("weights"):
+            own.add(f"{name}, {identity['weights']}")
+        if identity.get("sees_recording"):
+            informed.add(name)
+    notes = {
+        f"MEANINGLESS: made-up weights of {', '.join(sorted(made_up))}": made_up,
+        "; ".join(sorted(own)): own,
+        f"given the recorded future: {', '.join(sorted(informed))}": informed,
+    }
+    return [note for note, names in notes.items() if names]
 
 
 def _describe(group: Group) -> str:

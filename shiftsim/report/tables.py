@@ -6,12 +6,11 @@ import io
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from importlib import import_module
 from itertools import chain
 from textwrap import wrap
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
-from shiftsim.errors import MissingExtraError, one_of
+from shiftsim.errors import one_of
 from shiftsim.report.words import LONG, legend
 
 ENDINGS = {"text": "txt", "md": "md", "csv": "csv", "latex": "tex", "html": "html"}
@@ -183,33 +182,6 @@ def csv_text(rows: Iterable[Sequence[str]]) -> str:
     out = io.StringIO()
     csv.writer(out, lineterminator="\n").writerows(rows)
     return out.getvalue().rstrip("\n")
-
-
-def to_pandas(tables: Sequence[Table]) -> Any:
-    """Tables as one DataFrame of pandas, with numbers in full; `attrs["notes"]` are the notes.
-
-    A column `table` tells several apart.
-
-    Raises:
-        MissingExtraError: pandas is not installed.
-    """
-    try:
-        pandas = import_module("pandas")
-    except ImportError as error:
-        raise MissingExtraError(
-            "data frames need pandas", hint="pip install 'shiftsim[plots]'"
-        ) from error
-    frames = {}
-    for table in tables:
-        whole = replace(table.full or table, notes=())
-        texts = dict.fromkeys(whole.header[: whole.num_labels], str)
-        rules = {"dtype": texts, "keep_default_na": False, "na_values": [""]}
-        frames[table.name] = pandas.read_csv(io.StringIO(_csv(whole)), **rules)
-    out = next(iter(frames.values()))
-    if len(frames) > 1:
-        out = pandas.concat(frames, names=["table"]).reset_index("table").reset_index(drop=True)
-    out.attrs["notes"] = list(dict.fromkeys(note for table in tables for note in table.notes))
-    return out
 
 
 def _parts(cell: Cell) -> dict[str, str]:
