@@ -290,10 +290,11 @@ def _planner_facts(group: Group) -> dict[str, Any]:
         out |= {k: PurePath(str(v)).name for k, v in identity.get("arguments", {}).items()}
         out |= {"batch size": identity["batch_size"]} if "batch_size" in identity else {}
     if isinstance(identity, dict) and "checkpoint" in identity:
-        given = (text.rpartition("=") for text in config.get("checkpoints", ()))
-        named = {owner: file for owner, _, file in given if owner in ("", group.name)}
-        file = config.get("planner_args", {}).get(group.name, {}).get("checkpoint", "")
-        out["checkpoint"] = PurePath(file or next(iter(named.values()), "official")).name
+        others = {*config["planners"]} - {group.name}
+        given = [t for t in config.get("checkpoints", ()) if t.partition("=")[0] not in others]
+        given += [config.get("planner_args", {}).get(group.name, {}).get("checkpoint")]
+        found = given[0] or ("shiftsim" if identity.get("weights") else "official")
+        out["checkpoint"] = PurePath(found.removeprefix(f"{group.name}=")).name
     return out
 
 

@@ -396,9 +396,9 @@ def test_latex_has_measured_columns_the_best_in_bold_and_seeds_as_subscripts(tmp
     assert r"  alpha & 50.00 & 45.00$_{\pm 7.07}$ \\" in lines
     assert r"  beta\_2 & \textbf{75.00} & \textbf{70.00}$_{\pm 7.07}$ \\" in lines
     rows = found["scores"].splitlines()
-    assert rows[7].startswith("  none & alpha & 50.00 & ")
-    assert rows[8].startswith(r"   & beta\_2 & \textbf{75.00} & ")
-    assert rows[9] == r"\midrule"
+    assert rows[9].startswith("  none & alpha & 50.00 & ")
+    assert rows[10].startswith(r"   & beta\_2 & \textbf{75.00} & ")
+    assert rows[11] == r"\midrule"
     assert "seeds" not in found["scores"]
     assert "95" not in found["semantic-shift_made-up"]
     assert "95" in found["planner-comparison"]
