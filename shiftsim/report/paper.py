@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import methodcaller
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from shiftsim.report.groups import COLUMNS, DataSet, Group, by_set, distinct_sets
 from shiftsim.report.statistics import FEW_CLUSTERS, score_interval
@@ -86,7 +86,9 @@ def semantic_shift(
         header = ("traffic", "planner", *(column.heading for column in columns))
         title = f"Scores × 100 without noise: {data.label}"
         name = f"semantic-shift_{data.name}"
-        out.append(_semantic_table(name, title, header, rows, notes, published))
+        best = dict.fromkeys((one for one in header[2:] if one != INTERVAL), max)
+        table = Table(name, title, header, rows, 2, notes, words=_words(published), best=best)
+        out.append(table)
     alike = [data for data, _ in sets if published and _is_paper_like(data, published)]
     if published is not None and with_published and not alike:
         out.append(published_semantic(published))
@@ -182,19 +184,8 @@ def published_semantic(published: Published) -> Table:
     header = ("traffic", "planner", *(column.heading for column in columns))
     notes = (published.source, "Val14 thresholds nuplan, DeepPlan thresholds deepplan")
     title = "Zero-shot generalization as published, scores × 100"
-    return _semantic_table("semantic-shift_published", title, header, rows, notes, published)
-
-
-def _semantic_table(
-    name: str,
-    title: str,
-    header: Sequence[str],
-    rows: Sequence[Row],
-    notes: Sequence[str],
-    published: Published | None,
-) -> Table:
-    best = dict.fromkeys((one for one in header[2:] if one != INTERVAL), max)
-    return Table(name, title, header, rows, 2, notes, words=_words(published), best=best)
+    more: dict[str, Any] = {"words": _words(published), "best": dict.fromkeys(header[2:], max)}
+    return Table("semantic-shift_published", title, header, rows, 2, notes, **more)
 
 
 def _words(published: Published | None) -> dict[str, str]:

@@ -99,3 +99,20 @@ def test_mistakes_end_in_two_lines(clean_run, capsys, words, hint):
     assert len(lines) == 2
     assert lines[0].startswith("error: ")
     assert hint in lines[1]
+
+
+def test_planners_are_called_otherwise_in_pictures_and_comparisons(call, clean_run, tmp_path):
+    names = clean_run.manifest["config"]["planners"]
+    label = ("--label", f"{names[0]}=ours")
+    done = call("view", clean_run.path, *label, "-p", "ours", "--out", tmp_path, "--no-open", "-q")
+    rows = json.loads(sections((tmp_path / "index.html").read_text("utf-8"))["rows"])
+    assert done.exit_code == 0, done.output
+    assert {row["planner"] for row in rows} == {"ours"}
+    found = call("diff", clean_run.path, clean_run.path, *label)
+    assert "better 0" in found.output
+
+
+def test_open_against_closed_needs_open_loop_and_plot_a_scenario(call, clean_run):
+    for words, hint in (((), "--open-against-closed"), (("--open-against-closed",), "--open-loop")):
+        error = call("plot", clean_run.path, *words).exception
+        assert hint in error.hint

@@ -151,3 +151,62 @@ def test_a_run_says_where_its_data_was_made_up(toy, capsys, monkeypatch):
             main(["run", *words])
         line = "data        generated, not recorded: towns, seed 1, towns 300\n"
         assert (line in capsys.readouterr().out) == bool(generator)
+
+
+NAMED = """
+from shiftsim.planners.registry import load_planner
+
+
+class Named:
+    name = "mine"
+
+    def __init__(self, headway: float = 1.5):
+        self.inner = load_planner("idm", {"headway": headway})
+
+    def reset(self, scene):
+        self.inner.reset(scene)
+
+    def plan(self, observation):
+        return self.inner.plan(observation)
+
+
+class Other(Named): ...
+
+
+class Borrowed(Named):
+    name = "idm"
+"""
+
+
+def test_the_name_of_a_class_is_that_in_tables_unless_a_label_is_given(call, tmp_path):
+    file = tmp_path / "named_planners.py"
+    file.write_text(NAMED)
+    planners = [f"{file}:Named", f"far={file}:Named", f"{file}:Borrowed"]
+    words = [word for planner in planners for word in ("-p", planner)]
+    more = ("--planner-arg", "far.headway=4", "--workers", 1, "--limit", 1)
+    code, out, _ = call("run", *words, *more, "--out", tmp_path / "run", "-q")
+    run = shiftsim.open_run(tmp_path / "run")
+    assert code == 0
+    assert f"planner     far = {file}:Named  headway=4" in out
+    assert run.manifest["config"]["planners"] == ["mine", "far", f"{file}:Borrowed"]
+    assert run.manifest["config"]["planner_args"] == {"far": {"headway": 4}}
+    assert set(run.scores["planner"].to_pylist()) == {"mine", "far", f"{file}:Borrowed"}
+
+    code, out, _ = call(
+        "report", tmp_path / "run", "-t", "scores", "--label", "mine=M", store=False
+    )
+    assert [line.split()[0] for line in out.splitlines()[2:4]] == ["M", "far"]
+
+    twins = ("-p", f"{file}:Named", "-p", f"{file}:Other", *more[2:])
+    code, out, _ = call("run", *twins, "--out", tmp_path / "twins", "-q")
+    named = shiftsim.open_run(tmp_path / "twins").manifest["config"]["planners"]
+    assert named == [f"{file}:Named", f"{file}:Other"]
+
+
+def test_an_isolated_planner_has_its_own_name_too(call, tmp_path):
+    file = tmp_path / "named_planners.py"
+    file.write_text(NAMED)
+    words = ("-p", f"{file}:Named", "--isolate", "--workers", 1, "--limit", 1, "-q")
+    code, _, _ = call("run", *words, "--out", tmp_path / "run")
+    assert code == 0
+    assert shiftsim.open_run(tmp_path / "run").manifest["config"]["planners"] == ["mine"]
