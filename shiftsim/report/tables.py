@@ -313,10 +313,10 @@ def _best(table: Table, settings: Sequence[Row]) -> set[tuple[int, int]]:
 
 def _float(table: Table, tabular: Sequence[str], sizes: Sequence[int]) -> str:
     """The float around a tabular whose columns are so many characters wide."""
-    width = 4.0 * sum(sizes) + 8.0 * len(sizes)
+    width = 4.4 * sum(sizes) + 8.0 * len(sizes)
     kind, font, gap, needs = "table" if width <= _COLUMN else "table*", "footnotesize", 4, ""
     if width > _PAGE:
-        width, font, gap = 3.7 * sum(sizes) + 4.0 * len(sizes), "scriptsize", 2
+        width, font, gap = 3.9 * sum(sizes) + 4.0 * len(sizes), "scriptsize", 2
     if width > _PAGE:
         needs, tabular = ",graphicx", [r"\resizebox{\textwidth}{!}{%", *tabular, "}"]
     notes = " ".join(f"{latex_escape(note)}." for note in table.remarks)
