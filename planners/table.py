@@ -68,7 +68,7 @@ _ENTRIES = (
     PlannerEntry(
         "constant-velocity",
         "rule-based",
-        f"{_HERE}.basic.constant_velocity:ConstantVelocity",
+        f"{_HERE}.basic:ConstantVelocity",
         "keeps heading and speed",
     ),
     PlannerEntry(
@@ -91,9 +91,7 @@ _ENTRIES = (
         "nuPlan's IDM planner: follows the route's lanes behind the nearest object",
         ("target_velocity", *_IDM),
     ),
-    PlannerEntry(
-        "log-future", "oracle", f"{_HERE}.basic.log_future:LogFuture", "drives the recorded future"
-    ),
+    PlannerEntry("log-future", "oracle", f"{_HERE}.basic:LogFuture", "drives the recorded future"),
     PlannerEntry(
         "pdm-closed",
         "rule-based",
@@ -120,14 +118,14 @@ _ENTRIES = (
     PlannerEntry(
         "scripted",
         "replay",
-        f"{_HERE}.basic.scripted:Scripted",
+        f"{_HERE}.basic:Scripted",
         "replays pose sequences from a Parquet or CSV file",
         ("file", "name"),
     ),
     PlannerEntry(
         "simple",
         "rule-based",
-        f"{_HERE}.basic.simple:Simple",
+        f"{_HERE}.basic:Simple",
         "nuPlan's SimplePlanner: straight on, slows down to a limit",
         ("max_velocity",),
     ),

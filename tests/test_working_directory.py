@@ -27,7 +27,7 @@ if __name__ == "__main__":
 """
 PLUGINS = """
 from shiftsim.metrics.result import MetricRow
-from shiftsim.planners.basic.constant_velocity import ConstantVelocity
+from shiftsim.planners.basic import ConstantVelocity
 from shiftsim.sim.traffic import LogReplay
 
 import my_helper

@@ -15,7 +15,7 @@ import shiftsim
 
 PLANNER = """
 import time
-from shiftsim.planners.basic.constant_velocity import ConstantVelocity
+from shiftsim.planners.basic import ConstantVelocity
 
 class Failing(ConstantVelocity):
     def reset(self, scene):

@@ -81,7 +81,7 @@ JOBS = {
 }
 MOODY = """
 import os
-from shiftsim.planners.basic.constant_velocity import ConstantVelocity
+from shiftsim.planners.basic import ConstantVelocity
 
 class Moody(ConstantVelocity):
     def reset(self, scene):

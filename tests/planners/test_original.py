@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shiftsim.kernels import readonly
-from shiftsim.planners.basic.constant_velocity import ConstantVelocity
+from shiftsim.planners.basic import ConstantVelocity
 from shiftsim.planners.prototype import PlannerPrototype
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shiftsim.planners.basic.constant_velocity import ConstantVelocity
+from shiftsim.planners.basic import ConstantVelocity
 from shiftsim.planners.learned.base import LearnedPlanner
 from shiftsim.world.state import Trajectory
 

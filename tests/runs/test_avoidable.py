@@ -8,7 +8,7 @@ from worlds import cruise_scenario
 from shiftsim.data import open_store
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.edits.sampling import GRADES, HARDEST, KINDS, sample_edits
-from shiftsim.planners.basic.log_future import LogFuture
+from shiftsim.planners.basic import LogFuture
 from shiftsim.runs.avoidable import Braking, grade, hits, is_avoidable
 from shiftsim.runs.edited import EditedStore, make_edits
 from shiftsim.sim.loop import simulate

@@ -11,7 +11,7 @@ from stores import write_toy_store
 
 import shiftsim
 from shiftsim.errors import ConfigError, DataError
-from shiftsim.planners.basic.constant_velocity import ConstantVelocity
+from shiftsim.planners.basic import ConstantVelocity
 from shiftsim.runs.config import make_config
 from shiftsim.runs.execute import execute
 from shiftsim.runs.prepare import prepare

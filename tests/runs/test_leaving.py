@@ -7,12 +7,12 @@ import pytest
 
 import shiftsim
 from shiftsim.cli import main
-from shiftsim.planners.basic.constant_velocity import ConstantVelocity
+from shiftsim.planners.basic import ConstantVelocity
 
 BAD = "0001cafe"
 MODULE = """
 import sys
-from shiftsim.planners.basic.constant_velocity import ConstantVelocity
+from shiftsim.planners.basic import ConstantVelocity
 {0}
 class Mine(ConstantVelocity):
     def __init__(self):

@@ -15,7 +15,7 @@ from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.review import REVIEW, Review, Reviews, read_reviews, write_reviews
 from shiftsim.errors import DataError, readable
 from shiftsim.metrics.result import MetricRow
-from shiftsim.planners.basic.constant_velocity import ConstantVelocity
+from shiftsim.planners.basic import ConstantVelocity
 
 HALF = "half \ud800 a pair"
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from worlds import cruise_scenario, standing_tracks
 
 from shiftsim.errors import DataError, InvalidTrajectoryError, PlannerError
-from shiftsim.planners.basic.constant_velocity import ConstantVelocity
+from shiftsim.planners.basic import ConstantVelocity
 from shiftsim.planners.learned.base import LearnedPlanner
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import Rollout, simulate, simulate_together

@@ -7,7 +7,7 @@ import pytest
 from worlds import cruise_scenario
 
 from shiftsim.errors import ConfigError, DataError, InvalidTrajectoryError, PlannerError
-from shiftsim.planners.basic.constant_velocity import ConstantVelocity
+from shiftsim.planners.basic import ConstantVelocity
 from shiftsim.sim import loop
 from shiftsim.sim.dynamics.bicycle import command_and_step
 from shiftsim.sim.loop import DEFAULT, Rollout, simulate, simulate_together

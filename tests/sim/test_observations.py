@@ -9,8 +9,7 @@ from worlds import cruise_scenario
 
 from shiftsim.errors import InvalidTrajectoryError
 from shiftsim.kernels import readonly
-from shiftsim.planners.basic.constant_velocity import ConstantVelocity
-from shiftsim.planners.basic.log_future import LogFuture
+from shiftsim.planners.basic import ConstantVelocity, LogFuture
 from shiftsim.sim.dynamics.lqr import track_and_step
 from shiftsim.sim.loop import Rollout, simulate
 from shiftsim.sim.planner import observe_log, scene_info

@@ -25,7 +25,7 @@ from shiftsim.data.nuplan.scenarios import (
 )
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError, ConversionError, DataError
-from shiftsim.planners.basic.log_future import LogFuture
+from shiftsim.planners.basic import LogFuture
 from shiftsim.sim.planner import observe_log, past_rows, scene_info
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario

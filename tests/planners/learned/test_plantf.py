@@ -17,7 +17,7 @@ from shiftsim.world.state import AX, HEADING, VX, LightStatus, Tracks, TrafficLi
 
 pytest.importorskip("torch")
 
-from shiftsim.planners.basic.constant_velocity import ConstantVelocity
+from shiftsim.planners.basic import ConstantVelocity
 from shiftsim.planners.learned.plantf.planner import MAX_STEER, PlanTF, current_state
 
 pytestmark = pytest.mark.learned
