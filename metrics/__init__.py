@@ -32,6 +32,7 @@ from shiftsim.metrics.score import (
 )
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.map import VectorMap
+from shiftsim.world.scenario import Scenario
 
 METRIC_VERSION = "1"  # raised with any change of a definition
 CustomMetric = Callable[[SimulationLog, VectorMap], float | MetricRow]
@@ -64,7 +65,7 @@ __all__ = [
 
 def compute_metrics(
     log: SimulationLog,
-    road: VectorMap,
+    road: VectorMap | Scenario,
     *,
     thresholds: str | Thresholds = "nuplan",
     own: Sequence[str | CustomMetric] = (),
@@ -73,7 +74,7 @@ def compute_metrics(
 
     Args:
         log: The rollout.
-        road: Map it was driven on.
+        road: Map it was driven on, or the scenario with that map.
         thresholds: Profile name, or thresholds of your own.
         own: Metrics of your own, as callables or `module:attribute`; they are reported in
             `extra` and never enter the score.
@@ -89,6 +90,7 @@ def compute_metrics(
         print(result.score, result.scores)
         ```
     """
+    road = road.map if isinstance(road, Scenario) else road
     result = evaluate(measure(log, road), thresholds)
     return add_metrics(result, log, road, own) if own else result
 

@@ -2,11 +2,20 @@ from typing import Any
 
 from shiftsim._version import __version__ as __version__
 from shiftsim.api import Run as Run
+from shiftsim.api import bench as bench
+from shiftsim.api import demo as demo
+from shiftsim.api import demo_store as demo_store
 from shiftsim.api import load_planner as load_planner
+from shiftsim.api import merge as merge
 from shiftsim.api import open_run as open_run
 from shiftsim.api import open_store as open_store
 from shiftsim.api import run as run
 from shiftsim.api import simulate as simulate
+from shiftsim.api.stores import convert_dataset as convert_dataset
+from shiftsim.api.stores import convert_dsc3d as convert_dsc3d
+from shiftsim.api.stores import convert_nuplan as convert_nuplan
+from shiftsim.api.stores import convert_tracks as convert_tracks
+from shiftsim.api.stores import make_towns as make_towns
 from shiftsim.errors import ShiftsimError as ShiftsimError
 from shiftsim.metrics import compute_metrics as score
 from shiftsim.planners.contract import check_planner as check_planner
@@ -35,8 +44,17 @@ __all__ = [
     "SimulationLog",
     "Tracks",
     "Trajectory",
+    "bench",
     "check_planner",
+    "convert_dataset",
+    "convert_dsc3d",
+    "convert_nuplan",
+    "convert_tracks",
+    "demo",
+    "demo_store",
     "load_planner",
+    "make_towns",
+    "merge",
     "open_run",
     "open_store",
     "run",

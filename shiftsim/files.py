@@ -37,11 +37,12 @@ _IMPORT = re.compile(
 )
 
 
-def store_path(name: str) -> Path:
+def store_path(name: str | Path) -> Path:
     """Folder of a store: a path, or a name below `SHIFTSIM_DATA` (`./shiftsim-data`).
 
     A store in the current directory may be named without `./`, unless the name is taken below.
     """
+    name = str(name)
     path = expand(name)
     if path.is_absolute() or len(path.parts) != 1 or name in (".", ".."):
         return path

@@ -1,5 +1,7 @@
 """The public names: what they print, what notebooks show of them, and that their examples run."""
 
+import copy
+import pickle
 import re
 import shutil
 import sys
@@ -7,12 +9,13 @@ import sys
 import numpy as np
 import pytest
 from stores import write_toy_store
+from track_files import export_town, write_tracks
 
 import shiftsim
 from shiftsim.files import PACKAGE
 from shiftsim.report.build import TABLES
 from shiftsim.report.tables import FORMATS
-from shiftsim.sim.planner import scene_info
+from shiftsim.sim.planner import observe_log, scene_info
 
 
 def is_short(text):
@@ -271,3 +274,96 @@ def test_no_hint_is_said_twice():
     sources = [path for folder in folders for path in (PACKAGE.parent / folder).rglob("*.py")]
     assert len(sources) > 300
     assert not [str(path) for path in sources if twice.search(path.read_text("utf-8"))]
+
+
+def test_what_other_tools_call_otherwise_is_answered_with_the_name_here(run, scenario, store, log):
+    from shiftsim.api.notebook import WORDS
+
+    result = shiftsim.score(log, scenario)
+    scene, seen = scene_info(scenario), observe_log(scenario, 3)
+    plan = shiftsim.Trajectory.from_poses([0, 1.0], [seen.ego.pose] * 2)
+    asked = run, scenario, store, log, result, scene, seen, seen.ego, seen.tracks, plan
+    for thing in (*asked, scenario.map):
+        words = next(words for kind, words in WORDS.items() if isinstance(thing, kind))
+        for name, meant in words.items():
+            with pytest.raises(AttributeError, match=f"no attribute '{name}'") as caught:
+                getattr(thing, name)
+            assert meant in str(caught.value)
+            first = re.match(r"\w+", meant)[0]
+            assert hasattr(thing, first) or first in NO_ATTRIBUTES, (name, meant)
+    with pytest.raises(AttributeError, match="may be: tracks"):
+        _ = scenario.track
+    assert not hasattr(scenario, "_private")
+    for name, meant in shiftsim._WORDS.items():
+        if f"shiftsim.{name}" in sys.modules:  # a package that something has imported
+            continue
+        with pytest.raises(AttributeError) as caught:
+            getattr(shiftsim, name)
+        assert meant in str(caught.value)
+
+
+NO_ATTRIBUTES = "iteration that for np shiftsim Trajectory store".split()
+
+
+def test_what_is_asked_for_by_name_survives_copies(scenario):
+    for thing in (scenario, scene_info(scenario), observe_log(scenario, 3)):
+        assert repr(pickle.loads(pickle.dumps(thing))) == repr(thing)
+        assert repr(copy.deepcopy(thing)) == repr(thing)
+
+
+def test_a_scenario_has_a_duration_and_an_ego_its_parts(scenario):
+    times = scenario.iteration_times
+    assert scenario.duration == pytest.approx((times[-1] - times[0]) * 1e-6)
+    ego = observe_log(scenario, 0).ego
+    assert (ego.x, ego.y, ego.heading) == tuple(ego.pose)
+
+
+def test_a_rollout_is_found_by_the_token_of_its_scenario(run, scenario, store, tmp_path):
+    found = run.rollout(scenario.token)
+    assert found.token == scenario.token
+    assert (found.ego == shiftsim.simulate(scenario, "constant-velocity").ego).all()
+    planners = ["constant-velocity", "simple"]
+    several = shiftsim.run(planners, store=str(store.path), limit=1, out=str(tmp_path / "two"))
+    token = several.scores["token"][0].as_py()
+    with pytest.raises(shiftsim.ShiftsimError, match="driven 2 times"):
+        several.rollout(token)
+    assert several.rollout(token, planner="simple").token == token
+
+
+def test_a_store_is_checked_filtered_counted_and_exported(tmp_path):
+    write_toy_store(tmp_path / "toy")
+    opened = shiftsim.open_store(tmp_path / "toy")
+    kept = opened.filter(min_path_m=0.0, min_progress_share=0.0, workers=1)
+    assert len(kept.rows) == len(opened)
+    assert set(opened.stats().rows) == set(opened.tokens)
+    written = opened.export_nuplan(tmp_path / "out")
+    for thing in (kept, opened.check(), opened.stats(), written):
+        assert is_short(repr(thing)), repr(thing)
+    back = shiftsim.convert_nuplan(
+        written.logs, written.maps, tmp_path / "back", tokens=written.tokens.values()
+    )
+    assert f"{len(opened)} scenarios converted, 0 unchanged, 0 failed" in repr(back)
+    assert len(shiftsim.open_store(tmp_path / "back")) == len(opened)
+
+
+def test_recordings_and_tracks_are_converted_from_python(tmp_path):
+    columns, road = export_town(tmp_path / "sites", "street")
+    site = tmp_path / "sites/street"
+    report = shiftsim.convert_dsc3d(site, tmp_path / "street", overlap_s=0.0, workers=1)
+    assert f"{len(shiftsim.open_store(tmp_path / 'street'))} scenarios" in repr(report)
+    with pytest.raises(shiftsim.ShiftsimError, match="window"):
+        shiftsim.convert_dsc3d(site, tmp_path / "none", windows=3.0)
+    table = write_tracks(tmp_path / "t.csv", columns)
+    report = shiftsim.convert_tracks(table, road, tmp_path / "own")
+    assert report.accepted == len(shiftsim.open_store(tmp_path / "own"))
+    with pytest.raises(shiftsim.ShiftsimError, match="did you mean 'av2'"):
+        shiftsim.convert_dataset("av", tmp_path, tmp_path / "none")
+
+
+def test_shards_are_joined_from_python(store, tmp_path):
+    shards = [
+        shiftsim.run("simple", store=str(store.path), shard=f"{n}/2", out=str(tmp_path / f"{n}"))
+        for n in (1, 2)
+    ]
+    merged = shiftsim.merge([shards[0], shards[1].path], out=str(tmp_path / "all"))
+    assert len(merged.scores) == len(store)

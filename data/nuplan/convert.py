@@ -57,6 +57,12 @@ class ConversionReport:
     left: dict[str, int] = field(default_factory=dict)
     offers: dict[str, Counter[str]] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        return (
+            f"<ConversionReport nuplan: {len(self.converted)} scenarios converted, "
+            f"{len(self.unchanged)} unchanged, {len(self.failed)} failed>"
+        )
+
 
 def convert_nuplan(
     logs: Path,

@@ -60,6 +60,9 @@ class ExportReport:
     # maps that nuPlan's own code opens and that are not in the folder
     missing_maps: list[str] = field(default_factory=list)
 
+    def __repr__(self) -> str:
+        return f"<ExportReport: {len(self.tokens)} logs, {len(self.cities)} maps, in {self.logs}>"
+
     @property
     def renamed(self) -> dict[str, str]:
         """Scenarios whose token had to be replaced, with the new one."""

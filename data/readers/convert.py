@@ -67,6 +67,12 @@ class ConversionReport:
     map_warnings: dict[str, int] = field(default_factory=dict)
     details: dict[str, Any] = field(default_factory=dict)  # what the reader adds
 
+    def __repr__(self) -> str:
+        return (
+            f"<ConversionReport {self.name}: {self.accepted} scenarios of {len(self.recordings)} "
+            f"recordings, {len(self.skipped)} skipped>"
+        )
+
     @property
     def accepted(self) -> int:
         """Number of scenarios of the recordings."""

@@ -107,6 +107,10 @@ class CheckReport:
     problems: list[Problem]
     recordings: list[RecordingRow]
 
+    def __repr__(self) -> str:
+        errors = sum(problem.is_error for problem in self.problems)
+        return f"<CheckReport: {errors} errors, {len(self.problems) - errors} unusual>"
+
 
 def check_store(path: str | Path) -> list[Problem]:
     """All problems of a store: schemas, digests, maps, recordings and scenarios.

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import pyarrow as pa
@@ -66,6 +66,12 @@ class ScenarioStore:
         self._maps: dict[str, VectorMap] = {}
         self._recordings: dict[str, StoredRecording] = {}
         self._egos: dict[tuple[str, str], tables.Table] = {}
+
+    # attached by shiftsim.api: filter(), check(), stats() and export_nuplan(out)
+    filter: ClassVar[Callable[..., Any]]
+    check: ClassVar[Callable[..., Any]]
+    stats: ClassVar[Callable[..., Any]]
+    export_nuplan: ClassVar[Callable[..., Any]]
 
     def __repr__(self) -> str:
         return f"<ScenarioStore {self.path.name}: {len(self)} scenarios in {len(self.cities)} maps>"

@@ -72,6 +72,9 @@ class StoreStats:
     cities: Mapping[str, str]  # city by scenario
     types: Mapping[str, str]  # scenario type by scenario
 
+    def __repr__(self) -> str:
+        return f"<StoreStats: {len(self.rows)} scenarios in {len(set(self.cities.values()))} maps>"
+
     def groups(self, by: str = "city") -> dict[str, dict[str, float]]:
         """Number of scenarios and mean of every column, of each group (city or type) and of all."""
         labels = self.cities if by == "city" else self.types

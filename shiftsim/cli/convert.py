@@ -54,7 +54,7 @@ def nuplan(
     as_json: Json = False,
 ) -> None:
     """Convert scenarios of nuPlan logs (.db) and maps (map.gpkg)."""
-    from shiftsim.data.nuplan.convert import convert_nuplan
+    from shiftsim import convert_nuplan
     from shiftsim.data.nuplan.scenarios import parse_mapping
 
     folder = store_path(store)
@@ -310,14 +310,11 @@ def _convert(
     as_json: bool,
 ) -> None:
     """Convert a source over processes, print the report, and leave with the code for it."""
-    from shiftsim.data.readers.convert import convert
-    from shiftsim.runs.config import default_workers
-    from shiftsim.runs.workers import map_unordered
+    from shiftsim.api.stores import convert_reader
 
     folder = store_path(store)
-    executor = partial(map_unordered, workers=settings.get("workers") or default_workers())
     with progress_bar(quiet=quiet or as_json) as advance:
-        report = convert(reader, folder, progress=advance, executor=executor)
+        report = convert_reader(reader, folder, settings.get("workers", 0), advance)
     following = f" next: shiftsim filter {store}, then shiftsim run --planner idm --store {store}"
     printed = [*lines(report, folder), following]
     print_result({kind: report.name, **_contents(report)}, printed, as_json=as_json)

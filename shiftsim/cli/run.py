@@ -28,7 +28,7 @@ from shiftsim.cli.report import print_worst
 from shiftsim.errors import ConfigError
 from shiftsim.files import DEFAULT_STORE, read_toml, store_path
 from shiftsim.planners.registry import planner_name
-from shiftsim.runs.config import default_workers, make_config
+from shiftsim.runs.config import make_config
 
 if TYPE_CHECKING:
     from shiftsim.runs.execute import OnProgress, Progress
@@ -340,9 +340,7 @@ def merge(
     as_json: Json = False,
 ) -> None:
     """Join runs made with --shard: the same tables as without."""
-    from shiftsim.runs.derive import merge_runs
-
-    merged = merge_runs(list(map(shiftsim.open_run, runs)), out=out, allow_partial=allow_partial)
+    merged = shiftsim.merge(runs, out=out, allow_partial=allow_partial)
     leave_with(merged, allow_partial=allow_partial, as_json=as_json)
 
 
@@ -387,15 +385,14 @@ def demo(
         return
     if seed is not None:
         raise ConfigError("--seed is of random towns only", hint="say how many with --towns")
-    from shiftsim.data.synthetic.store import demo_store
+    from shiftsim.api import DEMO
 
     folder = out or store_path(DEFAULT_STORE)
     if not folder.exists():
         echo(f"generating and converting recordings, compiling kernels → {folder}")
-        demo_store(folder)
+        shiftsim.demo_store(folder)
     values = {
-        "planners": ["log-future", "idm", "constant-velocity"],
-        "noise": ["none", "ou-high"],
+        **DEMO,
         "store": str(folder) if out else DEFAULT_STORE,
         **settings,
     }
@@ -417,19 +414,14 @@ def _make_towns(
     """Generate, convert and filter random towns."""
     if "limit" in settings:
         raise ConfigError("--limit is of runs, --towns runs nothing", hint="leave one of them out")
-    from shiftsim.data.synthetic.store import write_towns
-    from shiftsim.runs.filter import filter_store
-    from shiftsim.runs.workers import map_unordered
-
     folder = out or store_path(f"towns-{seed}")
-    workers = settings.get("workers", 0) or default_workers()
+    workers = settings.get("workers", 0)
     echo(f"generating and converting {plural(towns, 'town')} of seed {seed} → {folder}")
     with progress_bar(quiet=quiet) as advance:
-        spread = partial(map_unordered, workers=min(workers, towns), alone=1)
-        write_towns(folder, towns=towns, seed=seed, spread=spread, progress=advance)
+        store = shiftsim.make_towns(folder, towns, seed=seed, workers=workers, on_progress=advance)
     echo("driving every scenario as recorded, to leave out those that cannot be driven so")
     with progress_bar(quiet=quiet) as advance:
-        found = filter_store(folder, workers=workers, on_progress=advance)
+        found = store.filter(workers=workers, on_progress=advance)
     counts = found.counts()
     echo(f" {counts['accepted']} of {plural(len(found.rows), 'scenario')} accepted → {folder}")
     echo(f" next: shiftsim run --planner log-future --store {folder} --limit 20")

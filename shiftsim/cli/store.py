@@ -81,16 +81,13 @@ def filter_scenarios(
     Dropped scenarios stay in the store and are listed; runs over the whole store leave them out.
     An interrupted filter goes on when it is started again.
     """
-    from shiftsim.runs.filter import FilterConfig, filter_store
-
     workers = settings.pop("workers", 0)
     limits = cli.given(min_path_m=min_path, min_progress_share=min_progress)
-    config = FilterConfig(**settings, **limits)
-    folder = cli.open_store(store).path
+    opened = cli.open_store(store)
     with progress_bar(quiet=quiet or as_json) as advance:
-        found = filter_store(folder, config, workers=workers, on_progress=advance)
+        found = opened.filter(workers=workers, on_progress=advance, **settings, **limits)
     values = {"config": found.config, "counts": found.counts(), "verdicts": found.rows}
-    print_result(values, _verdict_lines(found, config.thresholds), as_json=as_json)
+    print_result(values, _verdict_lines(found, found.config["thresholds"]), as_json=as_json)
     if found.counts()["failed"]:
         raise typer.Exit(cli.UNFINISHED)
 

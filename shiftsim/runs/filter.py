@@ -84,6 +84,10 @@ class FilterResults:
     hash: str  # digest of the file
     conditions: Mapping[str, Any]  # everything that the verdicts depend on
 
+    def __repr__(self) -> str:
+        counts = self.counts()
+        return f"<FilterResults: {counts[ACCEPTED]} of {len(self.rows)} scenarios accepted>"
+
     @property
     def config(self) -> Mapping[str, Any]:
         """What a scenario had to satisfy."""

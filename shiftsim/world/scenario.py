@@ -7,7 +7,7 @@ and learned targets that look into the recorded future.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -88,10 +88,9 @@ class Scenario:
         object.__setattr__(self, "traffic_lights", self.traffic_lights.readonly())
 
     def __repr__(self) -> str:
-        times = self.iteration_times
         return (
             f"<Scenario {self.token}: {self.scenario_type} in {self.city}, "
-            f"{(times[-1] - times[0]) * 1e-6:.1f} s, {self.tracks.num_tracks} tracks>"
+            f"{self.duration:.1f} s, {self.tracks.num_tracks} tracks>"
         )
 
     @property
@@ -105,6 +104,12 @@ class Scenario:
         return self.time_us[self.iteration_rows]
 
     @property
+    def duration(self) -> float:
+        """Time from the first iteration to the last one [s]."""
+        times = self.iteration_times
+        return float(times[-1] - times[0]) * 1e-6
+
+    @property
     def duration_class(self) -> str:
         """Scenarios of one class may stand in one mean: `15 s`, or shorter, such as `8 s`."""
         return duration_class(self.iteration_times)
@@ -116,6 +121,8 @@ class Scenario:
 
     # edited(name="edited", **tables): this scenario changed; attached by shiftsim.edits
     edited: ClassVar[Callable[..., "Scenario"]]
+    # plot(): a matplotlib figure of the first iteration; attached by shiftsim.api
+    plot: ClassVar[Callable[..., Any]]
 
 
 def scenario_of_rows(

@@ -259,6 +259,21 @@ class EgoState:
         return self.values[:3]
 
     @property
+    def x(self) -> float:
+        """Rear axle x [m]."""
+        return float(self.values[X])
+
+    @property
+    def y(self) -> float:
+        """Rear axle y [m]."""
+        return float(self.values[Y])
+
+    @property
+    def heading(self) -> float:
+        """Heading [rad]."""
+        return float(self.values[HEADING])
+
+    @property
     def center(self) -> FloatArray:
         """(3,) box centre x [m], y [m], heading [rad]."""
         return center_poses(self.values[None, :3])[0]

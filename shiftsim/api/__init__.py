@@ -1,17 +1,18 @@
 """What `import shiftsim` offers that joins layers which may not import one another.
 
-The other public names are where they are defined; `shiftsim/__init__.py` lists all of them. What a
-notebook shows of scenarios, maps and logs is registered here: these know nothing of pictures.
+The other public names are where they are defined; `shiftsim/__init__.py` lists all of them.
 """
 
-import html
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import shiftsim.api.notebook  # pictures, and answers to other names
 import shiftsim.edits  # noqa: F401  # attaches Scenario.edited
+from shiftsim.api.stores import demo_store as demo_store
 from shiftsim.data import open_store as open_store
-from shiftsim.errors import ConfigError, one_of
+from shiftsim.errors import ConfigError, listed, one_of
+from shiftsim.files import DEFAULT_STORE, store_path
 from shiftsim.planners import registry
 from shiftsim.report.tables import FORMATS
 from shiftsim.runs import results
@@ -19,9 +20,10 @@ from shiftsim.sim import loop
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
 from shiftsim.sim.planner import Planner
-from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario, require_scenario
-from shiftsim.world.state import speeds
+
+# settings of the demo's run
+DEMO = {"planners": ("log-future", "idm", "constant-velocity"), "noise": ("none", "ou-high")}
 
 
 class Explanation(str):
@@ -220,6 +222,33 @@ class Run(results.Run):
         bundle_run(self, store)
         return self
 
+    def rollout(self, task: Any, scenario: Scenario | None = None, **choice: Any) -> SimulationLog:
+        """One stored rollout.
+
+        Args:
+            task: Its task, or the token of its scenario.
+            scenario: That of the store the run was made with; read from there by default.
+            choice: `planner`, `noise` and `seed`, where the scenario was driven more than once.
+
+        Raises:
+            ConfigError: There is no such task, or there are several.
+            DataError: It was not stored, cannot be read, or the scenario is another one.
+        """
+        from shiftsim.report.explain import select_tasks
+        from shiftsim.report.words import task_of, task_words
+        from shiftsim.runs.scenarios import open_run_store
+
+        if isinstance(task, str):
+            rows = select_tasks(
+                self, task, **{"planner": None, "noise": None, "seed": None} | choice
+            )
+            if len(rows) > 1:
+                there = listed([task_words(row) for row in rows])
+                raise ConfigError(f"{task!r} was driven {len(rows)} times", f"there are {there}")
+            task = task_of(rows[0])
+        driven = open_run_store(self).read(task.token) if scenario is None else scenario
+        return super().rollout(task, driven)
+
     def _gallery(self, *, planner: Any = (), noise: Any = (), seed: Any = ()) -> Any:
         from shiftsim.runs.scenarios import open_run_store
         from shiftsim.view.build import Choice, Gallery
@@ -298,6 +327,68 @@ def run(
     return Run(finished.path, finished.manifest)
 
 
+def demo(store: str | Path = DEFAULT_STORE, **settings: Any) -> Run:
+    """Generate the demo's recordings where they are not there, and run three planners on them.
+
+    Args:
+        store: Name or folder of the store.
+        settings: Those of `run`.
+
+    Example:
+        ```python
+        run = shiftsim.demo(limit=1, out="demo-run")
+        ```
+    """
+    path = demo_store(store).path
+    settings = {"planner": DEMO["planners"], "noise": DEMO["noise"], **settings}
+    return run(store=DEFAULT_STORE if path == store_path(DEFAULT_STORE) else str(path), **settings)
+
+
+def bench(
+    track: str,
+    planner: Any = (),
+    *,
+    out: str | Path = "",
+    val14: str = "",
+    on_progress: Any = None,
+    **settings: Any,
+) -> list[Run]:
+    """Run a benchmark track with all its traffic modes, noises and seeds, as `shiftsim bench` does.
+
+    Args:
+        track: `semantic-shift`, `state-drift` or `edits`.
+        planner: A name or `package.module:Class`, or a list of those; those of the track if empty.
+        out: Folder; that of an earlier call goes on.
+        val14: Store, or STORE:SPLIT, with Val14.
+        on_progress: Called with a `Progress` after every task.
+        settings: Other settings of a run; what narrows the track makes the result partial.
+
+    Raises:
+        ShiftsimError: A setting is wrong, or something it names is missing.
+    """
+    from shiftsim.benchmarks import load_track
+    from shiftsim.benchmarks.bench import plan_bench, run_bench
+
+    if planner:
+        settings["planners"] = [planner] if isinstance(planner, str) else list(planner)
+    plan = plan_bench(load_track(track), settings, reference=val14, out=str(out))
+    done = run_bench(plan, **{"on_progress": on_progress} if on_progress else {})
+    return [Run(finished.path, finished.manifest) for finished in done]
+
+
+def merge(runs: Iterable[Any], *, out: str | None = None, allow_partial: bool = False) -> Run:
+    """Join the shards of one run, as runs or folders: the same bytes as without shards.
+
+    Raises:
+        ConfigError: Something is no shard, of another run, given twice or missing.
+    """
+    from shiftsim.runs.derive import merge_runs
+
+    shards = [each if isinstance(each, results.Run) else open_run(each) for each in runs]
+    merged = merge_runs(shards, out=out, allow_partial=allow_partial)
+    return Run(merged.path, merged.manifest)
+
+
 def open_run(path: str | Path) -> Run:
     """A run folder.
 
@@ -362,45 +453,6 @@ def simulate(
     require_scenario("simulate", scenario)
     driver = load_planner(planner) if isinstance(planner, str) else planner
     return loop.simulate(scenario, driver, setting, **changes)
-
-
-def _preformatted(text: str) -> str:
-    return f"<pre>{html.escape(text)}</pre>"
-
-
-def _picture_of(thing: Scenario | VectorMap) -> str:
-    """A scenario or a map as a picture; as text where matplotlib is missing."""
-    from shiftsim.errors import MissingExtraError
-    from shiftsim.view.still import overview, svg_of
-
-    try:
-        return f"{_preformatted(repr(thing))}{svg_of(overview(thing))}"
-    except MissingExtraError:
-        return _preformatted(repr(thing))
-
-
-def _table_of(log: SimulationLog) -> str:
-    """What can be said of a rollout without its map."""
-    driven = speeds(log.ego)
-    rows = {
-        "scenario": log.token,
-        "samples": len(log.ego),
-        "duration": f"{(log.time_us[-1] - log.time_us[0]) * 1e-6:.1f} s",
-        "speed": f"{driven.mean():.1f} m/s on average, {driven.max():.1f} m/s at most",
-        "tracks": log.tracks.num_tracks,
-        "noise": "yes" if log.noise.any() else "none",
-        "planning": f"{log.planning_seconds.mean() * 1e3:.2f} ms per step",
-    }
-    cells = (f"<tr><th>{name}</th><td>{html.escape(str(v))}</td></tr>" for name, v in rows.items())
-    return f"<table>{''.join(cells)}</table>"
-
-
-for _kind, _shown in (
-    (Scenario, _picture_of),
-    (VectorMap, _picture_of),
-    (SimulationLog, _table_of),
-):
-    setattr(_kind, "_repr_html_", _shown)  # noqa: B010
 
 
 def __getattr__(name: str) -> Any:
