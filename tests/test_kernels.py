@@ -26,7 +26,7 @@ from worlds import cruise_scenario
 from shiftsim.data.readers.dsc3d import convert_dsc3d
 from shiftsim.data.readers.tracks.reader import TracksReader, convert_tracks
 from shiftsim.data.recording import visible_columns
-from shiftsim.data.store.check import check_store
+from shiftsim.data.store.check import survey_store
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.files import PACKAGE
 from shiftsim.kernels import _is_trusted
@@ -103,7 +103,7 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
     def convert_table() -> None:
         shutil.rmtree(folder / "own", ignore_errors=True)
         convert_tracks(TracksReader(table, town[1], city="roundabout"), folder / "own")
-        check_store(folder / "own")
+        survey_store(folder / "own").problems
 
     def drive_edited() -> None:
         # agents that look where the ego will be: one of them is beside it, another one far ahead
@@ -299,7 +299,7 @@ def test_a_user_without_a_home_has_a_cache_all_the_same() -> None:
     assert store == "~/x"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough  # compiles the kernels of three planners and two kinds of traffic
 def test_runs_of_several_planners_in_turn_share_a_cache(toy: Path, tmp_path: Path) -> None:
     environment = os.environ | {
         "PYTHONPATH": str(PACKAGE.parent),

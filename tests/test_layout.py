@@ -2,6 +2,7 @@
 
 import ast
 import collections
+import functools
 import importlib
 import subprocess
 import sys
@@ -96,6 +97,7 @@ def test_every_public_name_can_be_imported():
         assert getattr(shiftsim, name) is not None
 
 
+@functools.cache
 def sources():
     """Path of every module of the project, and its lines."""
     tops = ("shiftsim", *FOLDERS)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from places import GOLDEN, REPOSITORY
 
-from shiftsim.data.store.check import check_store
+from shiftsim.data.store.check import survey_store
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import DataError
 from shiftsim.runs.results import open_run
@@ -44,7 +44,7 @@ def test_a_store_has_the_same_numbers(folder, tmp_path, upgrade):
     assert "now have format 4" in upgrade(path)
     assert "already" in upgrade(path)
     assert (path / "splits" / "mine.toml").is_file()
-    assert not [problem for problem in check_store(path) if problem.kind == ""]
+    assert not [problem for problem in survey_store(path).problems if problem.kind == ""]
     store, found = open_store(path), {}
     for scene in store:
         parts = {name: getattr(scene, name) for name in ("time_us", "ego")}

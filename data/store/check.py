@@ -112,15 +112,6 @@ class CheckReport:
         return f"<CheckReport: {errors} errors, {len(self.problems) - errors} unusual>"
 
 
-def check_store(path: str | Path) -> list[Problem]:
-    """All problems of a store: schemas, digests, maps, recordings and scenarios.
-
-    Raises:
-        DataError: It is no store at all.
-    """
-    return survey_store(path).problems
-
-
 def survey_store(path: str | Path) -> CheckReport:
     """All problems of a store, and what was found in each recording.
 

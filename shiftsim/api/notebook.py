@@ -71,119 +71,86 @@ def _plot(self: Scenario | VectorMap) -> Any:
 for _kind in (Scenario, VectorMap):
     setattr(_kind, "plot", _plot)  # noqa: B010
 
-# what is asked for by the names of other tools -> what it is called here
-WORDS: dict[type, Mapping[str, str]] = {
-    Run: {
-        "results": "scores, metrics and tasks",
-        "summary": "table()",
-        "failures": "tasks, where `status` is not ok",
-        "planners": 'manifest["config"]["planners"]',
-        "scenarios": 'scores["token"], and shiftsim.open_store(…)[token]',
-        "tokens": 'scores["token"]',
-        "rollouts": "rollout_places, and rollout(token)",
-        "log": "rollout(token)",
-        "show": "view(token)",
-        "score": "scores",
-        "to_pandas": 'scores.to_pandas(), or table(format="pandas")',
-        "save": "path: it is on disk already",
-        "folder": "path",
-    },
-    Scenario: {
-        "agents": "tracks",
-        "objects": "tracks",
-        "boxes": "tracks",
-        "id": "token",
-        "name": "token",
-        "type": "scenario_type",
-        "log": "log_name",
-        "dt": "iteration_times",
-        "times": "iteration_times",
-        "lights": "traffic_lights",
-        "goal": "mission_goal",
-        "view": "plot(); shiftsim.show(scenario, name=log) replays rollouts",
-        "vector_map": "map",
-        "map_name": "city",
-        "length": "num_iterations",
-        "simulate": 'shiftsim.simulate(scenario, "idm")',
-    },
-    ScenarioStore: {
-        "scenarios": "iteration: for scenario in store",
-        "get": "store[token]",
-        "load": "store[token]",
-        "get_scenario": "store[token]",
-        "maps": "cities, and map(city)",
-        "types": 'summary()["type"]',
-        "splits": "path / 'splits'",
-        "to_pandas": "summary().to_pandas()",
-    },
-    Observation: {
-        "agents": "tracks",
-        "objects": "tracks",
-        "time": "time_us",
-        "time_s": "time_us * 1e-6",
-        "ego_state": "ego",
-        "step": "iteration",
-        "map": "that of scene, which reset(scene) is given",
-        "route": "that of scene, which reset(scene) is given",
-    },
-    SceneInfo: {
-        "vector_map": "map",
-        "route_ids": "route",
-        "route_roadblock_ids": "route",
-        "roadblocks": "route",
-        "mission_goal": "goal",
-        "scenario": "expert, for a planner with sees_recording = True",
-        "lanes": "map.edges; route_lanes, those of the route",
-    },
-    EgoState: {
-        "position": "pose[:2]",
-        "xy": "pose[:2]",
-        "yaw": "heading",
-        "rear_axle": "pose",
-        "v": "speed",
-        "vx": "velocity[0]",
-        "steering": "steering_angle",
-        "time": "time_us",
-    },
-    Tracks: {
-        "positions": "poses[..., :2]",
-        "xy": "poses[..., :2]",
-        "headings": "poses[..., 2]",
-        "ids": "tokens",
-        "types": "kinds",
-        "categories": "kinds",
-        "mask": "valid",
-        "lengths": "sizes[..., 0]",
-        "speeds": "np.hypot(*velocities.T).T",
-    },
-    SimulationLog: {
-        "score": "shiftsim.score(log, scenario.map)",
-        "scores": "shiftsim.score(log, scenario.map).scores",
-        "plot": "shiftsim.show(scenario, name=log)",
-        "states": "ego",
-        "times": "time_us",
-        "agents": "tracks",
-        "trajectory": "ego, and plans",
-    },
-    Trajectory: {
-        "poses": "states[:, :3]",
-        "times": "time_us",
-        "from_xy": "from_poses",
-        "from_states": "Trajectory(time_us, states)",
-    },
-    MetricResult: {
-        "cls": "score",
-        "total": "score",
-        "metrics": "scores and rows",
-        "violations": "rows, each with its violation",
-    },
-    VectorMap: {
-        "lanes": "edges",
-        "roadblocks": "blocks",
-        "lane_at": "lanes_at(x, y)",
-        "route": "that of the scenario",
-    },
+# what is asked for by names of other tools: what it is called here
+_SYNONYMS: dict[type, str] = {
+    Run: """results: scores, metrics and tasks
+        summary: table()
+        failures: tasks, where `status` is not ok
+        planners: manifest["config"]["planners"]
+        scenarios, tokens: scores["token"]; shiftsim.open_store(…)[token] is a scenario
+        rollouts, log: rollout(token)
+        show: view(token)
+        score: scores
+        to_pandas: table(format="pandas"), or scores.to_pandas()
+        save, folder: path; it is on disk already""",
+    Scenario: """agents, objects, boxes: tracks
+        id, name: token
+        type: scenario_type
+        log: log_name
+        dt, times: iteration_times
+        lights: traffic_lights
+        goal: mission_goal
+        view: plot(); shiftsim.show(scenario, name=log) replays rollouts
+        vector_map: map
+        map_name: city
+        length: num_iterations
+        simulate: shiftsim.simulate(scenario, "idm")""",
+    ScenarioStore: """scenarios: iteration, as in `for scenario in store`
+        get, load, get_scenario: store[token]
+        maps: cities, and map(city)
+        types: summary()["type"]
+        splits: path / "splits"
+        to_pandas: summary().to_pandas()""",
+    Observation: """agents, objects: tracks
+        time, time_s: time_us
+        ego_state: ego
+        step: iteration
+        map, route: those of the scene that reset(scene) is given""",
+    SceneInfo: """vector_map: map
+        route_ids, route_roadblock_ids, roadblocks: route
+        mission_goal: goal
+        scenario: expert, for a planner with `sees_recording = True`
+        lanes: route_lanes, or map.edges""",
+    EgoState: """position, xy: pose[:2]
+        yaw: heading
+        rear_axle: pose
+        v: speed
+        vx: velocity[0]
+        steering: steering_angle
+        time: time_us""",
+    Tracks: """positions, xy: poses[..., :2]
+        headings: poses[..., 2]
+        ids: tokens
+        types, categories: kinds
+        mask: valid
+        lengths: sizes[..., 0]
+        speeds: velocities, whose length it is""",
+    SimulationLog: """score, scores, metrics: shiftsim.score(log, scenario)
+        plot, show: shiftsim.show(scenario, name=log)
+        states: ego
+        times: time_us
+        agents: tracks
+        trajectory: ego; what was planned: plans""",
+    Trajectory: """poses: states[:, :3]
+        times: time_us
+        from_xy: from_poses
+        from_states: Trajectory(time_us, states)""",
+    MetricResult: """cls, total: score
+        metrics: scores, and rows
+        violations: rows, each with its violation""",
+    VectorMap: """lanes: edges
+        roadblocks: blocks
+        lane_at: lanes_at(x, y)""",
 }
+
+
+def _words(text: str) -> dict[str, str]:
+    """The name here for each name of a list of synonyms."""
+    lines = (line.strip().partition(": ") for line in text.splitlines())
+    return {name: meant for names, _, meant in lines for name in names.split(", ")}
+
+
+WORDS = {kind: _words(text) for kind, text in _SYNONYMS.items()}
 
 
 def _answer(words: Mapping[str, str]) -> Callable[[Any, str], Any]:
@@ -199,5 +166,5 @@ def _answer(words: Mapping[str, str]) -> Callable[[Any, str], Any]:
     return __getattr__
 
 
-for _asked, _words in WORDS.items():
-    setattr(_asked, "__getattr__", _answer(_words))  # noqa: B010
+for _asked, _meant in WORDS.items():
+    setattr(_asked, "__getattr__", _answer(_meant))  # noqa: B010

@@ -15,7 +15,7 @@ import pytest
 
 from shiftsim.cli import main
 from shiftsim.data.readers.dsc3d import convert_dsc3d
-from shiftsim.data.store.check import check_store
+from shiftsim.data.store.check import survey_store
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import DataError
 
@@ -87,7 +87,7 @@ def test_a_broken_recording_is_skipped_with_its_reason_and_the_others_finish(pla
     assert "column 'translation_x', row 379: nan" in report["skipped"]["broken"]
     kept = json.loads((place / "shiftsim-data/again/reports/town.json").read_text())
     assert kept["skipped"] == report["skipped"]
-    assert check_store(place / "shiftsim-data/again") == []
+    assert survey_store(place / "shiftsim-data/again").problems == []
 
 
 @pytest.mark.thorough

@@ -303,10 +303,10 @@ def _stores(folder: Path) -> None:
 
 def read_store(folder: Path) -> Any:
     """A store, its maps and scenarios, looked at as `shiftsim check` does."""
-    from shiftsim.data.store.check import check_store
+    from shiftsim.data.store.check import survey_store
     from shiftsim.data.store.reading import ScenarioStore
 
-    check_store(folder)
+    survey_store(folder).problems
     store = ScenarioStore(folder)
     return [store.map(city) for city in store.cities], list(store), store.summary().to_pylist()
 

@@ -103,10 +103,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         item
         for item in items
         if HERE in item.path.parents
-        and (item.get_closest_marker("reference") is None or not hasattr(item, "callspec"))
+        and (item.get_closest_marker("reference") is None or not _takes_reference(item))
     ]
     items[:] = [item for item in items if item not in others]
     config.hook.pytest_deselected(items=others)
+
+
+def _takes_reference(item: pytest.Item) -> bool:
+    """Whether a test is called with a folder or a file of references."""
+    params = item.callspec.params if hasattr(item, "callspec") else {}
+    return bool({"folder", "path"} & set(params))
 
 
 @pytest.fixture

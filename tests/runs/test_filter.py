@@ -14,7 +14,7 @@ from stores import write_toy_store
 from worlds import cruise_scenario, standing_tracks
 
 import shiftsim
-from shiftsim.data.store.check import check_store
+from shiftsim.data.store.check import survey_store
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.runs.filter import (
@@ -98,7 +98,7 @@ def test_verdicts_are_beside_the_scenarios_which_stay_as_they_were(store):
     found = filter_store(store, FilterConfig(min_path_m=19.0), workers=1)
     assert open_store(store).hash == before
     assert found.counts()[STANDING] == found.counts()["dropped"] > 0
-    assert check_store(store) == []
+    assert survey_store(store).problems == []
     assert read_filter_results(store, before).rows == found.rows
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from shiftsim.data.readers.annotations import read_recording
 from shiftsim.data.readers.dsc3d import convert_dsc3d, open_site
 from shiftsim.data.readers.windows import ConversionConfig
-from shiftsim.data.store.check import check_store
+from shiftsim.data.store.check import survey_store
 from shiftsim.errors import ConfigError, ConversionError
 
 SHORT = ConversionConfig(window_s=4.0, overlap_s=1.0, history_s=1.0, min_drivable_share=0.0)
@@ -182,5 +182,7 @@ def test_any_boxes_give_a_sound_store_or_an_error_of_ours(tmp_path_factory, boxe
         return
     # boxes at random places move as no vehicle does; that the store says so is not its fault
     told = {"scenarios", "velocity", "heading", "off the map"}
-    problems = [p for p in check_store(folder / "store") if p.is_error and p.kind not in told]
+    problems = [
+        p for p in survey_store(folder / "store").problems if p.is_error and p.kind not in told
+    ]
     assert [p for p in problems if "faster" not in p.what] == []

@@ -27,7 +27,7 @@ from shiftsim.data.readers.av2 import Av2Reader
 from shiftsim.data.readers.convert import convert
 from shiftsim.data.readers.py123d import Py123dReader
 from shiftsim.data.readers.scenarios import convert_recording
-from shiftsim.data.store.check import check_store
+from shiftsim.data.store.check import survey_store
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConversionError
 from shiftsim.world.state import center_poses
@@ -130,7 +130,9 @@ def test_a_store_of_all_three_is_sound_and_goes_on_where_it_stopped(tmp_path):
         assert (report.converted, report.skipped) == (1, {})
         second = convert(reader(tmp_path / name), tmp_path / "store")
         assert (second.converted, second.kept) == (0, 1)
-    assert not [problem for problem in check_store(tmp_path / "store") if problem.is_error]
+    assert not [
+        problem for problem in survey_store(tmp_path / "store").problems if problem.is_error
+    ]
     classes = {scene.duration_class for scene in ScenarioStore(tmp_path / "store")}
     assert classes == {"8 s"}
 

@@ -12,7 +12,7 @@ from shiftsim.data.readers.av2 import Av2Reader
 from shiftsim.data.readers.commonroad import CommonRoadReader
 from shiftsim.data.readers.convert import convert
 from shiftsim.data.readers.scenarios import convert_recording
-from shiftsim.data.store.check import check_store
+from shiftsim.data.store.check import survey_store
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.world.state import AgentKind, center_poses
 
@@ -129,7 +129,7 @@ def test_tracks_of_commonroad_are_those_of_the_file(folder, expected):
 
 @pytest.mark.parametrize("name", READERS)
 def test_the_check_of_a_store_finds_no_error(stores, name):
-    assert not [finding for finding in check_store(stores[name]) if finding.is_error]
+    assert not [finding for finding in survey_store(stores[name]).problems if finding.is_error]
 
 
 def test_an_ego_whose_roads_the_map_does_not_link_is_counted(folder):

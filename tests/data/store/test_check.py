@@ -12,7 +12,7 @@ import shiftsim
 from shiftsim.cli import main
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.data.store import recordings as stored
-from shiftsim.data.store.check import check_store, survey_store
+from shiftsim.data.store.check import survey_store
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import MapError
 from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
@@ -59,7 +59,7 @@ def _write(path, *, road=None, scene=None, tracks=None, states=None, **changed):
 
 
 def _only(path):
-    (problem,) = check_store(path)
+    (problem,) = survey_store(path).problems
     assert problem.remedy
     return problem
 
@@ -103,13 +103,16 @@ def test_a_velocity_of_a_track_that_contradicts_its_places_is_an_error(tmp_path,
 
 def test_velocities_within_a_tenth_are_fine(tmp_path):
     scene = cruise_scenario(iterations=LONG)
-    assert check_store(_write(tmp_path / "s", tracks=_moving(len(scene.time_us), told=1.09))) == []
+    assert (
+        survey_store(_write(tmp_path / "s", tracks=_moving(len(scene.time_us), told=1.09))).problems
+        == []
+    )
 
 
 def test_a_velocity_that_is_wrong_at_the_ends_only_is_fine(tmp_path):
     tracks = _moving(len(cruise_scenario(iterations=LONG).time_us))
     tracks.velocities[:20] = tracks.velocities[-20:] = 0.0
-    assert check_store(_write(tmp_path / "s", tracks=tracks)) == []
+    assert survey_store(_write(tmp_path / "s", tracks=tracks)).problems == []
 
 
 def test_a_velocity_of_the_ego_that_contradicts_its_places_is_an_error(tmp_path):
@@ -132,7 +135,7 @@ def test_a_scenario_under_three_seconds_is_an_error(tmp_path):
     problem = _only(_write(tmp_path / "s", scene=scene, mapping=(2.9, 0.0, 0.5)))
     assert (problem.is_error, problem.where) == (True, "scenario cafe")
     assert "it is 2.9 s long, need at least 3 s" in problem.what
-    assert check_store(_write(tmp_path / "t", scene=cruise_scenario(iterations=31))) == []
+    assert survey_store(_write(tmp_path / "t", scene=cruise_scenario(iterations=31))).problems == []
 
 
 @pytest.mark.parametrize(
@@ -194,7 +197,7 @@ def _crossing_lanes(low, high):
 def test_lanes_that_overlap_under_the_ego_are_an_error_and_its_task_fails(tmp_path):
     scene = cruise_scenario(iterations=LONG, start=(62.0, 0.0, 0.0))
     path = _write(tmp_path / "s", road=_crossing_lanes(-10, 10), scene=scene, route=("0",))
-    problems = {problem.where: problem for problem in check_store(path)}
+    problems = {problem.where: problem for problem in survey_store(path).problems}
     found = problems["scenario cafe"]
     assert (found.is_error, found.kind) == (True, "lanes overlap")
     assert "lanes 'a' and 'b' overlap at (" in found.what
@@ -211,7 +214,7 @@ def test_lanes_that_overlap_under_the_ego_are_an_error_and_its_task_fails(tmp_pa
 def test_lanes_that_overlap_elsewhere_on_the_route_are_an_error(tmp_path):
     road = _crossing_lanes(1.0, 10.0)
     scene = cruise_scenario(iterations=LONG, speed=0.0, start=(10.0, 0.0, 0.0))
-    found = check_store(_write(tmp_path / "s", road=road, scene=scene, route=("0",)))
+    found = survey_store(_write(tmp_path / "s", road=road, scene=scene, route=("0",))).problems
     assert [p.is_error for p in found if p.where == "scenario cafe"] == [True]
     assert "on the route overlap by 7.5 m²" in found[-1].what
 

@@ -12,7 +12,7 @@ import pytest
 from recordings import TOKEN, make_recording, make_window, write_store
 
 from shiftsim.data.recording import EgoTrace, Recording
-from shiftsim.data.store.check import check_store
+from shiftsim.data.store.check import survey_store
 from shiftsim.data.store.map import read_map_file, write_map
 from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.recordings import ego_states, open_ego, write_ego
@@ -64,7 +64,7 @@ def test_a_map_too_wide_for_its_grids_is_neither_written_nor_read(
 
 
 def test_a_sound_store_has_no_problems(store: Path) -> None:
-    assert check_store(store) == []
+    assert survey_store(store).problems == []
 
 
 def test_check_finds_changed_missing_and_foreign_files(store: Path) -> None:
@@ -74,7 +74,7 @@ def test_check_finds_changed_missing_and_foreign_files(store: Path) -> None:
     tracks.write_bytes(data)
     next(store.rglob("ego-*.parquet")).unlink()
     (store / "notes.txt").write_text("x")
-    found = {problem.where.split("/")[-1]: problem for problem in check_store(store)}
+    found = {problem.where.split("/")[-1]: problem for problem in survey_store(store).problems}
     assert set(found) == {"tracks.parquet", "ego-ego.parquet", "notes.txt"}
     assert not found["notes.txt"].is_error
 
@@ -95,7 +95,7 @@ def test_check_names_what_is_implausible(
     recording.time_us[20] = recording.time_us[19]
     bad = dataclasses.replace(make_window("a", 0, 100), route=("1", "nowhere"))
     write_store(tmp_path / "s", road, recording, bad)
-    found = " | ".join(problem.what for problem in check_store(tmp_path / "s"))
+    found = " | ".join(problem.what for problem in survey_store(tmp_path / "s").problems)
     assert "time stamps do not increase" in found
     assert "pose is not finite" in found
     assert "'nowhere'" in found

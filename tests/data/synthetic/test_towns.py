@@ -9,7 +9,7 @@ from map_checks import check_map
 
 from shiftsim.data.maps.opendrive.map import build_road_map
 from shiftsim.data.maps.opendrive.reading import read_opendrive
-from shiftsim.data.store.check import check_store
+from shiftsim.data.store.check import survey_store
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.data.synthetic import recordings as town_recordings
@@ -53,7 +53,7 @@ def _files(store):
 def test_a_store_says_what_generated_it(store):
     assert store.generator == {"name": "towns", "seed": 5, "towns": 2}
     assert store.cities == ("town-5-001", "town-5-002")
-    assert [x for x in check_store(store.path) if x.is_error] == []
+    assert [x for x in survey_store(store.path).problems if x.is_error] == []
 
 
 def test_two_towns_give_many_scenarios_that_pass_the_filter(store):

@@ -20,7 +20,7 @@ from shiftsim.data.readers.motion import fitted_velocities
 from shiftsim.data.readers.scenarios import make_scenarios
 from shiftsim.data.readers.tracks.reader import TracksReader, convert_tracks
 from shiftsim.data.readers.tracks.table import read_tracks
-from shiftsim.data.store.check import check_store
+from shiftsim.data.store.check import survey_store
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import ConfigError, ConversionError
 
@@ -81,7 +81,7 @@ def test_a_table_gives_the_scenarios_of_the_same_recording_in_dsc3d(towns, town,
         np.testing.assert_allclose(a.ego[:, 2:], b.ego[:, 2:], rtol=0, atol=1e-7)
         shift = b.ego[0, :2] - a.ego[0, :2]
         np.testing.assert_allclose(a.ego[:, :2] + shift, b.ego[:, :2], rtol=0, atol=1e-6)
-    assert check_store(tmp_path / "own") == []
+    assert survey_store(tmp_path / "own").problems == []
 
 
 def test_the_order_of_rows_and_the_first_number_of_frames_do_not_matter(town, road, rng):
@@ -236,7 +236,7 @@ def test_a_recording_that_is_converted_again_takes_the_place_of_the_old_one(town
     store = open_store(tmp_path / "s")
     assert {store.window(token).ego for token in store.tokens} == {ego}
     assert len(store) == report.accepted
-    assert check_store(tmp_path / "s") == []
+    assert survey_store(tmp_path / "s").problems == []
     other = TracksReader(tmp_path / "t.csv", export_town(tmp_path, "junction")[1], city="map")
     other.diagnostics.errors.clear()
     with pytest.raises(ConversionError, match="another map named 'map'"):
