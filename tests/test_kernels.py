@@ -103,7 +103,7 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
     def convert_table() -> None:
         shutil.rmtree(folder / "own", ignore_errors=True)
         convert_tracks(TracksReader(table, town[1], city="roundabout"), folder / "own")
-        survey_store(folder / "own").problems
+        survey_store(folder / "own")
 
     def drive_edited() -> None:
         # agents that look where the ego will be: one of them is beside it, another one far ahead

@@ -306,7 +306,7 @@ def read_store(folder: Path) -> Any:
     from shiftsim.data.store.check import survey_store
     from shiftsim.data.store.reading import ScenarioStore
 
-    survey_store(folder).problems
+    survey_store(folder)
     store = ScenarioStore(folder)
     return [store.map(city) for city in store.cities], list(store), store.summary().to_pylist()
 
