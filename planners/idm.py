@@ -30,7 +30,6 @@ from shiftsim.planners.routes.graph import (
     Search,
     lane_at,
     lane_path,
-    lanes_of,
     search_levels,
     sub_path,
 )
@@ -100,7 +99,7 @@ def plan_route(
     Raises:
         PlannerError: The first two blocks of the route have no lanes.
     """
-    lanes = lanes_of(road, blocks[:2])
+    lanes = road.lanes_of(blocks[:2])
     if not lanes:
         raise PlannerError(
             f"idm: map {road.name!r} has no lanes in the first two roadblocks of the route",
@@ -108,12 +107,12 @@ def plan_route(
         )
     start = lane_at(road, np.array(lanes), center, vehicle.length, vehicle.width)
     skipped = 1 if int(road.block_of[start]) == blocks[1] else 0
-    allowed = set(lanes_of(road, blocks))
+    allowed = set(road.lanes_of(blocks))
     # nuPlan rule 152: the goal must lie exactly as deep as the route is long
     return search_levels(
         lambda lane: [after for after in road.outgoing.at(lane).tolist() if after in allowed],
         start,
-        set(lanes_of(road, blocks[-1:])),
+        set(road.lanes_of(blocks[-1:])),
         len(blocks) - skipped,
         only_last=True,
     )
@@ -186,7 +185,7 @@ class Idm:
         """
         self._scene = scene
         self._blocks = route_blocks(scene.map, scene.route, scene.token)
-        self._lights = LightWatch(scene.map, lanes_of(scene.map, self._blocks))
+        self._lights = LightWatch(scene.map, scene.map.lanes_of(self._blocks))
         self.route_plan = self.path = None
 
     def plan(self, observation: Observation) -> Trajectory:

@@ -27,6 +27,7 @@ import numpy as np
 
 _KINDS = "biuf"  # of arrays that can be sent
 LONGEST = 2**30  # bytes of a part of a message
+_ALONE = "in an interpreter of the planner's own (with --isolate alone it runs in that of shiftsim)"
 
 
 def write(connection: Any, value: Any) -> None:
@@ -90,7 +91,8 @@ class Record:
     """Named values."""
 
     def __getattr__(self, name: str) -> Any:
-        raise AttributeError(f"there is no {name!r}; there are: {', '.join(self.__dict__)}")
+        there = ", ".join(self.__dict__)
+        raise AttributeError(f"there is no {name!r} {_ALONE}; there are: {there}")
 
     def __init__(self, **values: Any) -> None:
         self.__dict__.update(values)
@@ -166,6 +168,8 @@ class _Folder:
         self.found: Any = set()
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> Any:
+        if name.startswith("shiftsim."):
+            raise ModuleNotFoundError(f"there is no module {name!r} {_ALONE}", name=name)
         frame: Any = sys._getframe(1)
         while frame and frame.f_globals.get("__name__", "").startswith("importlib."):
             frame = frame.f_back
@@ -181,7 +185,8 @@ class _Folder:
 def _alone(hello: Any) -> Any:
     """What makes planners, the classes of records, and the fingerprint, without shiftsim."""
     ours: Any = types.ModuleType("shiftsim")
-    ours.Trajectory, ours.Command = Trajectory, Command
+    ours.Trajectory, ours.Command, ours.__path__ = Trajectory, Command, []
+    ours.__getattr__ = Record(Trajectory=Trajectory, Command=Command).__getattr__
     sys.modules["shiftsim"] = ours
     module_name, _, name = hello["spec"].rpartition(":")
     folder, file = os.path.split(module_name) if module_name.endswith(".py") else ("", module_name)

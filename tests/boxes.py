@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from shiftsim.geometry.boxes import boxes_to_corners, wrap_angles
+from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.rings import convex_intersect
 from shiftsim.kernels import kernel
 
@@ -18,12 +18,3 @@ def _pairs_intersect(a, b):
     for index in range(len(a)):
         out[index] = convex_intersect(a[index], b[index])
     return out
-
-
-def to_frame(poses, origin):
-    """Poses (..., 3) of the map frame expressed in the frame of the pose `origin` (3,)."""
-    cos, sin = np.cos(origin[2]), np.sin(origin[2])
-    dx, dy = poses[..., 0] - origin[0], poses[..., 1] - origin[1]
-    return np.stack(
-        [cos * dx + sin * dy, -sin * dx + cos * dy, wrap_angles(poses[..., 2] - origin[2])], -1
-    )

@@ -1,9 +1,9 @@
 """What networks are tried on, and how their plans are looked at."""
 
 import numpy as np
-from boxes import to_frame
 from worlds import standing_tracks
 
+from shiftsim.geometry.boxes import to_frame
 from shiftsim.sim.loop import Rollout
 from shiftsim.sim.planner import observe_log, scene_info
 from shiftsim.world.state import AgentKind

@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from shiftsim.geometry.boxes import turned
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
-from shiftsim.sim.planner import History, SceneInfo
+from shiftsim.sim.planner import History
 from shiftsim.world.state import (
     AY,
     HEADING,
@@ -30,12 +31,6 @@ _SLOPE = _WINDOW / 10.0
 _BEND = (_WINDOW**2 - 2.0) / 7.0
 
 NO_ROUTE = "the scenario has no route on the map"
-
-
-def route_blocks(scene: SceneInfo) -> list[int]:
-    """Blocks of the scenario's route, each once; those that the map does not have are left out."""
-    index = scene.map.blocks.index
-    return [index[name] for name in dict.fromkeys(scene.route) if name in index]
 
 
 def short_history(count: int) -> str:
@@ -93,13 +88,6 @@ def agent_features(history: History, center: FloatArray, max_agents: int) -> Age
         valid=filled(seen, np.bool_),
         category=category,
     )
-
-
-def turned(vectors: FloatArray, heading: float) -> FloatArray:
-    """Vectors (..., 2) in a frame that is turned to a heading [rad]: forward and left."""
-    cos, sin = np.cos(heading), np.sin(heading)
-    x, y = vectors[..., 0], vectors[..., 1]
-    return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
 
 
 def _nearest_agents(tracks: Tracks, center: FloatArray, count: int) -> IntArray:

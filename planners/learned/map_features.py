@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
+from shiftsim.geometry.boxes import turned
 from shiftsim.geometry.polylines import point_on_polyline
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.planners.learned.features import turned
 from shiftsim.planners.per_map import PerMap
 from shiftsim.world.layers import Polylines, meeting, square_around
 from shiftsim.world.map import NONE, VectorMap

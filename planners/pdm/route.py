@@ -16,7 +16,6 @@ from shiftsim.planners.routes.graph import (
     Search,
     deviation,
     lane_at,
-    lanes_of,
     search_cheapest,
 )
 from shiftsim.world.layers import square_around
@@ -46,7 +45,7 @@ def start_route(road: VectorMap, ids: Sequence[str], ego: FloatArray, token: str
     square = square_around(float(ego[0]), float(ego[1]), START_HALF_WIDTH)
     start = find_start(road, blocks, ego[:3], square)
     corrected = list(dict.fromkeys(correct_route(road, blocks, start)))
-    lanes = lanes_of(road, corrected)
+    lanes = road.lanes_of(corrected)
     if not lanes:
         raise PlannerError(f"pdm-closed: the route of scenario {token!r} has no lanes", hint=HINT)
     return Route(start, corrected, np.array(lanes), make_areas(road, lanes))
@@ -104,7 +103,7 @@ def follow_route(road: VectorMap, route: list[int], current: int) -> Search:
     # nuPlan rule 197: a lane whose block is not on the route starts at its first block
     start = route.index(block) if block in route else 0
     goal = route[start : start + SEARCH_DEPTH][-1]
-    allowed = set(lanes_of(road, route))
+    allowed = set(road.lanes_of(route))
     return search_cheapest(
         current,
         lambda lane: [after for after in road.outgoing.at(lane).tolist() if after in allowed],

@@ -106,11 +106,6 @@ def _ancestry(parent: dict[int, int], lane: int) -> list[int]:
     return path[::-1]
 
 
-def lanes_of(road: VectorMap, blocks: Iterable[int]) -> list[int]:
-    """Lanes and connectors of blocks, in their order; blocks that are NONE are passed over."""
-    return [e for block in blocks if block != NONE for e in road.block_edges.at(block).tolist()]
-
-
 @kernel
 def deviation(
     baselines: Polylines, lane: int, stride: int, x: float, y: float, heading: float

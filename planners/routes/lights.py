@@ -7,7 +7,7 @@ import numpy as np
 
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.map import VectorMap
-from shiftsim.world.state import LightStatus, TrafficLights
+from shiftsim.world.state import TrafficLights
 
 
 class RedLights(NamedTuple):
@@ -38,10 +38,8 @@ class LightWatch:
 
 def red_lanes(road: VectorMap, lights: TrafficLights) -> list[int]:
     """Lanes and connectors of the map whose light is red in one row, in the order of the lights."""
-    # nuPlan rule 429: one red entry is enough, whatever else is listed
-    names, index = lights.connector_ids, road.edges.index
-    red = np.flatnonzero(lights.status[0] == LightStatus.RED).tolist()
-    return [index[names[i]] for i in red if names[i] in index]
+    index = road.edges.index
+    return [index[name] for name in lights.red(0) if name in index]
 
 
 def red_lights(lanes: list[int], rings: Sequence[FloatArray]) -> RedLights:

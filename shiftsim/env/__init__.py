@@ -12,6 +12,9 @@ except ModuleNotFoundError as error:
         "the environment needs gymnasium", hint='pip install "shiftsim[gym]"'
     ) from error
 
+from shiftsim.env.raster import raster_observation as raster_observation
+from shiftsim.env.vector import vector_observation as vector_observation
+
 ID = "shiftsim/Driving-v0"
 
 if ID not in registry:

@@ -67,6 +67,11 @@ class Episode:
         return self._rollout.iteration + 1 == self._rollout.num_samples
 
     @property
+    def last_command(self) -> np.ndarray:
+        """(2,) the last action where actions are commands, else zeros."""
+        return self.action if self.action.shape == (2,) else np.zeros(2, np.float32)
+
+    @property
     def infraction(self) -> str:
         """`off_road`, `collision`, or empty: what the last step did wrong."""
         return self.terms.infraction

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import Space, spaces
+from numpy.typing import ArrayLike
 
 from shiftsim.env.episode import Episode
 from shiftsim.kernels import BoolArray
@@ -11,9 +12,9 @@ from shiftsim.planners.learned.carl import view
 from shiftsim.planners.learned.carl.planner import draw, measure
 from shiftsim.planners.learned.carl.raster import Raster
 from shiftsim.planners.learned.carl.roads import make_roads
-from shiftsim.planners.learned.features import route_blocks
 from shiftsim.planners.learned.map_features import LightLookup
 from shiftsim.planners.per_map import PerMap
+from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.state import LightStatus
 
 LARGEST = 1e4  # of a measurement, in its unit; none comes near
@@ -31,11 +32,40 @@ _COLOURS = {  # red, green, blue by channel; what is drawn first lies below
 _roads = PerMap(make_roads)  # of all environments of a process
 
 
-class RasterObserver:
-    """CaRL's raster and measurements, and what only its critic sees.
+class RasterBuilder:
+    """CaRL's raster in one scenario. The route is drawn as the scenario gives it."""
 
-    The route is drawn as the scenario gives it.
+    def __init__(self, scene: SceneInfo) -> None:
+        """Rasterize the map."""
+        self._roads = _roads(scene.map)
+        self._on_route: BoolArray = np.zeros(len(scene.map.blocks), np.bool_)
+        self._on_route[scene.route_blocks] = True
+        self._lights = LightLookup(scene.map, LightStatus.ABSENT)
+
+    def draw(self, observation: Observation) -> Raster:
+        """The raster (9, 256, 256) of an observation."""
+        ego, tracks = observation.history.ego[-1].copy(), observation.history.tracks
+        raster, status = np.zeros(SHAPE, np.uint8), self._lights.at(observation.lights)
+        draw(raster, self._roads, ego, tracks, -1, self._on_route, status)
+        return raster
+
+
+def raster_observation(
+    scene: SceneInfo, observation: Observation, action: ArrayLike = (0.0, 0.0)
+) -> dict[str, Any]:
+    """What a policy of `observation="raster"` sees; `action` (2,) is the last one.
+
+    All but the `value_measurements`, which only a critic reads.
     """
+    last = np.asarray(action, np.float32)
+    return {
+        "raster": scene.once(RasterBuilder).draw(observation),
+        "measurements": measure(observation.history.ego[-1], last).astype(np.float32),
+    }
+
+
+class RasterObserver:
+    """CaRL's raster and measurements, and what only its critic sees."""
 
     space: Space[Any] = spaces.Dict(
         {
@@ -47,38 +77,20 @@ class RasterObserver:
     )
 
     def start(self, episode: Episode) -> None:
-        """Rasterize the map."""
-        scene = episode.scene
-        self._roads = _roads(scene.map)
-        self._on_route: BoolArray = np.zeros(len(scene.map.blocks), np.bool_)
-        self._on_route[route_blocks(scene)] = True
-        self._lights = LightLookup(scene.map, LightStatus.ABSENT)
-
-    def draw(self, episode: Episode) -> Raster:
-        """The present raster (9, 256, 256)."""
-        log, row, raster = episode.log, episode.iteration, np.zeros(SHAPE, np.uint8)
-        status = self._lights.at(log.traffic_lights.rows(slice(row, row + 1)))
-        draw(raster, self._roads, log.ego[row], log.tracks, row, self._on_route, status)
-        return raster
+        """Nothing to prepare: what there is, the scene keeps."""
 
     def look(self, episode: Episode) -> dict[str, Any]:
         """The present raster and measurements."""
-        row, terms = episode.iteration, episode.terms
-        action = episode.action if episode.action.shape == (2,) else np.zeros(2, np.float32)
-        time_left = 1.0 - row / episode.scenario.num_iterations
+        terms = episode.terms
+        time_left = 1.0 - episode.iteration / episode.scenario.num_iterations
         critic = np.array([time_left, 1.0 - terms.completion, terms.comfort, terms.ttc], np.float32)
-        return {
-            "raster": self.draw(episode),
-            "measurements": measure(episode.log.ego[row], action).astype(np.float32),
-            "value_measurements": critic,
-        }
+        seen = raster_observation(episode.scene, episode.observe(), episode.last_command)
+        return seen | {"value_measurements": critic}
 
 
 def picture_of(episode: Episode) -> np.ndarray:
     """(256, 256, 3) uint8, driving to the right, left is up."""
-    observer = RasterObserver()
-    observer.start(episode)
-    raster = observer.draw(episode)
+    raster = episode.scene.once(RasterBuilder).draw(episode.observe())
     picture = np.full((view.SIZE, view.SIZE, 3), 245, np.uint8)
     for channel, colour in _COLOURS.items():
         picture[raster[channel, ::-1] > 0] = colour

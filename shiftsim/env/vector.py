@@ -9,16 +9,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import Space, spaces
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from shiftsim.env.episode import Episode
-from shiftsim.env.terms import EpisodeState
 from shiftsim.geometry.polylines import arc_lengths, point_on_polyline, project_on_polyline
-from shiftsim.kernels import FloatArray, IntArray, kernel
-from shiftsim.planners.learned.features import route_blocks
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.learned.map_features import LightLookup
-from shiftsim.planners.routes.graph import lane_at, lanes_of
-from shiftsim.sim.planner import SceneInfo
+from shiftsim.planners.routes.graph import lane_at
+from shiftsim.sim.planner import Observation, SceneInfo
+from shiftsim.world.layers import Polylines
 from shiftsim.world.state import (
     LAST_AGENT_KIND,
     PACIFICA,
@@ -74,29 +73,77 @@ class Route(NamedTuple):
     indices: IntArray  # (16,) scratch: of what
 
 
+class Around(NamedTuple):
+    """What is around the ego, as the kernel reads it. N tracks, E lanes and connectors."""
+
+    valid: BoolArray  # (N,)
+    poses: FloatArray  # (N, 3)
+    velocities: FloatArray  # (N, 2)
+    sizes: FloatArray  # (N, 2)
+    kinds: IntArray  # (N,) AgentKind codes
+    baselines: Polylines
+    bounds: FloatArray  # (E, 4) [m]
+    limits: FloatArray  # (E,) [m/s], NaN where the map has none
+    on_route: BoolArray  # (E,)
+    status: IntArray  # (E,) LightStatus
+
+
+class VectorBuilder:
+    """The compact observation in one scenario."""
+
+    def __init__(self, scene: SceneInfo) -> None:
+        """Find the route's lanes; the line along them begins at the first observation."""
+        self._scene, self._route = scene, None
+        on_route = np.zeros(len(scene.map.blocks) + 1, np.bool_)  # the last: edges without block
+        on_route[scene.route_blocks] = True
+        self._on_route: BoolArray = on_route[scene.map.block_of]
+        self._lights = LightLookup(scene.map, LightStatus.ABSENT, ranked=(LightStatus.RED,))
+
+    def at(self, observation: Observation, action: ArrayLike) -> Values:
+        """The parts of `Seen`, one after the other; `action` (2,) is the last one."""
+        road, ego, tracks = self._scene.map, observation.history.ego[-1], observation.history.tracks
+        route = self._route = self._route or self._start(ego)
+        arrays = (tracks.valid, tracks.poses, tracks.velocities, tracks.sizes)
+        around = Around(
+            *(np.array(array[-1]) for array in arrays),
+            np.array(tracks.kinds),
+            road.baselines,
+            road.edges.polygons.bounds,
+            road.speed_limits,
+            self._on_route,
+            self._lights.at(observation.lights),
+        )
+        values = np.zeros(SIZE, np.float32)
+        seen = parts_of(values)
+        _write_observation(around, route, np.array(ego), seen)
+        seen.ego[7:] = action
+        return values
+
+    def _start(self, ego: FloatArray) -> Route:
+        scene = self._scene
+        line = route_line(scene, scene.route_blocks, center_poses(ego[:3]))
+        arc, most = arc_lengths(line, np.array([0, len(line)])), max(TRACKS, LANES)
+        return Route(line, arc, np.zeros(most), np.zeros(most, np.int64))
+
+
+def vector_observation(
+    scene: SceneInfo, observation: Observation, action: ArrayLike = (0.0, 0.0)
+) -> Values:
+    """(345,) what a policy of `observation="vector"` sees; `action` (2,) is the last one."""
+    return scene.once(VectorBuilder).at(observation, action)
+
+
 class VectorObserver:
     """The compact observation: the parts of `Seen`, one after the other."""
 
     space: Space[Any] = spaces.Box(-LARGEST, LARGEST, (SIZE,))
 
     def start(self, episode: Episode) -> None:
-        """Find the route's lanes."""
-        scene, center = episode.scene, center_poses(episode.log.ego[0, :3])
-        line = route_line(scene, route_blocks(scene), center)
-        arc, most = arc_lengths(line, np.array([0, len(line)])), max(TRACKS, LANES)
-        self._route = Route(line, arc, np.zeros(most), np.zeros(most, np.int64))
-        self._lights = LightLookup(scene.map, LightStatus.ABSENT, ranked=(LightStatus.RED,))
+        """Nothing to prepare: what there is, the scene keeps."""
 
     def look(self, episode: Episode) -> Values:
         """The present observation."""
-        row = episode.iteration
-        status = self._lights.at(episode.log.traffic_lights.rows(slice(row, row + 1)))
-        values = np.zeros(SIZE, np.float32)
-        seen = parts_of(values)
-        _write_observation(episode.state, self._route, row, status, seen)
-        if episode.action.shape == (2,):
-            seen.ego[7:] = episode.action
-        return values
+        return vector_observation(episode.scene, episode.observe(), episode.last_command)
 
 
 def route_line(scene: SceneInfo, blocks: list[int], center: FloatArray) -> FloatArray:
@@ -105,7 +152,7 @@ def route_line(scene: SceneInfo, blocks: list[int], center: FloatArray) -> Float
     It goes on in the lane of the next block that begins nearest to its end.
     """
     road, size = scene.map, scene.vehicle
-    lanes = lanes_of(road, blocks)
+    lanes = road.lanes_of(blocks)
     if not lanes:
         ahead = 1e3 * np.array([np.cos(center[2]), np.sin(center[2])])
         return np.stack([center[:2], center[:2] + ahead])
@@ -118,11 +165,8 @@ def route_line(scene: SceneInfo, blocks: list[int], center: FloatArray) -> Float
 
 
 @kernel
-def _write_observation(
-    episode: EpisodeState, route: Route, row: int, status: IntArray, seen: Seen
-) -> None:
-    """Write one observation into zeros."""
-    ego = episode.ego[row]
+def _write_observation(around: Around, route: Route, ego: FloatArray, seen: Seen) -> None:
+    """Write one observation of an ego in a state (11,) into zeros."""
     cos, sin = np.cos(ego[2]), np.sin(ego[2])
     x, y = ego[0] + _TO_CENTER * cos, ego[1] + _TO_CENTER * sin
     seen.ego[0] = _clip(ego[3] / SPEED)
@@ -135,24 +179,24 @@ def _write_observation(
         px, py = point_on_polyline(route.xy, route.arc, 0, last, start + point * ROUTE_STEP)
         _write_vector(px - x, py - y, cos, sin, METRES, seen.route[point])
     count = 0
-    for track in range(len(episode.kinds)):
-        if episode.valid[row, track]:
-            dx, dy = episode.poses[row, track, 0] - x, episode.poses[row, track, 1] - y
+    for track in range(len(around.kinds)):
+        if around.valid[track]:
+            dx, dy = around.poses[track, 0] - x, around.poses[track, 1] - y
             count = _insert_nearest(route, count, TRACKS, np.hypot(dx, dy), track)
     for place in range(count):
         track, line = route.indices[place], seen.tracks[place]
-        pose, size = episode.poses[row, track], episode.sizes[row, track]
+        pose, size = around.poses[track], around.sizes[track]
         line[0] = 1.0
         _write_vector(pose[0] - x, pose[1] - y, cos, sin, METRES, line[1:3])
         _write_vector(np.cos(pose[2]), np.sin(pose[2]), cos, sin, 1.0, line[3:5])
-        if episode.kinds[track] <= _LAST_AGENT:
-            velocity = episode.velocities[row, track]
+        if around.kinds[track] <= _LAST_AGENT:
+            velocity = around.velocities[track]
             _write_vector(velocity[0], velocity[1], cos, sin, SPEED, line[5:7])
-            line[9] = 0.0 if episode.kinds[track] == _VEHICLE else 1.0
+            line[9] = 0.0 if around.kinds[track] == _VEHICLE else 1.0
         else:
             line[10] = 1.0
         line[7], line[8] = _clip(size[0] / METRES), _clip(size[1] / METRES)
-    bounds, lines, count = episode.edges.bounds, episode.baselines, 0
+    bounds, lines, count = around.bounds, around.baselines, 0
     for edge in range(len(bounds)):
         dx = max(bounds[edge, 0] - x, 0.0, x - bounds[edge, 2])
         dy = max(bounds[edge, 1] - y, 0.0, y - bounds[edge, 3])
@@ -166,11 +210,11 @@ def _write_observation(
                 count = _insert_nearest(route, count, LANES, distance, edge)
     for place in range(count):
         edge, line = route.indices[place], seen.lanes[place]
-        limit = episode.limits[edge]
+        limit = around.limits[edge]
         line[0] = 1.0
-        line[1] = 1.0 if episode.edge_on_route[edge] else 0.0
+        line[1] = 1.0 if around.on_route[edge] else 0.0
         line[2] = 0.0 if np.isnan(limit) else _clip(limit / SPEED)
-        line[3] = 1.0 if status[edge] == _RED else 0.0
+        line[3] = 1.0 if around.status[edge] == _RED else 0.0
         first, stop = lines.ptr[edge], lines.ptr[edge + 1]
         along = project_on_polyline(lines.xy, lines.arc, first, stop, x, y)
         for point in range(LANE_POINTS):

@@ -151,3 +151,16 @@ def from_frame(poses: FloatArray, origin: FloatArray) -> FloatArray:
         ],
         -1,
     )
+
+
+def to_frame(poses: FloatArray, origin: FloatArray) -> FloatArray:
+    """Poses (..., 3) of the map frame expressed in the frame of the pose `origin` (3,)."""
+    xy = turned(poses[..., :2] - origin[:2], origin[2])
+    return np.concatenate([xy, wrap_angles(poses[..., 2:] - origin[2])], axis=-1)
+
+
+def turned(vectors: FloatArray, heading: float) -> FloatArray:
+    """Vectors (..., 2) in a frame that is turned to a heading [rad]: forward and left."""
+    cos, sin = np.cos(heading), np.sin(heading)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)

@@ -198,3 +198,58 @@ def window(path: Path, low: float, high: float) -> tuple[int, int]:
     first = int(np.searchsorted(path.progress, min(max(low, 0.0), end)))
     last = int(np.searchsorted(path.progress, min(max(high, 0.0), end), side="right"))
     return first, max(first, last)
+
+
+@kernel
+def write_frenet(
+    poses: FloatArray,  # (K, 3) vertices and their headings
+    ahead: FloatArray,  # (K, 2) unit vectors along the headings
+    arc: FloatArray,  # (K,) arc length at each of them, strictly increasing [m]
+    points: FloatArray,  # (P, 2) [m]
+    out: FloatArray,  # (P, 3) written: arc length, offset to the left [m], heading [rad]
+) -> None:
+    """Where points lie along and beside a line, the nearest place where several would do.
+
+    Between two vertices the heading turns with the blend of their unit vectors, so that a point
+    within the radius of a bend has one place only. Beyond its ends the line goes straight on.
+    """
+    last = len(arc) - 1
+    for point in range(len(points)):
+        least, before = np.inf, 0.0
+        for vertex in range(last + 1):
+            dx, dy = points[point, 0] - poses[vertex, 0], points[point, 1] - poses[vertex, 1]
+            tx, ty = ahead[vertex, 0], ahead[vertex, 1]
+            along, across = dx * tx + dy * ty, dy * tx - dx * ty
+            if (vertex == 0 and along < 0.0) or (vertex == last and along > 0.0):
+                distance = np.hypot(dx, dy)
+                if distance < least:
+                    least = distance
+                    out[point, 0], out[point, 1] = arc[vertex] + along, across
+                    out[point, 2] = poses[vertex, 2]
+            if vertex > 0 and along <= 0.0 <= before:
+                found = _foot(poses, ahead, vertex, points[point, 0], points[point, 1])
+                if abs(found[1]) < least:
+                    least = abs(found[1])
+                    out[point, 0] = arc[vertex - 1] + found[0] * (arc[vertex] - arc[vertex - 1])
+                    out[point, 1], out[point, 2] = found[1], found[2]
+            before = along
+
+
+@kernel
+def _foot(
+    poses: FloatArray, ahead: FloatArray, vertex: int, x: float, y: float
+) -> tuple[float, float, float]:
+    """Where the step to a vertex has a point right beside it: share of it, offset, heading."""
+    ax, ay = poses[vertex - 1, 0], poses[vertex - 1, 1]
+    tx, ty = ahead[vertex - 1, 0], ahead[vertex - 1, 1]
+    ex, ey = poses[vertex, 0] - ax, poses[vertex, 1] - ay
+    ux, uy = ahead[vertex, 0] - tx, ahead[vertex, 1] - ty
+    qx, qy = x - ax, y - ay
+    # (q - w e) (t + w u) = 0 for the share w: a w^2 + b w + c = 0, falling from c >= 0
+    a, b, c = -(ex * ux + ey * uy), qx * ux + qy * uy - ex * tx - ey * ty, qx * tx + qy * ty
+    root = np.sqrt(max(b * b - 4.0 * a * c, 0.0))
+    share = min(max(2.0 * c / (root - b), 0.0), 1.0) if root > b else 0.0
+    nx, ny = tx + share * ux, ty + share * uy
+    size = np.hypot(nx, ny)
+    across = ((qy - share * ey) * nx - (qx - share * ex) * ny) / size
+    return share, across, np.arctan2(ny, nx)

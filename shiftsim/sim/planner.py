@@ -3,13 +3,15 @@
 A planner is any object with `reset(scene)` and `plan(observation)`; nothing needs to be subclassed.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
+from shiftsim.geometry.boxes import to_frame, turned
 from shiftsim.kernels import FloatArray, IntArray, readonly
+from shiftsim.world.line import Lead, Line, RedLight, find_lead, next_red, route_line
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import (
@@ -25,6 +27,7 @@ from shiftsim.world.state import (
 
 # nuPlan rule 10: 2.1 s and the present, not 2.0 s
 HISTORY_SAMPLES = 22
+Made = TypeVar("Made")
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,11 +46,12 @@ class SceneInfo:
         seed: Seed of the task; what a planner samples is keyed with it and the token.
         expert: The whole recording, future included; None unless the planner declares with
             `sees_recording = True` that it looks at it.
+        start: (3,) rear axle at the first iteration x [m], y [m], heading [rad], or None.
 
     Example:
         ```python
         def reset(self, scene: shiftsim.SceneInfo):
-            self.lanes = [scene.map.blocks.index[name] for name in scene.route]
+            self.line = scene.route_line()  # poses, arc, speed_limits, …
         ```
     """
 
@@ -61,12 +65,47 @@ class SceneInfo:
     vehicle: VehicleParameters = PACIFICA
     seed: int = 0
     expert: Scenario | None = None
+    start: FloatArray | None = None
+    _made: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __repr__(self) -> str:
         return (
             f"<SceneInfo {self.token}: map {self.map.name}, route of {len(self.route)} roadblocks, "
             f"{len(self.times)} iterations of {self.dt:.1f} s>"
         )
+
+    @property
+    def route_blocks(self) -> list[int]:
+        """Blocks of the route, each once; those that the map does not have are left out."""
+        index = self.map.blocks.index
+        return [index[name] for name in dict.fromkeys(self.route) if name in index]
+
+    @property
+    def route_lanes(self) -> list[int]:
+        """Lanes and connectors of the route as edges of the map, block by block."""
+        return self.map.lanes_of(self.route_blocks)
+
+    def route_line(self, pose: FloatArray | None = None) -> Line:
+        """The route as one centre line, from the lane under a pose on.
+
+        Where that lane does not lead on along the route, the line moves to one that does; behind
+        the route it goes straight on for 200 m, as far as there are lanes.
+
+        Args:
+            pose: (3,) rear axle x [m], y [m], heading [rad]; where the scenario begins if None.
+
+        Raises:
+            MapError: There is no lane to begin in.
+        """
+        given = self.start if pose is None else pose
+        return route_line(self.map, self.route_blocks, given, self.vehicle)
+
+    def once(self, make: "Callable[[SceneInfo], Made]") -> Made:
+        """What `make(scene)` returns, made when it is first asked for and then kept."""
+        if make not in self._made:
+            self._made[make] = make(self)
+        made: Made = self._made[make]
+        return made
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +161,24 @@ class Observation:
     def traffic_lights(self) -> dict[str, LightStatus]:
         """Status of the listed lane connectors; the last one where one is listed with several."""
         return self.lights.at(0)
+
+    def lead(self, line: Line) -> Lead | None:
+        """The nearest box in the corridor of our width along a line: gap, speed, token; or None.
+
+        The gap [m] runs along the line from our front bumper to the box.
+        """
+        return find_lead(line, self.ego.pose, self.history.tracks)
+
+    def lights_on(self, line: Line) -> RedLight | None:
+        """The next red light on a line, or None: gap from our front bumper [m], connector."""
+        return next_red(line, self.ego.pose, self.lights)
+
+    def in_ego_frame(self) -> Tracks:
+        """The present tracks as the rear axle sees them, x ahead and y to the left (one row)."""
+        tracks, pose = self.tracks, self.ego.pose
+        seen = tracks.select(tracks.valid[0])
+        velocities = turned(seen.velocities, pose[2])
+        return replace(seen, poses=to_frame(seen.poses, pose), velocities=velocities)
 
 
 @runtime_checkable
@@ -190,6 +247,7 @@ def scene_info(scenario: Scenario, seed: int = 0, planner: object = None) -> Sce
         log_name=scenario.log_name,
         seed=seed,
         expert=scenario if sees_recording(planner) else None,
+        start=readonly(scenario.ego[scenario.iteration_rows[0], :3]),
     )
 
 

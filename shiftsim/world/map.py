@@ -5,7 +5,7 @@ order of the source tables), so that one integer names a piece of road everywher
 for roadblocks and roadblock connectors (*blocks*). Ids are strings at the boundary only.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields
 
 import numpy as np
@@ -143,6 +143,10 @@ class VectorMap:
     def is_connector(self, edge: int) -> bool:
         """Whether an edge is a lane connector."""
         return edge >= self.num_lanes
+
+    def lanes_of(self, blocks: Iterable[int]) -> list[int]:
+        """Lanes and connectors of blocks, in their order; blocks that are NONE are passed over."""
+        return [e for block in blocks if block != NONE for e in self.block_edges.at(block).tolist()]
 
     def lanes_at(self, x: float, y: float) -> list[int]:
         """Lanes that hold a point in their interior."""

@@ -217,6 +217,12 @@ class TrafficLights:
             if code != LightStatus.ABSENT
         ]
 
+    def red(self, row: int) -> list[str]:
+        """Connector ids with a red light in one row, in the order of the columns."""
+        # nuPlan rule 429: one red entry is enough, whatever else is listed
+        red = np.flatnonzero(self.status[row] == LightStatus.RED).tolist()
+        return [self.connector_ids[column] for column in red]
+
     def at(self, row: int) -> dict[str, LightStatus]:
         """Status by connector id, of the connectors listed in one row; the last where several."""
         return dict(self.listed(row))

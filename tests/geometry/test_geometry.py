@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import shapely
-from boxes import boxes_intersect, to_frame
+from boxes import boxes_intersect
 from hypothesis import given
 from strategies import OFFSETS, angles, rigid_motions, seeds
 
@@ -201,7 +201,7 @@ def test_corners_of_boxes_in_an_array_of_any_shape_are_those_of_each(rng, shape,
 def test_frames_are_inverse_to_each_other(heading, motion):
     origin = np.array([motion[1], motion[2], motion[0]])
     poses = np.array([[3.0, -4.0, heading], [motion[2], motion[1], 0.5]])
-    back = to_frame(boxes.from_frame(poses, origin), origin)
+    back = boxes.to_frame(boxes.from_frame(poses, origin), origin)
     np.testing.assert_allclose(back[:, :2], poses[:, :2], atol=1e-9)
     assert np.abs(boxes.wrap_angles(back[:, 2] - poses[:, 2])).max() < 1e-9
 

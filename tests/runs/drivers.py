@@ -196,6 +196,23 @@ class Remembers(ConstantVelocity):
         return plan
 
 
+class FollowsItsRoute(ConstantVelocity):
+    """Drives along the line of its route, slower the nearer the lead or a red light is."""
+
+    def reset(self, scene):
+        self.line = scene.route_line()
+
+    def plan(self, observation):
+        times, line = np.arange(41) * 0.1, self.line
+        stops = [
+            ahead.gap for ahead in (observation.lead(line), observation.lights_on(line)) if ahead
+        ]
+        speed = min([*stops, 8.0, 1.0 + len(observation.in_ego_frame().tokens)])
+        s, d, _ = line.to_frenet(observation.ego.pose)
+        poses = line.to_poses(np.c_[s + speed * times, np.full(41, d)])
+        return Trajectory.from_poses(times, poses)
+
+
 class RemembersInItsClass(ConstantVelocity):
     """Plans by how many scenarios were driven in this process: no copy helps, one alone is fine."""
 

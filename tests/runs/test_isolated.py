@@ -39,7 +39,10 @@ def test_isolated_planners_give_the_same_bytes(workers, toy, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("planner", ["idm", pytest.param("pdm-closed", marks=pytest.mark.thorough)])
+@pytest.mark.parametrize(
+    "planner",
+    ["drivers:FollowsItsRoute", "idm", pytest.param("pdm-closed", marks=pytest.mark.thorough)],
+)
 def test_planners_that_read_the_map_give_the_same_bytes(planner, toy, tmp_path):
     settings = {"noise": ["none", "ou-high"], "limit": 2}
     plain = drive(toy, tmp_path / "plain", planner, **settings)
@@ -146,6 +149,32 @@ def test_another_interpreter_needs_numpy_and_nothing_of_ours(
     )
     assert there.is_complete, there.tasks.to_pylist()
     assert same_results(here, there) == [True, True]
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        (
+            "observation",
+            "AttributeError: there is no 'lead' in an interpreter of the planner's own",
+        ),
+        ("module", "AttributeError: there is no 'simulate' in an interpreter of the planner's own"),
+        ("env", "ModuleNotFoundError: there is no module 'shiftsim.env' in an interpreter"),
+    ],
+)
+def test_what_another_interpreter_lacks_is_named(
+    what, message, interpreter, toy, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(FOLDER)
+    run = drive(
+        *(toy, tmp_path / "run", "foreign:Asks"),
+        planner_args={"foreign:Asks": {"what": what}},
+        planner_python=interpreter,
+        limit=1,
+    )
+    (task,) = run.tasks.to_pylist()
+    assert task["error"].startswith(message)
+    assert "with --isolate alone it runs in that of shiftsim" in task["error"]
 
 
 def test_another_interpreter_that_is_none_is_named(toy, tmp_path):

@@ -19,7 +19,6 @@ from shiftsim.planners.learned.carl.raster import Raster
 from shiftsim.planners.learned.carl.roads import MAX_SPEED, Roads, level, make_roads
 from shiftsim.planners.learned.checkpoint import load_network, split_ensemble
 from shiftsim.planners.learned.device import resolve_device
-from shiftsim.planners.learned.features import route_blocks
 from shiftsim.planners.learned.map_features import LightLookup
 from shiftsim.planners.per_map import PerMap
 from shiftsim.planners.routes.correction import correct_route, find_start
@@ -104,7 +103,7 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
 
     def _start(self, scene: SceneInfo, ego: FloatArray, center: FloatArray) -> BoolArray:
         """Correct the route, once per scenario; (B,) the blocks on it."""
-        road, known = scene.map, route_blocks(scene)
+        road, known = scene.map, scene.route_blocks
         if not known:
             self._route_flaw = "the map has no block of the route"
         elif len(known) < len(set(scene.route)):

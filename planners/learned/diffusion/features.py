@@ -12,8 +12,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from shiftsim.geometry.boxes import turned
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.planners.learned.features import route_blocks, turned
 from shiftsim.planners.learned.map_features import LightLookup, resample
 from shiftsim.planners.routes.correction import RouteCorrector
 from shiftsim.sim.planner import Observation, SceneInfo
@@ -108,7 +108,7 @@ class FeatureBuilder:
 
     def __init__(self, scene: SceneInfo, lanes: LaneLines) -> None:
         self._road, self._lanes = scene.map, lanes
-        blocks = route_blocks(scene)
+        blocks = scene.route_blocks
         self._corrector = RouteCorrector(scene.map, blocks, START_SQUARE) if blocks else None
         self._lights = LightLookup(scene.map, ranked=_RANKED)
 

@@ -21,7 +21,6 @@ from shiftsim.planners.learned.features import (
     map_poses,
     plan_of_poses,
     poses_of,
-    route_blocks,
     short_history,
     stack_scenes,
     straight_on,
@@ -65,7 +64,7 @@ class PlanTF(LearnedPlanner[Features, Plans]):
         """Prepare for a scenario: its map, its route and its lights."""
         self.degraded = self._reason = ""
         self._map, self._lights = scene.map, LightLookup(scene.map)
-        blocks = route_blocks(scene)
+        blocks = scene.route_blocks
         self._corrector = RouteCorrector(scene.map, blocks, START_REACH) if blocks else None
         self._route: tuple[int, ...] = ()
         self._on_route: BoolArray = np.zeros(len(scene.map.blocks), np.bool_)

@@ -20,7 +20,6 @@ from shiftsim.planners.learned.features import (
     AgentFeatures,
     agent_features,
     plan_of_poses,
-    route_blocks,
     short_history,
     stack_scenes,
     turned,
@@ -106,7 +105,7 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
 
     def reset(self, scene: SceneInfo) -> None:
         """Look up the route; it is corrected at the first step."""
-        self._blocks = route_blocks(scene)
+        self._blocks = scene.route_blocks
         self._scene, self._lights = scene, LightLookup(scene.map)
         self.route = self.choice = None
         self.degraded = ""

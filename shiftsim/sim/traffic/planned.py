@@ -145,6 +145,7 @@ class PlannedTraffic:
                 times=times,
                 token=f"{scenario.token}:{tracks.tokens[track]}",
                 log_name=scenario.log_name,
+                start=ego[row, :3].copy(),
             )
         )
         driver = _Driver(
