@@ -14,6 +14,7 @@ from shiftsim.planners.learned.carl.roads import make_roads
 from shiftsim.planners.learned.features import route_blocks
 from shiftsim.planners.learned.map_features import LightLookup
 from shiftsim.planners.per_map import PerMap
+from shiftsim.sim.planner import Observation
 from shiftsim.world.state import LightStatus
 
 LARGEST = 1e4  # of a measurement, in its unit; none comes near
@@ -54,31 +55,33 @@ class RasterObserver:
         self._on_route[route_blocks(scene)] = True
         self._lights = LightLookup(scene.map, LightStatus.ABSENT)
 
-    def draw(self, episode: Episode) -> Raster:
-        """The present raster (9, 256, 256)."""
-        log, row, raster = episode.log, episode.iteration, np.zeros(SHAPE, np.uint8)
-        status = self._lights.at(log.traffic_lights.rows(slice(row, row + 1)))
-        draw(raster, self._roads, log.ego[row], log.tracks, row, self._on_route, status)
+    def draw(self, observation: Observation) -> Raster:
+        """The raster (9, 256, 256) of what a planner sees."""
+        history, raster = observation.history, np.zeros(SHAPE, np.uint8)
+        ego, status = history.ego[-1].copy(), self._lights.at(observation.lights)
+        draw(raster, self._roads, ego, history.tracks, -1, self._on_route, status)
         return raster
 
     def look(self, episode: Episode) -> dict[str, Any]:
         """The present raster and measurements."""
-        row, terms = episode.iteration, episode.terms
+        observation, terms = episode.observe(), episode.terms
         action = episode.action if episode.action.shape == (2,) else np.zeros(2, np.float32)
-        time_left = 1.0 - row / episode.scenario.num_iterations
-        critic = np.array([time_left, 1.0 - terms.completion, terms.comfort, terms.ttc], np.float32)
-        return {
-            "raster": self.draw(episode),
-            "measurements": measure(episode.log.ego[row], action).astype(np.float32),
-            "value_measurements": critic,
+        seen: dict[str, Any] = {
+            "raster": self.draw(observation),
+            "measurements": measure(observation.history.ego[-1].copy(), action).astype(np.float32),
         }
+        if terms is not None:  # a planner that is not shown the recording has none
+            time_left = 1.0 - observation.iteration / len(episode.scene.times)
+            critic = [time_left, 1.0 - terms.completion, terms.comfort, terms.ttc]
+            seen["value_measurements"] = np.array(critic, np.float32)
+        return seen
 
 
 def picture_of(episode: Episode) -> np.ndarray:
     """(256, 256, 3) uint8, driving to the right, left is up."""
     observer = RasterObserver()
     observer.start(episode)
-    raster = observer.draw(episode)
+    raster = observer.draw(episode.observe())
     picture = np.full((view.SIZE, view.SIZE, 3), 245, np.uint8)
     for channel, colour in _COLOURS.items():
         picture[raster[channel, ::-1] > 0] = colour

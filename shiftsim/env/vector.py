@@ -12,13 +12,13 @@ from gymnasium import Space, spaces
 from numpy.typing import NDArray
 
 from shiftsim.env.episode import Episode
-from shiftsim.env.terms import EpisodeState
 from shiftsim.geometry.polylines import arc_lengths, point_on_polyline, project_on_polyline
-from shiftsim.kernels import FloatArray, IntArray, kernel
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.learned.features import route_blocks
 from shiftsim.planners.learned.map_features import LightLookup
 from shiftsim.planners.routes.graph import lane_at, lanes_of
 from shiftsim.sim.planner import SceneInfo
+from shiftsim.world.layers import Polygons, Polylines
 from shiftsim.world.state import (
     LAST_AGENT_KIND,
     PACIFICA,
@@ -65,13 +65,27 @@ def parts_of(values: Values) -> Seen:
     return Seen(*parts)
 
 
-class Route(NamedTuple):
-    """The line along the route, and scratch for what is nearest to the ego."""
+class Surroundings(NamedTuple):
+    """What stays as it is in a scenario, and scratch for what is nearest to the ego."""
 
-    xy: FloatArray  # (V, 2) vertices [m]
+    xy: FloatArray  # (V, 2) vertices of the line along the route [m]
     arc: FloatArray  # (V,) arc length at each of them [m]
+    edges: Polygons
+    baselines: Polylines
+    limits: FloatArray  # (E,) [m/s], NaN where the map has none
+    on_route: BoolArray  # (E,)
     nearest: FloatArray  # (16,) scratch: distances
     indices: IntArray  # (16,) scratch: of what
+
+
+class Present(NamedTuple):
+    """The ego and the tracks that are there now. N tracks."""
+
+    ego: FloatArray  # (11,) state
+    poses: FloatArray  # (N, 3)
+    velocities: FloatArray  # (N, 2)
+    sizes: FloatArray  # (N, 2)
+    kinds: IntArray  # (N,) AgentKind codes
 
 
 class VectorObserver:
@@ -81,19 +95,33 @@ class VectorObserver:
 
     def start(self, episode: Episode) -> None:
         """Find the route's lanes."""
-        scene, center = episode.scene, center_poses(episode.log.ego[0, :3])
-        line = route_line(scene, route_blocks(scene), center)
-        arc, most = arc_lengths(line, np.array([0, len(line)])), max(TRACKS, LANES)
-        self._route = Route(line, arc, np.zeros(most), np.zeros(most, np.int64))
+        scene, center = episode.scene, center_poses(episode.observe().history.ego[-1, :3])
+        road, blocks, most = scene.map, route_blocks(scene), max(TRACKS, LANES)
+        line = route_line(scene, blocks, center)
+        on_route = np.zeros(len(road.blocks) + 1, np.bool_)  # the last is of edges without block
+        on_route[blocks] = True
+        self._around = Surroundings(
+            xy=line,
+            arc=arc_lengths(line, np.array([0, len(line)])),
+            edges=road.edges.polygons,
+            baselines=road.baselines,
+            limits=road.speed_limits,
+            on_route=on_route[road.block_of],
+            nearest=np.zeros(most),
+            indices=np.zeros(most, np.int64),
+        )
         self._lights = LightLookup(scene.map, LightStatus.ABSENT, ranked=(LightStatus.RED,))
 
     def look(self, episode: Episode) -> Values:
         """The present observation."""
-        row = episode.iteration
-        status = self._lights.at(episode.log.traffic_lights.rows(slice(row, row + 1)))
+        observation = episode.observe()
+        history, tracks = observation.history, observation.history.tracks
+        here = np.flatnonzero(tracks.valid[-1])
+        parts = (tracks.poses[-1], tracks.velocities[-1], tracks.sizes[-1], tracks.kinds)
+        present = Present(history.ego[-1].copy(), *(part[here] for part in parts))
         values = np.zeros(SIZE, np.float32)
         seen = parts_of(values)
-        _write_observation(episode.state, self._route, row, status, seen)
+        _write_observation(self._around, present, self._lights.at(observation.lights), seen)
         if episode.action.shape == (2,):
             seen.ego[7:] = episode.action
         return values
@@ -119,56 +147,55 @@ def route_line(scene: SceneInfo, blocks: list[int], center: FloatArray) -> Float
 
 @kernel
 def _write_observation(
-    episode: EpisodeState, route: Route, row: int, status: IntArray, seen: Seen
+    around: Surroundings, present: Present, status: IntArray, seen: Seen
 ) -> None:
     """Write one observation into zeros."""
-    ego = episode.ego[row]
+    ego = present.ego
     cos, sin = np.cos(ego[2]), np.sin(ego[2])
     x, y = ego[0] + _TO_CENTER * cos, ego[1] + _TO_CENTER * sin
     seen.ego[0] = _clip(ego[3] / SPEED)
     seen.ego[1], seen.ego[2] = _clip(ego[5] / ACCEL), _clip(ego[6] / ACCEL)
     for index in range(4):
         seen.ego[3 + index] = _clip(ego[7 + index])
-    last = len(route.arc)
-    start = project_on_polyline(route.xy, route.arc, 0, last, x, y)
+    last = len(around.arc)
+    start = project_on_polyline(around.xy, around.arc, 0, last, x, y)
     for point in range(ROUTE_POINTS):
-        px, py = point_on_polyline(route.xy, route.arc, 0, last, start + point * ROUTE_STEP)
+        px, py = point_on_polyline(around.xy, around.arc, 0, last, start + point * ROUTE_STEP)
         _write_vector(px - x, py - y, cos, sin, METRES, seen.route[point])
     count = 0
-    for track in range(len(episode.kinds)):
-        if episode.valid[row, track]:
-            dx, dy = episode.poses[row, track, 0] - x, episode.poses[row, track, 1] - y
-            count = _insert_nearest(route, count, TRACKS, np.hypot(dx, dy), track)
+    for track in range(len(present.kinds)):
+        distance = np.hypot(present.poses[track, 0] - x, present.poses[track, 1] - y)
+        count = _insert_nearest(around, count, TRACKS, distance, track)
     for place in range(count):
-        track, line = route.indices[place], seen.tracks[place]
-        pose, size = episode.poses[row, track], episode.sizes[row, track]
+        track, line = around.indices[place], seen.tracks[place]
+        pose, size = present.poses[track], present.sizes[track]
         line[0] = 1.0
         _write_vector(pose[0] - x, pose[1] - y, cos, sin, METRES, line[1:3])
         _write_vector(np.cos(pose[2]), np.sin(pose[2]), cos, sin, 1.0, line[3:5])
-        if episode.kinds[track] <= _LAST_AGENT:
-            velocity = episode.velocities[row, track]
+        if present.kinds[track] <= _LAST_AGENT:
+            velocity = present.velocities[track]
             _write_vector(velocity[0], velocity[1], cos, sin, SPEED, line[5:7])
-            line[9] = 0.0 if episode.kinds[track] == _VEHICLE else 1.0
+            line[9] = 0.0 if present.kinds[track] == _VEHICLE else 1.0
         else:
             line[10] = 1.0
         line[7], line[8] = _clip(size[0] / METRES), _clip(size[1] / METRES)
-    bounds, lines, count = episode.edges.bounds, episode.baselines, 0
+    bounds, lines, count = around.edges.bounds, around.baselines, 0
     for edge in range(len(bounds)):
         dx = max(bounds[edge, 0] - x, 0.0, x - bounds[edge, 2])
         dy = max(bounds[edge, 1] - y, 0.0, y - bounds[edge, 3])
-        limit = REACH if count < LANES else route.nearest[count - 1]
+        limit = REACH if count < LANES else around.nearest[count - 1]
         if dx * dx + dy * dy < limit * limit:
             first, stop = lines.ptr[edge], lines.ptr[edge + 1]
             along = project_on_polyline(lines.xy, lines.arc, first, stop, x, y)
             px, py = point_on_polyline(lines.xy, lines.arc, first, stop, along)
             distance = np.hypot(px - x, py - y)
             if distance < REACH:
-                count = _insert_nearest(route, count, LANES, distance, edge)
+                count = _insert_nearest(around, count, LANES, distance, edge)
     for place in range(count):
-        edge, line = route.indices[place], seen.lanes[place]
-        limit = episode.limits[edge]
+        edge, line = around.indices[place], seen.lanes[place]
+        limit = around.limits[edge]
         line[0] = 1.0
-        line[1] = 1.0 if episode.edge_on_route[edge] else 0.0
+        line[1] = 1.0 if around.on_route[edge] else 0.0
         line[2] = 0.0 if np.isnan(limit) else _clip(limit / SPEED)
         line[3] = 1.0 if status[edge] == _RED else 0.0
         first, stop = lines.ptr[edge], lines.ptr[edge + 1]
@@ -181,9 +208,11 @@ def _write_observation(
 
 
 @kernel
-def _insert_nearest(route: Route, count: int, most: int, distance: float, index: int) -> int:
+def _insert_nearest(
+    around: Surroundings, count: int, most: int, distance: float, index: int
+) -> int:
     """Sort something into the nearest ones; how many there are then."""
-    nearest, indices = route.nearest, route.indices
+    nearest, indices = around.nearest, around.indices
     if count == most:
         if not distance < nearest[most - 1]:
             return count
