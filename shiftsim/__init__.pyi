@@ -7,6 +7,7 @@ from shiftsim.api import open_run as open_run
 from shiftsim.api import open_store as open_store
 from shiftsim.api import run as run
 from shiftsim.api import simulate as simulate
+from shiftsim.env.policy import policy_planner as policy_planner
 from shiftsim.errors import ShiftsimError as ShiftsimError
 from shiftsim.metrics import compute_metrics as score
 from shiftsim.planners.contract import check_planner as check_planner
@@ -39,6 +40,7 @@ __all__ = [
     "load_planner",
     "open_run",
     "open_store",
+    "policy_planner",
     "run",
     "score",
     "show",

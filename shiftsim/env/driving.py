@@ -23,7 +23,7 @@ from shiftsim.data import open_store
 from shiftsim.env.episode import REWARDS, Episode, NoObservation, Observer, Reward
 from shiftsim.env.raster import RasterObserver, picture_of
 from shiftsim.env.vector import VectorObserver
-from shiftsim.errors import ConfigError, DataError, ShiftsimError, one_of
+from shiftsim.errors import ConfigError, DataError, ShiftsimError, one_of, readable
 from shiftsim.geometry.boxes import from_frame
 from shiftsim.kernels import FloatArray
 from shiftsim.planners.learned.carl.planner import command_of
@@ -223,9 +223,13 @@ def bounded(action: Any, high: NDArray[np.float32]) -> NDArray[np.float32]:
     """An action, cut at its bounds.
 
     Raises:
-        ConfigError: It has another shape.
+        ConfigError: It is none, or has another shape.
     """
-    given = np.asarray(action, np.float32)
+    try:
+        given = np.asarray(action, np.float32)
+    except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError is torch's
+        what = f"the action is a {type(action).__name__}, no array ({readable(error)})"
+        raise ConfigError(what, hint=f"return {high.size} numbers of shape {high.shape}") from error
     if given.shape != high.shape:
         raise ConfigError(f"the action has shape {given.shape}; it must be {high.shape}")
     return np.minimum(np.maximum(given, -high), high)

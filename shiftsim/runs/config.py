@@ -85,7 +85,10 @@ class RunConfig:
     """
 
     planners: tuple[str, ...] = setting(
-        (), "Name, ./file.py:Class or [nuplan:]package.module:Class; repeatable.", "--planner", "-p"
+        (),
+        "Name, ./file.py:Class, [nuplan:]package.module:Class or policy:FILE; repeatable.",
+        "--planner",
+        "-p",
     )
     noise: tuple[str, ...] = setting(
         ("none",), "none, awgn-low … ou-high, all; repeatable. [none]", "--noise", "-n"
