@@ -8,6 +8,7 @@ import hashlib
 import inspect
 import zipfile
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import asdict, dataclass
 from io import BytesIO
@@ -77,7 +78,7 @@ class PolicyPlanner:
         self._parts = tuple(space) if isinstance(space, spaces.Dict) else ()
         self.sees_recording = CRITIC in self._parts
         self.source = ""  # in the fingerprint: of a function only the name is pickled
-        if inspect.isfunction(policy):
+        with suppress(OSError, TypeError):  # of what is no function, or of a console
             self.source = hashlib.sha256(inspect.getsource(policy).encode()).hexdigest()
 
     def reset(self, scene: SceneInfo) -> None:
@@ -100,7 +101,7 @@ class PolicyPlanner:
             ConfigError: The policy returned something else.
         """
         if self._parts:
-            seen = {name: seen[name] for name in self._parts}
+            seen = {name: part for name, part in seen.items() if name in self._parts}
         if not hasattr(self._policy, "predict"):
             return bounded(self._policy(seen), self._high)
         memory = {} if self._memory is None else {"state": self._memory}
@@ -139,10 +140,10 @@ def policy_planner(
     predicts = hasattr(policy, "predict")
     if not predicts and not callable(policy):
         raise ConfigError(
-            f"a {type(policy).__name__} is no policy",
+            f"{readable(policy)} is no policy",
             hint="a policy is called with an observation, or has predict(observation)",
         )
-    name = getattr(policy, "__name__", type(policy).__name__)
+    name = getattr(policy, "__name__", type(policy).__name__).strip("<>")  # of a lambda
     if predicts and hasattr(inner := getattr(policy, "policy", None), "predict"):
         policy = inner  # the network of a model, without what trained it
     seen, acts = (getattr(policy, f"{what}_space", None) for what in ("observation", "action"))
@@ -262,7 +263,7 @@ def _load_export(file: BytesIO) -> Any:
 _MODEL = "zip of Stable-Baselines3"
 _KINDS: dict[str, Callable[[BytesIO], Any]] = {
     _MODEL: _load_model,
-    "TorchScript": _load_script,
+    "TorchScript file": _load_script,
     "torch.export file": _load_export,
 }
 _MEMBERS = ("policy.pth", "constants.pkl", "archive_format")  # that tell archives of each kind
@@ -280,7 +281,7 @@ def _kind_of(path: Path) -> str:
         if member in names:
             return kind
     raise ConfigError(
-        f"{str(path)!r} is no policy: {why}", hint=f"a policy is a {', a '.join(_KINDS)}"
+        f"{str(path)!r} is no policy: {why}", hint=f"a policy is a {' or a '.join(_KINDS)}"
     )
 
 
