@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import asdict, dataclass
+from importlib import import_module
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from shiftsim.env.driving import ACTIONS, OBSERVATIONS, bounded, high_of, plan_of
 from shiftsim.env.episode import Observer
 from shiftsim.env.terms import Terms, compute_reward_terms, make_state
-from shiftsim.errors import ConfigError, MissingExtraError, one_of, readable
+from shiftsim.errors import ConfigError, MissingExtraError, ShiftsimError, one_of, readable
 from shiftsim.files import expand, make_table, read_toml
 from shiftsim.planners.learned.device import prepare_inference, require_torch
 from shiftsim.sim.loop import Rollout
@@ -72,7 +73,7 @@ class PolicyPlanner:
 
     def __init__(self, policy: Any, observer: Observer, action: str, name: str) -> None:
         """The policy, what it is shown, its kind of action, and its name in tables."""
-        self.name, self._policy, self._observer = name, policy, deepcopy(observer)
+        self.name, self._policy, self.observer = name, policy, deepcopy(observer)
         self._high, self._memory = high_of(action), None
         space = getattr(policy, "observation_space", None)
         self._parts = tuple(space) if isinstance(space, spaces.Dict) else ()
@@ -90,8 +91,8 @@ class PolicyPlanner:
         sight: Any = self._sight
         sight.go_on(observation)
         if observation.iteration == 0:
-            self._observer.start(sight)
-        sight.action = self.act(self._observer.look(sight))
+            self.observer.start(sight)
+        sight.action = self.act(self.observer.look(sight))
         return plan_of(sight.action, observation.history.ego[-1])
 
     def act(self, seen: Any) -> NDArray[np.float32]:
@@ -107,11 +108,6 @@ class PolicyPlanner:
         memory = {} if self._memory is None else {"state": self._memory}
         action, self._memory = self._policy.predict(seen, deterministic=True, **memory)
         return bounded(action, self._high)
-
-    def try_out(self) -> None:
-        """Act once, so that what does not fit is said before anything is driven."""
-        space = self._observer.space
-        self.act(spaces.unflatten(space, np.ones(spaces.flatdim(space), np.float32)))
 
 
 def policy_planner(
@@ -176,10 +172,6 @@ class Interface:
     observation: str
     action: str
 
-    def __post_init__(self) -> None:
-        one_of("observation", self.observation, OBSERVATIONS)
-        one_of("action", self.action, ACTIONS)
-
 
 class FilePolicy:
     """The network of a file; a copy in another process is made of the same bytes."""
@@ -187,26 +179,12 @@ class FilePolicy:
     shares_nothing = True  # it keeps nothing of a scenario: one is enough for a process
 
     def __init__(self, content: bytes, kind: str) -> None:
-        """The bytes of a file, and which of `_KINDS` it is.
-
-        Raises:
-            ConfigError: It cannot be loaded.
-            MissingExtraError: What loads it is not installed.
-        """
-        require_torch("a policy")
+        """The bytes of a file, and which of `_LOADERS` reads it."""
         prepare_inference("cpu")
         self._made_of = content, kind
-        try:
-            self._network = _KINDS[kind](BytesIO(content))
-        except MissingExtraError:
-            raise
-        except Exception as error:  # of other libraries
-            raise ConfigError(
-                f"the {kind} cannot be loaded: {type(error).__name__}: {readable(error)}",
-                hint="versions of Python, NumPy or torch may differ from those that wrote it",
-            ) from error
-        for space in ("observation_space", "action_space"):
-            setattr(self, space, getattr(self._network, space, None))
+        self._network = _LOADERS[kind](BytesIO(content))
+        self.observation_space = getattr(self._network, "observation_space", None)
+        self.action_space = getattr(self._network, "action_space", None)
 
     def __reduce__(self) -> Any:
         return FilePolicy, self._made_of
@@ -218,17 +196,13 @@ class FilePolicy:
         import torch
 
         parts = (seen["raster"], seen["measurements"]) if isinstance(seen, dict) else (seen,)
-        try:
-            with torch.inference_mode():
-                out = self._network(*(torch.from_numpy(np.array(part)[None]) for part in parts))
-        except RuntimeError as error:
-            shapes = " and ".join(str((1, *np.shape(part))) for part in parts)
-            text = f"the network cannot be called with {shapes}: {readable(error)}"
-            raise ConfigError(text, hint="it gets batches of one observation") from error
+        with torch.inference_mode():
+            out = self._network(*(torch.from_numpy(np.array(part)[None]) for part in parts))
         return (out[0] if isinstance(out, torch.Tensor) and len(out) == 1 else out), None
 
 
 def _load_model(file: BytesIO) -> Any:
+    """The policy of a model of Stable-Baselines3, without what trained it."""
     try:
         from stable_baselines3.common.save_util import load_from_zip_file
     except ImportError as error:
@@ -248,41 +222,27 @@ def _load_model(file: BytesIO) -> Any:
     return policy
 
 
-def _load_script(file: BytesIO) -> Any:
-    import torch
-
-    return torch.jit.load(file, map_location="cpu").eval()
-
-
-def _load_export(file: BytesIO) -> Any:
-    import torch
-
-    return torch.export.load(file).module()
-
-
-_MODEL = "zip of Stable-Baselines3"
-_KINDS: dict[str, Callable[[BytesIO], Any]] = {
+_MODEL = "policy.pth"
+_LOADERS: dict[str, Callable[[BytesIO], Any]] = {  # by what such archives have in them
     _MODEL: _load_model,
-    "TorchScript file": _load_script,
-    "torch.export file": _load_export,
+    "constants.pkl": lambda file: import_module("torch").jit.load(file, map_location="cpu").eval(),
+    "archive_format": lambda file: import_module("torch").export.load(file).module(),
 }
-_MEMBERS = ("policy.pth", "constants.pkl", "archive_format")  # that tell archives of each kind
+_HINT = "a policy is a zip of Stable-Baselines3, or a file of TorchScript or torch.export"
 
 
 def _kind_of(path: Path) -> str:
-    """Which of `_KINDS` a file is."""
+    """Which of `_LOADERS` reads a file."""
     try:
         with zipfile.ZipFile(path) as archive:
             names = {name.rpartition("/")[2] for name in archive.namelist()}
         why = "holds weights, but no network" if "data.pkl" in names else "is another archive"
     except (OSError, zipfile.BadZipFile) as error:
         names, why = set(), readable(getattr(error, "strerror", None) or error)
-    for kind, member in zip(_KINDS, _MEMBERS, strict=True):
-        if member in names:
+    for kind in _LOADERS:
+        if kind in names:
             return kind
-    raise ConfigError(
-        f"{str(path)!r} is no policy: {why}", hint=f"a policy is a {' or a '.join(_KINDS)}"
-    )
+    raise ConfigError(f"{str(path)!r} is no policy: {why}", hint=_HINT)
 
 
 def from_spec(spec: str) -> Callable[[], PolicyPlanner]:
@@ -292,23 +252,31 @@ def from_spec(spec: str) -> Callable[[], PolicyPlanner]:
         ConfigError: There is no such file, or it holds no policy.
     """
     path = expand(spec.partition(":")[2])
-    kind, beside = _kind_of(path), path.with_name(f"{path.name}.toml")
-    if kind != _MODEL and not beside.is_file():
-        raise ConfigError(
-            f"{str(path)!r} needs a file {beside.name!r} beside it that says how it acts",
-            hint='two lines: observation = "vector" and action = "command"',
-        )
+    files, kind = {"policy": path}, _kind_of(path)
+    if kind != _MODEL:
+        files["interface"] = beside = path.with_name(f"{path.name}.toml")
+        if not beside.is_file():
+            raise ConfigError(
+                f"{str(path)!r} needs a file {beside.name!r} beside it that says how it acts",
+                hint='two lines: observation = "vector" and action = "command"',
+            )
 
     def make() -> PolicyPlanner:
-        about = {} if kind == _MODEL else _interface(beside)
-        planner = policy_planner(FilePolicy(path.read_bytes(), kind), **about)
-        planner.name = spec
-        planner.try_out()
+        require_torch("a policy")
+        about = {}
+        if kind != _MODEL:
+            about = asdict(make_table(Interface, read_toml(beside), str(beside)))
+        try:
+            planner = policy_planner(FilePolicy(path.read_bytes(), kind), **about)
+            planner.name, space = spec, planner.observer.space
+            # what does not fit is said before anything is driven
+            planner.act(spaces.unflatten(space, np.ones(spaces.flatdim(space), np.float32)))
+        except ShiftsimError as error:
+            raise type(error)(f"{str(path)!r}: {error.message}", error.hint) from error
+        except Exception as error:  # of other libraries
+            text = f"{str(path)!r} cannot act: {type(error).__name__}: {readable(error)}"
+            raise ConfigError(text, hint="it is called with one observation at a time") from error
         return planner
 
-    vars(make)["files"] = {"policy": path} | ({} if kind == _MODEL else {"interface": beside})
+    vars(make)["files"] = files
     return make
-
-
-def _interface(beside: Path) -> dict[str, str]:
-    return asdict(make_table(Interface, read_toml(beside), str(beside)))

@@ -288,9 +288,12 @@ def test_a_file_obeys_the_contract_on_the_command_line(toy, tmp_path):
             INTERFACE.format("vector", "command") + "noise = 1",
             r"policy.pt.toml: key 'noise' unknown",
         ),
-        (INTERFACE.format("pixels", "command"), r"policy.pt.toml: observation 'pixels' unknown"),
+        (INTERFACE.format("pixels", "command"), r"policy.pt': observation 'pixels' unknown"),
         (INTERFACE.format("vector", "trajectory"), r"has shape \(2,\); it must be \(10, 3\)"),
-        (INTERFACE.format("none", "command"), r"the network cannot be called with \(1,\)"),
+        (
+            INTERFACE.format("none", "command"),
+            r"policy.pt' cannot act: RuntimeError: .*shapes cannot be multiplied",
+        ),
         ("observation", "is not TOML"),
     ],
 )
