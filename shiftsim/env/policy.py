@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gymnasium import Space, spaces
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from shiftsim.env.driving import ACTIONS, OBSERVATIONS, bounded, high_of, plan_of
@@ -105,8 +105,10 @@ class PolicyPlanner:
             seen = {name: part for name, part in seen.items() if name in self._parts}
         if not hasattr(self._policy, "predict"):
             return bounded(self._policy(seen), self._high)
-        memory = {} if self._memory is None else {"state": self._memory}
-        action, self._memory = self._policy.predict(seen, deterministic=True, **memory)
+        settings = {"deterministic": True} | (
+            {} if self._memory is None else {"state": self._memory}
+        )
+        action, self._memory = self._policy.predict(seen, **settings)
         return bounded(action, self._high)
 
 
@@ -153,7 +155,7 @@ def policy_planner(
     return PolicyPlanner(policy, observation, action or "command", name)
 
 
-def _fitting(space: Space[Any], known: Mapping[str, Any]) -> str:
+def _fitting(space: Any, known: Mapping[str, Any]) -> str:
     """The name of a space, or of one that has all its parts."""
     for name, other in known.items():
         are_parts = isinstance(space, spaces.Dict) and isinstance(other, spaces.Dict)

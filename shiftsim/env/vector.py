@@ -117,7 +117,7 @@ class VectorObserver:
         observation = episode.observe()
         history, tracks = observation.history, observation.history.tracks
         here = np.flatnonzero(tracks.valid[-1])
-        parts = (tracks.poses[-1], tracks.velocities[-1], tracks.sizes[-1], tracks.kinds)
+        parts: Any = (tracks.poses[-1], tracks.velocities[-1], tracks.sizes[-1], tracks.kinds)
         present = Present(history.ego[-1].copy(), *(part[here] for part in parts))
         values = np.zeros(SIZE, np.float32)
         seen = parts_of(values)
