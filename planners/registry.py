@@ -1,7 +1,7 @@
 """Makes planners: by name, by `package.module:Class`, from a class or an instance.
 
-`nuplan:package.module:Class` is a planner written against nuPlan's interface. Nothing is imported
-before it is asked for.
+`nuplan:package.module:Class` is a planner written against nuPlan's interface, `policy:FILE` one
+that acts in the environment. Nothing is imported before it is asked for.
 """
 
 import copy
@@ -25,8 +25,8 @@ from shiftsim.planners.table import PLANNERS as PLANNERS
 from shiftsim.planners.table import readiness as readiness
 from shiftsim.sim.planner import BatchPlanner, Planner, sees_recording
 
-# planners of another interface: prefix -> module with install() and factory(class)
-_ADAPTERS = {"nuplan:": "shiftsim.compat.nuplan"}
+# planners of another interface: prefix -> module with from_spec(spec), which is what makes them
+_ADAPTERS = {"nuplan:": "shiftsim.compat.nuplan", "policy:": "shiftsim.env.policy"}
 _WORDS = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 _NO_PICKLE = (pickle.PicklingError, TypeError, AttributeError, NotImplementedError, RuntimeError)
 
@@ -37,7 +37,7 @@ def load_planner(spec: str, arguments: Mapping[str, Any] | None = None) -> Plann
     Args:
         spec: Registered name, or `package.module:Class` of a custom planner, which may lie in the
             current directory, or `file.py:Class`; with `nuplan:` before it where it is written for
-            nuPlan.
+            nuPlan. Or `policy:FILE` (see `shiftsim.env.policy`).
         arguments: Arguments of its constructor; texts are converted to what it asks for.
 
     A learned planner without a `checkpoint` takes its published file from the folder of
@@ -78,18 +78,7 @@ def planner_factory(spec: str) -> Any:
     """
     for prefix, adapter in _ADAPTERS.items():
         if spec.startswith(prefix):
-            if spec.count(":") != 2:
-                raise ConfigError(
-                    f"planner {spec!r} is not of the form {prefix}package.module:Class",
-                    hint=f"for example {prefix}my_package.my_module:MyPlanner",
-                )
-            compat = importlib.import_module(adapter)
-            compat.install()
-            inner = spec.removeprefix(prefix)
-            try:
-                return compat.factory(planner_factory(inner))
-            except MissingExtraError as error:
-                raise compat.with_all_missing(error, inner.rpartition(":")[0]) from error
+            return importlib.import_module(adapter).from_spec(spec)
     entry = PLANNERS.get(spec)
     if entry is None and spec.endswith(".py"):
         raise ConfigError(
@@ -127,9 +116,9 @@ def planner_factory(spec: str) -> Any:
 def planner_fingerprint(spec: str, arguments: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """All that tells one planner from another, as JSON values.
 
-    Custom planners carry the hash of their module's source, file arguments that of the file,
-    learned planners that of their checkpoint and the kind of their device; what else they depend on
-    is not seen.
+    Custom planners carry the hash of their module's source, policies and file arguments that of the
+    file, learned planners that of their checkpoint and the kind of their device; what else they
+    depend on is not seen.
 
     Raises:
         ConfigError: The planner or an argument is wrong.
@@ -153,10 +142,12 @@ def planner_fingerprint(spec: str, arguments: Mapping[str, Any] | None = None) -
         },
         **learned,
     }
-    files = {n: v for n, v in values.items() if isinstance(v, Path)}
+    made_of = getattr(factory, "files", {})  # of a policy
+    files = made_of | {n: v for n, v in values.items() if isinstance(v, Path)}
     if files:
         out["files"] = {name: _hash_file(path, spec, name) for name, path in sorted(files.items())}
-    source = inspect.getsourcefile(inspect.unwrap(factory)) if entry is None else None
+    is_users = entry is None and not made_of
+    source = inspect.getsourcefile(inspect.unwrap(factory)) if is_users else None
     if source is not None:
         out["source"] = hashlib.sha256(Path(source).read_bytes()).hexdigest()
     return out

@@ -35,6 +35,7 @@ _PUBLIC = {
     "merge": "shiftsim.api:merge",
     "open_run": "shiftsim.api:open_run",
     "open_store": "shiftsim.api:open_store",
+    "policy_planner": "shiftsim.env.policy:policy_planner",
     "run": "shiftsim.api:run",
     "score": "shiftsim.metrics:compute_metrics",
     "show": "shiftsim.view.page:show",

@@ -16,6 +16,7 @@ from shiftsim.api.stores import convert_dsc3d as convert_dsc3d
 from shiftsim.api.stores import convert_nuplan as convert_nuplan
 from shiftsim.api.stores import convert_tracks as convert_tracks
 from shiftsim.api.stores import make_towns as make_towns
+from shiftsim.env.policy import policy_planner as policy_planner
 from shiftsim.errors import ShiftsimError as ShiftsimError
 from shiftsim.metrics import compute_metrics as score
 from shiftsim.planners.contract import check_planner as check_planner
@@ -57,6 +58,7 @@ __all__ = [
     "merge",
     "open_run",
     "open_store",
+    "policy_planner",
     "run",
     "score",
     "show",

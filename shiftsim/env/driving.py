@@ -23,7 +23,7 @@ from shiftsim.data import open_store
 from shiftsim.env.episode import REWARDS, Episode, NoObservation, Observer, Reward
 from shiftsim.env.raster import RasterObserver, picture_of
 from shiftsim.env.vector import VectorObserver
-from shiftsim.errors import ConfigError, DataError, ShiftsimError, one_of
+from shiftsim.errors import ConfigError, DataError, ShiftsimError, one_of, readable
 from shiftsim.geometry.boxes import from_frame
 from shiftsim.kernels import FloatArray
 from shiftsim.planners.learned.carl.planner import command_of
@@ -32,7 +32,7 @@ from shiftsim.sim.loop import Setting
 from shiftsim.sim.noise import NoiseModel, parse_noise
 from shiftsim.sim.traffic import Traffic, make_traffic, traffic_name
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import Trajectory
+from shiftsim.world.state import Command, Trajectory
 
 POSES, SPACING = 10, 0.1  # of a trajectory action; s between them
 REACH = 50.0  # m from the ego that a pose of it may be
@@ -121,14 +121,12 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         if isinstance(reward, str):
             reward = REWARDS[one_of("reward", reward, REWARDS)]
         self._reward = reward
-        self._is_command = one_of("action", action, ACTIONS) == "command"
+        self._high = high_of(action)
         self._terminate, self._penalty = terminate, penalty
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ConfigError(f"render_mode {render_mode!r} unknown", hint="use 'rgb_array'")
         self.render_mode = render_mode
         self.observation_space = self.observer.space
-        high = np.ones(2) if self._is_command else np.tile([REACH, REACH, np.pi], (POSES, 1))
-        self._high = high.astype(np.float32)
         self.action_space = spaces.Box(-self._high, self._high)
         self._episode: Episode | None = None
         self._begun: dict[str, Any] = {}  # token and noise seed of the episode
@@ -185,12 +183,8 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         episode = self.episode
         if episode.is_over:
             raise ConfigError("the episode has ended", hint="call reset()")
-        given = np.asarray(action, np.float32)
-        if given.shape != self._high.shape:
-            raise ConfigError(f"the action has shape {given.shape}; it must be {self._high.shape}")
-        episode.action = given = np.minimum(np.maximum(given, -self._high), self._high)
-        ego = episode.log.ego[episode.iteration]
-        episode.advance(command_of(given, ego) if self._is_command else _trajectory(given, ego))
+        episode.action = given = bounded(action, self._high)
+        episode.advance(plan_of(given, episode.log.ego[episode.iteration]))
         self._actions.append(given)
         infraction, is_over = episode.infraction, episode.is_over
         info: dict[str, Any] = {"terms": episode.terms, "infraction": infraction}
@@ -218,8 +212,33 @@ def _resume(
     return env
 
 
-def _trajectory(action: NDArray[np.float32], ego: FloatArray) -> Trajectory:
-    """The plan that (10, 3) poses in the frame of the rear axle stand for."""
+def high_of(action: str) -> NDArray[np.float32]:
+    """The largest action of a kind, `command` (2,) or `trajectory` (10, 3)."""
+    is_command = one_of("action", action, ACTIONS) == "command"
+    high = np.ones(2) if is_command else np.tile([REACH, REACH, np.pi], (POSES, 1))
+    return high.astype(np.float32)
+
+
+def bounded(action: Any, high: NDArray[np.float32]) -> NDArray[np.float32]:
+    """An action, cut at its bounds.
+
+    Raises:
+        ConfigError: It is none, or has another shape.
+    """
+    try:
+        given = np.asarray(action, np.float32)
+    except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError is torch's
+        what = f"the action is a {type(action).__name__}, no array ({readable(error)})"
+        raise ConfigError(what, hint=f"return {high.size} numbers of shape {high.shape}") from error
+    if given.shape != high.shape:
+        raise ConfigError(f"the action has shape {given.shape}; it must be {high.shape}")
+    return np.minimum(np.maximum(given, -high), high)
+
+
+def plan_of(action: NDArray[np.float32], ego: FloatArray) -> Trajectory | Command:
+    """The plan that an action stands for: a command, or poses in the frame of the rear axle."""
+    if action.ndim == 1:
+        return command_of(action, ego)
     poses = np.concatenate([ego[None, :3], from_frame(action.astype(np.float64), ego[:3])])
     return Trajectory.from_poses(SPACING * np.arange(POSES + 1), poses)
 

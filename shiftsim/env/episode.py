@@ -32,6 +32,11 @@ class _Driver:
         raise PlannerError("a policy acts through the environment, it is not asked")
 
 
+def as_command(action: np.ndarray) -> np.ndarray:
+    """(2,) the last action where actions are commands, else zeros."""
+    return action if action.shape == (2,) else np.zeros(2, np.float32)
+
+
 class Episode:
     """What an observation or a reward is made from.
 
@@ -65,11 +70,6 @@ class Episode:
     def is_over(self) -> bool:
         """Whether the scenario is at its end: its last sample is there."""
         return self._rollout.iteration + 1 == self._rollout.num_samples
-
-    @property
-    def last_command(self) -> np.ndarray:
-        """(2,) the last action where actions are commands, else zeros."""
-        return self.action if self.action.shape == (2,) else np.zeros(2, np.float32)
 
     @property
     def infraction(self) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium import Space, spaces
 from numpy.typing import ArrayLike
 
-from shiftsim.env.episode import Episode
+from shiftsim.env.episode import Episode, as_command
 from shiftsim.kernels import BoolArray
 from shiftsim.planners.learned.carl import view
 from shiftsim.planners.learned.carl.planner import draw, measure
@@ -81,11 +81,13 @@ class RasterObserver:
 
     def look(self, episode: Episode) -> dict[str, Any]:
         """The present raster and measurements."""
-        terms = episode.terms
-        time_left = 1.0 - episode.iteration / episode.scenario.num_iterations
-        critic = np.array([time_left, 1.0 - terms.completion, terms.comfort, terms.ttc], np.float32)
-        seen = raster_observation(episode.scene, episode.observe(), episode.last_command)
-        return seen | {"value_measurements": critic}
+        observation, terms = episode.observe(), episode.terms
+        seen = raster_observation(episode.scene, observation, as_command(episode.action))
+        if terms is not None:  # a planner that is not shown the recording has none
+            time_left = 1.0 - observation.iteration / len(episode.scene.times)
+            critic = [time_left, 1.0 - terms.completion, terms.comfort, terms.ttc]
+            seen["value_measurements"] = np.array(critic, np.float32)
+        return seen
 
 
 def picture_of(episode: Episode) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import Space, spaces
 from numpy.typing import ArrayLike, NDArray
 
-from shiftsim.env.episode import Episode
+from shiftsim.env.episode import Episode, as_command
 from shiftsim.geometry.polylines import arc_lengths, point_on_polyline, project_on_polyline
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.learned.map_features import LightLookup
@@ -143,7 +143,7 @@ class VectorObserver:
 
     def look(self, episode: Episode) -> Values:
         """The present observation."""
-        return vector_observation(episode.scene, episode.observe(), episode.last_command)
+        return vector_observation(episode.scene, episode.observe(), as_command(episode.action))
 
 
 def route_line(scene: SceneInfo, blocks: list[int], center: FloatArray) -> FloatArray:

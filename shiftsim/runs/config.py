@@ -87,7 +87,8 @@ class RunConfig:
 
     planners: tuple[str, ...] = setting(
         (),
-        "Name, ./file.py:Class or [nuplan:]package.module:Class, or LABEL=…; repeatable.",
+        "Name, ./file.py:Class, [nuplan:]package.module:Class or policy:FILE, or LABEL=… of one;"
+        " repeatable.",
         "--planner",
         "-p",
     )

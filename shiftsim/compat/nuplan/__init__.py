@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from shiftsim.compat.nuplan.finder import install as install
 from shiftsim.compat.nuplan.finder import with_all_missing as with_all_missing
-from shiftsim.errors import ConfigError
+from shiftsim.errors import ConfigError, MissingExtraError
+from shiftsim.planners.registry import planner_factory
 
 if TYPE_CHECKING:
     from shiftsim.compat.nuplan.bridge.planner import NuplanPlanner
@@ -44,6 +45,26 @@ def wrap(planner: Any, **arguments: Any) -> "NuplanPlanner":
             hint=f"wrap({kind.__name__}, …) or wrap({kind.__name__}(…))",
         )
     return NuplanPlanner(planner, arguments)
+
+
+def from_spec(spec: str) -> Callable[..., "NuplanPlanner"]:
+    """What makes the planner `nuplan:package.module:Class`.
+
+    Raises:
+        ConfigError: There is no such class, or it is none of nuPlan planners.
+        MissingExtraError: It needs more of nuPlan's devkit than the shims have.
+    """
+    if spec.count(":") != 2:
+        raise ConfigError(
+            f"planner {spec!r} is not of the form nuplan:package.module:Class",
+            hint="for example nuplan:my_package.my_module:MyPlanner",
+        )
+    install()
+    inner = spec.removeprefix("nuplan:")
+    try:
+        return factory(planner_factory(inner))
+    except MissingExtraError as error:
+        raise with_all_missing(error, inner.rpartition(":")[0]) from error
 
 
 def factory(kind: Any) -> Callable[..., "NuplanPlanner"]:
