@@ -191,7 +191,8 @@ def planner_identities(run: Run) -> dict[str, dict[str, Any]]:
 
 
 def planner_notes(runs: Iterable[Run]) -> list[str]:
-    """What a reader must know of planners: whose weights they had, and who saw the recording."""
+    """What a reader must know of planners: their weights, who saw the recording, who drove."""
+    runs = list(runs)
     made_up, own, informed = set[str](), set[str](), set[str]()
     for name, identity in (pair for run in runs for pair in planner_identities(run).items()):
         if str(identity.get("checkpoint", "")).startswith("deterministic:"):
@@ -205,7 +206,8 @@ def planner_notes(runs: Iterable[Run]) -> list[str]:
         "; ".join(sorted(own)): own,
         f"given the recorded future: {', '.join(sorted(informed))}": informed,
     }
-    return [note for note, names in notes.items() if names]
+    remarks = (one for run in runs for one in run.manifest.get("elsewhere", {}).get("remarks", ()))
+    return [*(note for note, names in notes.items() if names), *dict.fromkeys(remarks)]
 
 
 def has_default_weights(group: Group) -> bool:
@@ -303,8 +305,11 @@ def _groups(run: Run, known: Sequence[KnownSet], labels: dict[str, str]) -> Iter
     data = _data_set(run, known)
     parts = _by_duration(data)
     traffic = str(run.manifest["determining"]["traffic"])
+    undefined = {"cls", *run.manifest.get("elsewhere", {}).get("undefined", ())}
     # nuPlan rule 570: a metric without a score counts as 0
-    table = np.stack([pc.fill_null(scores[name], 0.0).to_numpy() for name in COLUMNS], axis=1)
+    missing = {name: np.nan if name in undefined else 0.0 for name in COLUMNS}
+    columns = [pc.fill_null(scores[name], value).to_numpy() for name, value in missing.items()]
+    table = np.stack(columns, axis=1)
     places = pc.index_in(scores["token"], value_set=pa.array(data.tokens, pa.string())).to_numpy()
     order = product(
         _ordered(tasks["planner"], run.manifest["config"]["planners"]),

@@ -127,7 +127,8 @@ class Rescorer:
     def _score(self, task: Task) -> TaskResult:
         scenario = self._scenarios.read(task.token)
         log = self._run.rollout(task, scenario)
-        scores, metrics = score_rollout(scenario, log, self.config)
+        undefined = self._run.manifest.get("elsewhere", {}).get("undefined", ())
+        scores, metrics = score_rollout(scenario, log, self.config, undefined)
         profile = {"thresholds": self.config.thresholds}
         metrics += [row | profile for row in self._open_loop.get(task, [])]
         return TaskResult(task, OK, scenario.scenario_type, scores=scores, metrics=metrics)
@@ -182,7 +183,8 @@ def rescore(
         fingerprint=fingerprint,
         argv=argv,
     )
-    manifest |= {key: run.manifest[key] for key in ("edits", "split_size") if key in run.manifest}
+    kept = ("edits", "split_size", "elsewhere")
+    manifest |= {key: run.manifest[key] for key in kept if key in run.manifest}
     with closing(RunWriter(target, manifest)) as writer:
         for result in stored_results(run.path):
             if result.status != OK:  # it stays so

@@ -155,6 +155,10 @@ def find_simulation_logs(folder: Path) -> dict[tuple[str, str], Path]:
     return found
 
 
+def log_source(path: Path) -> Source | None:
+    return None
+
+
 def read_simulation_log(path: Path, report: Report) -> Recorded:
     """Read one log.
 
