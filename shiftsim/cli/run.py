@@ -354,14 +354,15 @@ def _scored_again(source: Path, given: cli.Settings, settings: cli.Settings, **h
 def _scored_elsewhere(
     source: Path, given: cli.Settings, settings: cli.Settings, **how: Any
 ) -> "Run":
-    from shiftsim.runs.rollouts.elsewhere import RECORDED, read_source, score_source
+    from shiftsim.runs.derive import score_elsewhere
+    from shiftsim.runs.rollouts.elsewhere import RECORDED, read_source
     from shiftsim.verify.simulation_log import log_source
 
     tracks = given["tracks"]
     found = log_source(source) or read_source(source, tracks)
     settings = {"store": DEFAULT_STORE, **settings}
     options = {"point": given["point"], "partial_rollouts": given["partial"]}
-    return score_source(found, recorded=tracks == RECORDED, **options, **settings, **how)
+    return score_elsewhere(found, recorded=tracks == RECORDED, **options, **settings, **how)
 
 
 def merge(
