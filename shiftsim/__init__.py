@@ -28,6 +28,7 @@ _PUBLIC = {
     "open_store": "shiftsim.api:open_store",
     "run": "shiftsim.api:run",
     "score": "shiftsim.metrics:compute_metrics",
+    "score_rollout": "shiftsim.runs.rollouts.elsewhere:score_rollout",
     "show": "shiftsim.view.page:show",
     "simulate": "shiftsim.api:simulate",
 }

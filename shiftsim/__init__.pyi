@@ -10,6 +10,7 @@ from shiftsim.api import simulate as simulate
 from shiftsim.errors import ShiftsimError as ShiftsimError
 from shiftsim.metrics import compute_metrics as score
 from shiftsim.planners.contract import check_planner as check_planner
+from shiftsim.runs.rollouts.elsewhere import score_rollout as score_rollout
 from shiftsim.sim.log import SimulationLog as SimulationLog
 from shiftsim.sim.noise import NoiseModel as NoiseModel
 from shiftsim.sim.planner import Observation as Observation
@@ -41,6 +42,7 @@ __all__ = [
     "open_store",
     "run",
     "score",
+    "score_rollout",
     "show",
     "simulate",
 ]

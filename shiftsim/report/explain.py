@@ -98,7 +98,7 @@ def explain_tasks(
 
 
 def why(cls: float | None, metrics: list[dict[str, Any]]) -> str:
-    """A score x 100 in one line: why it is 0, or none, or how it is composed; empty if it failed."""
+    """A score x 100 in one line: why it is 0 or undefined, or its parts; empty if it failed."""
     if cls is None:
         lost = {*MULTIPLIERS, *WEIGHTS} - {row["metric"] for row in metrics}
         names = [in_words(name) for name in SHORT_NAMES if name in lost]

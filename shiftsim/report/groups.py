@@ -170,7 +170,7 @@ class Group:
         return np.array([row.mean() for row in seeds if len(row)])
 
     def estimate(self, name: str = "cls") -> Number:
-        """The score of one column, times 100; empty where nobody can know it, or of no scenarios."""
+        """The score of one column, times 100; empty of no scenarios, or where it is undefined."""
         if name in undefined_columns(self.run):
             return Number(None, done=0, expected=0)
         finished = np.isfinite(self.column(name))
@@ -214,8 +214,9 @@ def planner_notes(runs: Iterable[Run]) -> list[str]:
         "; ".join(sorted(own)): own,
         f"given the recorded future: {', '.join(sorted(informed))}": informed,
     }
-    remarks = (one for run in runs for one in run.manifest.get("elsewhere", {}).get("remarks", ()))
-    return [*(note for note, names in notes.items() if names), *dict.fromkeys(remarks)]
+    told = (run.manifest.get("elsewhere", {}).get("remarks", ()) for run in runs)
+    elsewhere = (f"driven elsewhere: {'; '.join(remarks)}" for remarks in told if remarks)
+    return [*(note for note, names in notes.items() if names), *dict.fromkeys(elsewhere)]
 
 
 def has_default_weights(group: Group) -> bool:

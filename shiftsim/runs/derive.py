@@ -350,8 +350,7 @@ def score_elsewhere(
             f"{remark} ({count} of {scored} rollouts)" if count < scored else remark
             for remark, count in sorted(remarks.items())
         )
-        about = {"undefined": undefined, "files": files}
-        about["remarks"] = [f"driven elsewhere: {source.name}", *source.remarks, *counted]
+        about = {"undefined": undefined, "remarks": [source.name, *source.remarks, *counted]}
         manifest |= {"state": "finished", "ended": now(), "elsewhere": about}
         expected = {task._replace(token=token) for task in tasks for token in tokens}
         return writer.finish(manifest, expected, default=f"not in {source.name}")

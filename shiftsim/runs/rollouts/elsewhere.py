@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 
 from shiftsim.data.store.schema import BOX, EGO_COLUMNS
 from shiftsim.errors import DataError, listed, one_of
-from shiftsim.kernels import FloatArray, IntArray
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.metrics import MetricResult, Thresholds, compute_metrics
 from shiftsim.metrics.score import without
 from shiftsim.runs.rollouts import Task
@@ -208,8 +208,8 @@ def table_source(
     return Source(where, (), tuple(entries), others is not None, point, tuple(remarks))
 
 
-def _with_boxes(driven: Driven, rows: "_BoxRows | None") -> Driven:
-    return driven if rows is None else replace(driven, boxes=rows.boxes())
+def _with_boxes(driven: Driven, make: Callable[[], Boxes] | None) -> Driven:
+    return driven if make is None else replace(driven, boxes=make())
 
 
 def _renamed(table: pa.Table, where: str) -> pa.Table:
@@ -291,78 +291,71 @@ def _nested(table: pa.Table) -> pa.Table:
     return pa.table(columns)
 
 
-class _BoxRows(NamedTuple):
-    """The boxes among which one rollout was driven. B rows."""
-
-    where: str  # the table, for messages
-    rows: IntArray  # (B,) of the table
-    time_us: IntArray  # (B,) [us]
-    track: IntArray  # (B,) index into `tokens`
-    tokens: tuple[str, ...]  # N tracks, by first appearance
-    kinds: IntArray  # (B,) AgentKind codes, -1 where not given
-    values: FloatArray  # (B, 7) columns of `_BOX`
-
-    def boxes(self) -> Boxes:
-        """The tracks at all times that have rows."""
-        times, frame = np.unique(self.time_us, return_inverse=True)
-        _, first, which = np.unique(
-            frame * len(self.tokens) + self.track, return_index=True, return_inverse=True
-        )
-        number = np.arange(len(self.rows))
-        kinds = self.kinds[np.unique(self.track, return_index=True)[1]]
-        for is_wrong, words in (
-            (~np.isfinite(self.values[:, [0, 1, 2, 5, 6]]).all(axis=1), "a number is missing"),
-            (~(self.values[:, 5:] > 0.0).all(axis=1), "length and width must be above 0"),
-            (first[which] != number, "its track is there twice at one time"),
-            (kinds[self.track] != self.kinds, "its track changes its type"),
-        ):
-            if is_wrong.any():
-                row = int(np.argmax(is_wrong))
-                token = self.tokens[self.track[row]]
-                what = f"{self.where}, row {self.rows[row]}: track {token!r}: {words}"
-                raise DataError(what, hint=_BOX_HINT)
-        dense = np.full((len(times), len(self.tokens), len(_BOX)), np.nan)
-        dense[frame, self.track] = self.values
-        return Boxes(times, tracks_of_boxes(dense, kinds, self.tokens))
-
-
 class _Others:
-    """A table of boxes."""
+    """A table of boxes. B rows."""
 
     def __init__(self, table: pa.Table, where: str) -> None:
-        needed = ("token", "track_token", *_POSE, "length", "width")
-        _require(table, where, needed, _BOX_HINT)
+        _require(table, where, ("token", "track_token", *_POSE, "length", "width"), _BOX_HINT)
         self.where, self._groups = where, _groups(table, where)
         self._time_us, self._values = _times(table, where), _numbers(table, _BOX, where)
         tokens = _column(table, "track_token", pa.string(), where).dictionary_encode()
-        self._tokens = tokens.dictionary.to_numpy(zero_copy_only=False)
-        self._codes = tokens.indices.to_numpy()
-        self._kinds = np.full(len(table), -1)
-        self._is_ego = np.zeros(len(table), np.bool_)
+        self._names, self._tracks = tokens.dictionary, tokens.indices.to_numpy()
+        self._kinds, self._is_ego = np.full(len(table), -1), np.zeros(len(table), np.bool_)
         if "type" in table.column_names:
             self._read_kinds(_column(table, "type", pa.string(), where).dictionary_encode())
+        broken = ~np.isfinite(self._values[:, [0, 1, 2, 5, 6]]).all(axis=1)
+        _refuse(broken, where, np.arange(len(table)), "a number is missing")
+        flat = (self._values[:, 5:] <= 0.0).any(axis=1)
+        _refuse(flat, where, np.arange(len(table)), "length and width must be above 0")
 
     def _read_kinds(self, types: pa.DictionaryArray) -> None:
         known = {word: kind.value for kind in AgentKind for word in (kind.name, str(kind.value))}
         codes = types.indices.to_numpy()
         for code, name in enumerate(types.dictionary.to_pylist()):
-            where = codes == code
             if name.upper() == "EGO":
-                self._is_ego |= where
-            elif name.upper() in known:
-                self._kinds[where] = known[name.upper()]
-            else:
-                words = f"{self.where}, row {np.argmax(where)}: type {name!r} unknown"
-                kinds = ", ".join(kind.name for kind in AgentKind)
-                raise DataError(words, hint=f"types are {kinds}, and EGO, which is left out")
+                self._is_ego |= codes == code
+                continue
+            if name.upper() not in known:
+                words = f"type {name!r} is none of {', '.join(k.name for k in AgentKind)} and EGO"
+                _refuse(codes == code, self.where, np.arange(len(codes)), words)
+            self._kinds[codes == code] = known[name.upper()]
 
-    def of(self, task: Task) -> _BoxRows:
-        """The boxes of a rollout; of all rollouts of its scenario where no column says more."""
+    def of(self, task: Task) -> Callable[[], Boxes]:
+        """Makes the boxes of a rollout; those of its scenario where no column says more."""
         names = [name for name, _ in next(iter(self._groups), ())]
         rows = self._groups.get(tuple((name, getattr(task, name)) for name in names), _NO_ROWS)
         rows = rows[~self._is_ego[rows]]
-        codes, first, track = np.unique(self._codes[rows], return_index=True, return_inverse=True)
-        order = np.argsort(first)
-        tokens = tuple(self._tokens[codes[order]].tolist())
-        values = (self._time_us[rows], np.argsort(order)[track], tokens)
-        return _BoxRows(self.where, rows, *values, self._kinds[rows], self._values[rows])
+        columns = (self._time_us, self._tracks, self._kinds, self._values)
+        tracks = np.unique(self._tracks[rows])
+        tokens = dict(zip(tracks.tolist(), self._names.take(tracks).to_pylist(), strict=True))
+        return partial(_boxes, self.where, rows, *(column[rows] for column in columns), tokens)
+
+
+def _boxes(
+    where: str,  # the table
+    rows: IntArray,  # (B,) of it
+    time_us: IntArray,  # (B,) [us]
+    tracks: IntArray,  # (B,) numbers
+    kinds: IntArray,  # (B,) AgentKind codes, -1 where not given
+    values: FloatArray,  # (B, 7) columns of `_BOX`
+    tokens: Mapping[int, str],  # by number
+) -> Boxes:
+    """The tracks at all times that have rows, in order of appearance."""
+    _, first, track = np.unique(tracks, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    first, track = first[order], np.argsort(order)[track]
+    times, frame = np.unique(time_us, return_inverse=True)
+    is_first = np.zeros(len(rows), np.bool_)
+    is_first[np.unique(frame * len(first) + track, return_index=True)[1]] = True
+    _refuse(~is_first, where, rows, "its track is there twice at one time")
+    _refuse(kinds[first][track] != kinds, where, rows, "its track changes its type")
+    dense = np.full((len(times), len(first), len(_BOX)), np.nan)
+    dense[frame, track] = values
+    names = [tokens[number] for number in tracks[first].tolist()]
+    return Boxes(times, tracks_of_boxes(dense, kinds[first], names))
+
+
+def _refuse(bad: BoolArray, where: str, rows: IntArray, words: str) -> None:
+    """Refuse the first of some rows of boxes that is bad."""
+    if bad.any():
+        raise DataError(f"{where}, row {rows[np.argmax(bad)]}: {words}", hint=_BOX_HINT)
