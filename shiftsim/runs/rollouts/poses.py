@@ -119,7 +119,7 @@ def rollout_of(
         scenario = replace(scenario, iteration_rows=scenario.iteration_rows[: reached + 1])
         times = times[:reached]
         remarks.append("partial: scored against the expert up to where it ends")
-    elif time_us[-1] > times[-1] + _NEAR:
+    elif time_us[-1] > scenario.iteration_times[-1] + _NEAR:
         remarks.append("cut at the end of the scenario")
     samples = _locate(time_us, times)
     if (far := samples.distance > _NEAR).any():
