@@ -11,9 +11,8 @@ from typing import Any
 
 from shiftsim._version import __version__
 from shiftsim.data import open_store
-from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.data.store.tables import digest
-from shiftsim.errors import ConfigError, DataError, nearest, one_of
+from shiftsim.errors import ConfigError, DataError, one_of
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.metrics.open_loop import NAMES as OPEN_LOOP
 from shiftsim.runs.config import RunConfig, default_workers, make_config, parse_shard
@@ -279,11 +278,10 @@ def score_elsewhere(
         words = f"--point {point}, but {source.name} says {source.point}"
         raise ConfigError(words, hint="leave --point out")
     found = open_store(store)
-    _check_known(source, found)
+    source = source.in_store(found)
     for metric in metrics:
         load_metric(metric)
     tasks = [entry.task for entry in source.entries]
-    tokens = sorted({task.token for task in tasks})
     config = RunConfig(
         planners=tuple(dict.fromkeys(task.planner for task in tasks)),
         noise=tuple(dict.fromkeys(task.noise for task in tasks)),
@@ -293,32 +291,16 @@ def score_elsewhere(
         thresholds=thresholds,
         metrics=metrics,
     )
-    files = {path.name: digest(path) for path in source.files}
     given = {"point": point or source.point or REAR_AXLE, "recorded": recorded}
     given["partial"] = partial_rollouts
-    undefined = () if recorded or source.has_boxes else NEED_BOXES
-    kinds = {name: {"kind": "none" if name == "none" else ELSEWHERE} for name in config.noise}
-    fingerprint = {
-        "shiftsim": __version__,
-        "code": code_digest(),
-        "store": found.hash,
-        "tokens": token_hash(tokens),
-        "planners": {name: {"driven": files} for name in config.planners},
-        "noise": kinds,
-        "seeds": list(config.seeds),
-        "traffic": config.traffic,
-        "controller": controller,
-        "thresholds": asdict(thresholds_of(thresholds)),
-        "metrics": config.added_metrics,
-        "metric_version": METRIC_VERSION,
-        "elsewhere": given,
-    }
-    split = split_name(found, tokens, Path(source.name).stem)
+    fingerprint = _fingerprint(source, found.hash, config) | {"controller": controller, **given}
+    split = split_name(found, source.tokens, Path(source.name).stem)
     target = Path(out) if out else RUNS / run_name(config, split, fingerprint)
     is_new = check_target(target, fingerprint) == "new"
     manifest = make_manifest(
         target, config=config, split=split, store=found.source, fingerprint=fingerprint, argv=argv
     )
+    undefined = () if recorded or source.has_boxes else NEED_BOXES
     remarks, failed = Counter[str](), list[TaskResult]()
     with closing(RunWriter(target, manifest)) as writer:
         outcomes = map_unordered(
@@ -345,24 +327,32 @@ def score_elsewhere(
             first = min(failed, key=lambda result: result.task)
             more = f"; {len(tasks) - 1} other rollouts fail as well" if len(tasks) > 1 else ""
             raise DataError(f"{first.error}{more}", first.hint)
-        scored = len(tasks) - len(failed)
-        counted = (
-            f"{remark} ({count} of {scored} rollouts)" if count < scored else remark
-            for remark, count in sorted(remarks.items())
-        )
-        about = {"undefined": undefined, "remarks": [source.name, *source.remarks, *counted]}
+        words = _counted(remarks, len(tasks) - len(failed))
+        about = {"undefined": undefined, "remarks": [source.name, *source.remarks, *words]}
         manifest |= {"state": "finished", "ended": now(), "elsewhere": about}
-        expected = {task._replace(token=token) for task in tasks for token in tokens}
+        expected = {task._replace(token=token) for task in tasks for token in source.tokens}
         return writer.finish(manifest, expected, default=f"not in {source.name}")
 
 
-def _check_known(source: Source, store: ScenarioStore) -> None:
-    unknown = [entry.task.token for entry in source.entries if entry.task.token not in store]
-    if unknown:
-        near = nearest(unknown[0], store.tokens)
-        raise DataError(
-            f"{source.name}: store {store.path.name!r} has no scenario {unknown[0]!r}"
-            f" ({len(set(unknown))} of its scenarios are unknown)",
-            hint=f"{f'did you mean {near!r}? ' if near else ''}--store names the store that was "
-            "converted for them",
-        )
+def _counted(remarks: Counter[str], total: int) -> list[str]:
+    """What is to be known of rollouts, with their number where it is not of all."""
+    found = sorted(remarks.items())
+    return [f"{one} ({n} of {total} rollouts)" if n < total else one for one, n in found]
+
+
+def _fingerprint(source: Source, store: str, config: RunConfig) -> dict[str, Any]:
+    """What scores of rollouts that were driven elsewhere depend on, as JSON values."""
+    files = {path.name: digest(path) for path in source.files}
+    return {
+        "shiftsim": __version__,
+        "code": code_digest(),
+        "store": store,
+        "tokens": token_hash(source.tokens),
+        "planners": {name: {"driven": files} for name in config.planners},
+        "noise": {n: {"kind": "none" if n == "none" else ELSEWHERE} for n in config.noise},
+        "seeds": list(config.seeds),
+        "traffic": config.traffic,
+        "thresholds": asdict(thresholds_of(config.thresholds)),
+        "metrics": config.added_metrics,
+        "metric_version": METRIC_VERSION,
+    }

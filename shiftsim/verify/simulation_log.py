@@ -172,7 +172,8 @@ def log_source(path: Path) -> elsewhere.Source | None:
         return None
     _require_msgpack(files)
     entries = [elsewhere.Entry(Task(*_names(file)), partial(_driven, file)) for file in files]
-    return elsewhere.Source(path.name, tuple(files), tuple(sorted(entries)), has_boxes=True)
+    entries.sort(key=lambda entry: (entry.task.token, entry.task))
+    return elsewhere.Source(path.name, tuple(files), tuple(entries), True, is_whole=False)
 
 
 def _names(file: Path) -> tuple[str, str, int, str]:
@@ -188,15 +189,14 @@ def _driven(path: Path) -> elsewhere.Driven:
     """What a log says of a rollout, and what its reader must know."""
     recorded = read_simulation_log(path, Report())
     ego, plans, count = read_ego(recorded.ego), recorded.plans, recorded.ego.num_rows
-    remarks = [f"simulation logs: {origin('NR', recorded.ego, plans).partition(':')[0]}"]
-    if recorded.dropped_us:
-        remarks.append("the last sample repeats a time: dropped")
-    if plans is None:
-        remarks.append("plans of an unknown class")
-    else:
+    words = [origin("NR", recorded.ego, plans).replace("other", "driven by another controller")]
+    if plans is not None:
         steps = np.diff(plans["time_us"].astype(np.int64))
         steps = steps[np.diff(plans["iteration"]) == 0] * 1e-6
-        remarks.append(f"plans every {np.median(steps):.2g} s" if len(steps) else "no plans")
+        words.append(f"plans every {np.median(steps):.2g} s" if len(steps) else "no plans")
+    if recorded.dropped_us:
+        words.append("the last sample repeats a time and is dropped")
+    remarks = [f"simulation log: {', '.join(words)}"]
     times = recorded.ego["time_us"].astype(np.int64)
     boxes = elsewhere.Boxes(times, tracks_of(recorded.objects, count))
     return elsewhere.Driven(path.name, times, ego, np.arange(count), boxes, remarks=tuple(remarks))

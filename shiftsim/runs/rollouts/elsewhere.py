@@ -16,8 +16,9 @@ import pyarrow.compute as pc
 import pyarrow.csv
 import pyarrow.parquet as pq
 
+from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.data.store.schema import BOX, EGO_COLUMNS
-from shiftsim.errors import DataError, listed, one_of
+from shiftsim.errors import DataError, listed, nearest, one_of
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.metrics import MetricResult, Thresholds, compute_metrics
 from shiftsim.metrics.score import without
@@ -65,6 +66,30 @@ class Source:
     has_boxes: bool = False  # whether it says where the others were
     point: str = ""  # which point of the ego the poses are of, where it says that
     remarks: tuple[str, ...] = ()  # what a reader of the scores must know
+    is_whole: bool = True  # whether the store must have all of its scenarios
+
+    @property
+    def tokens(self) -> list[str]:
+        """Their scenarios, sorted."""
+        return sorted({entry.task.token for entry in self.entries})
+
+    def in_store(self, store: ScenarioStore) -> "Source":
+        """The rollouts whose scenarios a store has.
+
+        Raises:
+            DataError: It lacks all of them, or one where the source is to be scored as a whole.
+        """
+        known = [entry for entry in self.entries if entry.task.token in store]
+        lost = [entry.task.token for entry in self.entries if entry.task.token not in store]
+        if lost and (self.is_whole or not known):
+            near = nearest(lost[0], store.tokens)
+            raise DataError(
+                f"{self.name}: store {store.path.name!r} has no scenario {lost[0]!r}, and "
+                f"{len(set(lost)) - 1} more of the file are not in it",
+                f"{f'did you mean {near!r}? ' if near else ''}--store names the one with them",
+            )
+        words = (f"left out: {len(lost)} whose scenarios are not in the store",) if lost else ()
+        return replace(self, entries=tuple(known), remarks=(*self.remarks, *words))
 
 
 class ScoredRollout(NamedTuple):
@@ -154,6 +179,8 @@ def read_source(path: Path, tracks: str = "") -> Source:
     """
     files = tuple(sorted([*path.glob("*.parquet"), *path.glob("*.csv")])) or (path,)
     table = pa.concat_tables(map(_read_table, files), promote_options="default")
+    if tracks == RECORDED and TRACKS.names[0] in table.column_names:
+        table = table.drop_columns([TRACKS.names[0]])
     others = [] if tracks in ("", RECORDED) else [Path(tracks)]
     boxes = _read_table(others[0]) if others else None
     source = table_source(table, path.name, boxes, tracks)
