@@ -358,8 +358,10 @@ def _scored_elsewhere(
     from shiftsim.runs.rollouts.elsewhere import RECORDED, read_source
     from shiftsim.verify.simulation_log import log_source
 
-    tracks = given["tracks"]
-    found = log_source(source) or read_source(source, tracks)
+    tracks, logs = given["tracks"], log_source(source)
+    if logs and tracks:
+        raise ConfigError("simulation logs say where the others were", hint="leave --tracks out")
+    found = logs or read_source(source, tracks)
     settings = {"store": DEFAULT_STORE, **settings}
     options = {"point": given["point"], "partial_rollouts": given["partial"]}
     return score_elsewhere(found, recorded=tracks == RECORDED, **options, **settings, **how)

@@ -401,6 +401,9 @@ def test_columns_that_lack_or_are_not_used_are_named(scene):
     columns = columns_of(scene)
     found = shiftsim.score_rollout({**columns, "z": columns["x"]}, scene)
     assert "columns not used: z" in found.remarks
+    boxes = boxes_of(scene, height=np.ones(25))
+    found = shiftsim.score_rollout(columns, scene, tracks=boxes)
+    assert "columns not used: height" in found.remarks
     del columns["heading"]
     with pytest.raises(DataError, match="poses: column 'heading' is missing"):
         shiftsim.score_rollout(columns, scene)

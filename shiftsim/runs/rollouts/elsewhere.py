@@ -23,7 +23,7 @@ from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.metrics import MetricResult, Thresholds, compute_metrics
 from shiftsim.metrics.score import without
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.rollouts.columns import KINDS, NOISE_COLUMNS, STATES, TRACKS
+from shiftsim.runs.rollouts.columns import KINDS, STATES, TRACKS
 from shiftsim.runs.rollouts.poses import NEED_BOXES, POINTS, REAR_AXLE, Boxes, Driven, rollout_of
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.scenario import Scenario
@@ -38,9 +38,8 @@ _SAME = {  # other names of columns, those of our own rollouts among them
 _KEY = {"planner": pa.string(), "noise": pa.string(), "seed": pa.int64(), "token": pa.string()}
 _TIMES, _POSE = {"time_us": 1.0, "time_s": 1e6}, ("x", "y", "heading")
 _BOX = (*STATE_COLUMNS[:5], "length", "width")
-_POSES = {*_KEY, *_TIMES, *STATE_COLUMNS, "seconds"}  # columns of poses that are known
-_POSES |= {_SAME.get(name, name) for name in (*STATES.names, *TRACKS.names)}
-_POSES |= {"iteration", KINDS, *NOISE_COLUMNS}
+_KNOWN = {*_KEY, *_TIMES, *STATE_COLUMNS, *_BOX, "seconds", "track_token", "type"}
+_KNOWN |= {*STATES.names, *TRACKS.names, KINDS, "iteration"}  # of rollouts of our own
 _NO_ROWS = np.zeros(0, np.int64)
 _TEXTS = dict.fromkeys(
     ("planner", "noise", "token", "scenario", "track_token", "type"), pa.string()
@@ -229,7 +228,7 @@ def table_source(
         entries.append(Entry(task, partial(_with_boxes, driven, others and others.of(task))))
     if not entries:
         raise DataError(f"{where} has no rows", hint=_HINT)
-    unused = sorted({*table.column_names} - _POSES)
+    unused = sorted({*table.column_names, *(others.columns if others else ())} - _KNOWN)
     remarks = [f"columns not used: {listed(unused)}"] if unused else []
     entries.sort(key=lambda entry: (entry.task.token, entry.task))
     return Source(where, (), tuple(entries), others is not None, point, tuple(remarks))
@@ -278,14 +277,12 @@ def _numbers(table: pa.Table, names: Sequence[str], where: str) -> FloatArray:
 
 def _times(table: pa.Table, where: str) -> IntArray:
     """(A,) times [us]."""
-    if "time_us" in table.column_names:
-        stamps: IntArray = _column(table, "time_us", pa.int64(), where).to_numpy()
-        return stamps
-    seconds = _numbers(table, ["time_s"], where)[:, 0]
-    if not np.isfinite(seconds).all():
-        row = int(np.argmin(np.isfinite(seconds)))
-        raise DataError(f"{where}, row {row}: time_s is missing", hint="give it in every row")
-    return np.rint(seconds * 1e6).astype(np.int64)
+    name = next(name for name in _TIMES if name in table.column_names)
+    times = _numbers(table, [name], where)[:, 0]  # microseconds since 1970 are exact
+    if (missing := ~np.isfinite(times)).any():
+        words = f"{where}, row {np.argmax(missing)}: {name} is missing"
+        raise DataError(words, hint="give it in every row")
+    return np.rint(times * _TIMES[name]).astype(np.int64)
 
 
 def _groups(table: pa.Table, where: str) -> dict[tuple[tuple[str, Any], ...], IntArray]:
@@ -323,7 +320,8 @@ class _Others:
 
     def __init__(self, table: pa.Table, where: str) -> None:
         _require(table, where, ("token", "track_token", *_POSE, "length", "width"), _BOX_HINT)
-        self.where, self._groups = where, _groups(table, where)
+        self.where, self.columns = where, table.column_names
+        self._groups = _groups(table, where)
         self._time_us, self._values = _times(table, where), _numbers(table, _BOX, where)
         tokens = _column(table, "track_token", pa.string(), where).dictionary_encode()
         self._names, self._tracks = tokens.dictionary, tokens.indices.to_numpy()
