@@ -328,7 +328,8 @@ def score(
     allow_partial = settings.pop("allow_partial", False)
     given = {"tracks": tracks, "point": point, "partial": partial_rollouts}
     is_run = source.is_dir() and (source / "manifest.json").is_file()
-    make = _scored_again if is_run or not source.exists() else _scored_elsewhere
+    is_run = is_run or not (source.exists() or source.suffix)
+    make = _scored_again if is_run else _scored_elsewhere
     with stdout_to_stderr(), progress_bar(quiet=quiet or as_json) as advance:
 
         def show(progress: "Progress") -> None:

@@ -531,7 +531,8 @@ def test_the_command_scores_a_table(toy, tmp_path, call):
     assert code == 1
     assert "--tracks is for what was driven elsewhere" in err
     code, _, err = call("score", tmp_path / "nothing.csv")
-    assert "no run folder" in err or "does not exist" in err
+    assert code == 2
+    assert "nothing.csv' is no readable table" in err
 
 
 def test_several_rollouts_of_a_scenario_are_kept_apart(scene):
