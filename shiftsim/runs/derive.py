@@ -327,8 +327,8 @@ def score_elsewhere(
             first = min(failed, key=lambda result: result.task)
             more = f"; {len(tasks) - 1} other rollouts fail as well" if len(tasks) > 1 else ""
             raise DataError(f"{first.error}{more}", first.hint)
-        words = _counted(remarks, len(tasks) - len(failed))
-        about = {"undefined": undefined, "remarks": [source.name, *source.remarks, *words]}
+        counted = _counted(remarks, len(tasks) - len(failed))
+        about = {"undefined": undefined, "remarks": [source.name, *source.remarks, *counted]}
         manifest |= {"state": "finished", "ended": now(), "elsewhere": about}
         expected = {task._replace(token=token) for task in tasks for token in source.tokens}
         return writer.finish(manifest, expected, default=f"not in {source.name}")

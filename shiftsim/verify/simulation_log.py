@@ -23,7 +23,10 @@ import numpy as np
 
 from shiftsim.errors import DataError, MissingExtraError
 from shiftsim.kernels import IntArray
-from shiftsim.runs.rollouts import Task, elsewhere
+from shiftsim.runs.rollouts import Task
+from shiftsim.runs.rollouts.elsewhere import Entry
+from shiftsim.runs.rollouts.elsewhere import Source as Rollouts
+from shiftsim.runs.rollouts.poses import Boxes, Driven
 from shiftsim.verify.report import Report
 from shiftsim.verify.rollouts import CENTER_COLUMNS, origin, read_ego, tracks_of
 from shiftsim.verify.tables import DAMAGED, Source
@@ -161,7 +164,7 @@ def _require_msgpack(files: Iterable[Path]) -> None:
         )
 
 
-def log_source(path: Path) -> elsewhere.Source | None:
+def log_source(path: Path) -> Rollouts | None:
     """The rollouts of a log, or of all logs in a folder; None where there is none.
 
     Raises:
@@ -171,9 +174,9 @@ def log_source(path: Path) -> elsewhere.Source | None:
     if not files:
         return None
     _require_msgpack(files)
-    entries = [elsewhere.Entry(Task(*_names(file)), partial(_driven, file)) for file in files]
+    entries = [Entry(Task(*_names(file)), partial(_driven, file)) for file in files]
     entries.sort(key=lambda entry: (entry.task.token, entry.task))
-    return elsewhere.Source(path.name, tuple(files), tuple(entries), True, is_whole=False)
+    return Rollouts(path.name, tuple(files), tuple(entries), True, is_whole=False)
 
 
 def _names(file: Path) -> tuple[str, str, int, str]:
@@ -185,7 +188,7 @@ def _names(file: Path) -> tuple[str, str, int, str]:
     return planner, "none", 0, file.name.partition(".")[0]
 
 
-def _driven(path: Path) -> elsewhere.Driven:
+def _driven(path: Path) -> Driven:
     """What a log says of a rollout, and what its reader must know."""
     recorded = read_simulation_log(path, Report())
     ego, plans, count = read_ego(recorded.ego), recorded.plans, recorded.ego.num_rows
@@ -198,8 +201,8 @@ def _driven(path: Path) -> elsewhere.Driven:
         words.append("the last sample repeats a time and is dropped")
     remarks = [f"simulation log: {', '.join(words)}"]
     times = recorded.ego["time_us"].astype(np.int64)
-    boxes = elsewhere.Boxes(times, tracks_of(recorded.objects, count))
-    return elsewhere.Driven(path.name, times, ego, np.arange(count), boxes, remarks=tuple(remarks))
+    boxes = Boxes(times, tracks_of(recorded.objects, count))
+    return Driven(path.name, times, ego, np.arange(count), boxes, remarks=tuple(remarks))
 
 
 def read_simulation_log(path: Path, report: Report) -> Recorded:

@@ -142,8 +142,8 @@ def score_rollout(
     if len(source.entries) != 1:
         words = f"{len(source.entries)} rollouts of scenario {scenario.token!r} in the poses"
         raise DataError(words, hint="give those of one")
-    driven, given = source.entries[0].read(), {"point": point, "partial": partial}
-    log, remarks = rollout_of(driven, scenario, recorded=is_recorded, **given)
+    driven = source.entries[0].read()
+    log, remarks = rollout_of(driven, scenario, point=point, recorded=is_recorded, partial=partial)
     undefined = () if source.has_boxes or is_recorded else NEED_BOXES
     result = without(compute_metrics(log, scenario.map, thresholds=thresholds), undefined)
     total, remarks = None if undefined else result.score, (*source.remarks, *remarks)
@@ -225,7 +225,8 @@ def table_source(
         task = Task(**{"planner": where.partition(".")[0], "noise": "none", "seed": 0, **dict(key)})
         fields = {} if seconds is None else {"planning_seconds": seconds[rows]}
         driven = Driven(where, time_us[rows], states[rows], rows, fields=fields)
-        entries.append(Entry(task, partial(_with_boxes, driven, others and others.of(task))))
+        read = partial(_with_boxes, driven, others.of(task) if others else None)
+        entries.append(Entry(task, read))
     if not entries:
         raise DataError(f"{where} has no rows", hint=_HINT)
     unused = sorted({*table.column_names, *(others.columns if others else ())} - _KNOWN)
@@ -328,9 +329,14 @@ class _Others:
         self._kinds, self._is_ego = np.full(len(table), -1), np.zeros(len(table), np.bool_)
         if "type" in table.column_names:
             self._read_kinds(_column(table, "type", pa.string(), where).dictionary_encode())
-        broken = ~np.isfinite(self._values[:, [0, 1, 2, 5, 6]]).all(axis=1)
-        _refuse(broken, where, np.arange(len(table)), "a number is missing")
-        flat = (self._values[:, 5:] <= 0.0).any(axis=1)
+        broken = ~np.isfinite(self._values[:, [0, 1, 2, 5, 6]])
+        _refuse(
+            np.logical_or.reduce(broken, axis=1),
+            where,
+            np.arange(len(table)),
+            "a number is missing",
+        )
+        flat = self._values[:, 5:].min(axis=1) <= 0.0
         _refuse(flat, where, np.arange(len(table)), "length and width must be above 0")
 
     def _read_kinds(self, types: pa.DictionaryArray) -> None:
@@ -350,10 +356,10 @@ class _Others:
         names = [name for name, _ in next(iter(self._groups), ())]
         rows = self._groups.get(tuple((name, getattr(task, name)) for name in names), _NO_ROWS)
         rows = rows[~self._is_ego[rows]]
-        columns = (self._time_us, self._tracks, self._kinds, self._values)
         tracks = np.unique(self._tracks[rows])
         tokens = dict(zip(tracks.tolist(), self._names.take(tracks).to_pylist(), strict=True))
-        return partial(_boxes, self.where, rows, *(column[rows] for column in columns), tokens)
+        times, numbers, kinds = self._time_us[rows], self._tracks[rows], self._kinds[rows]
+        return partial(_boxes, self.where, rows, times, numbers, kinds, self._values[rows], tokens)
 
 
 def _boxes(

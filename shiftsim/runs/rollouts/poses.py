@@ -82,8 +82,8 @@ class Driven:
 class _Samples(NamedTuple):
     """Where K times lie among F others."""
 
-    index: IntArray  # (K,) the nearest time where it is taken as it is, else the one before
-    weight: FloatArray  # (K,) of the time after `index`; 0 where the nearest is taken as it is
+    at: IntArray  # (K,) the nearest time where it is taken as it is, else the one before
+    weight: FloatArray  # (K,) of the time after `at`; 0 where the nearest is taken as it is
     distance: IntArray  # (K,) to the nearest [us]
 
 
@@ -125,7 +125,7 @@ def rollout_of(
     if (far := samples.distance > _NEAR).any():
         step = int(np.argmax(far))
         driven.refuse_one(
-            int(samples.index[step]),
+            int(samples.at[step]),
             f"no sample within {_NEAR // 1000} ms of iteration {step}, the nearest is "
             f"{samples.distance[step] * 1e-3:.1f} ms away",
             "give 10 Hz in step with the recording, or 20 Hz and more, from iteration 0 on",
@@ -134,9 +134,9 @@ def rollout_of(
     if samples.weight.any():
         ego[:, 3:] = np.nan
         remarks.append("poses interpolated to the iterations")
-    _check_start(driven, int(samples.index[0]), ego[0], scenario.expert[0], point)
+    _check_start(driven, int(samples.at[0]), ego[0], scenario.expert[0], point)
     remarks += _fill(ego, times, driven, samples)
-    fields = {name: values[samples.index] for name, values in driven.fields.items()}
+    fields = {name: values[samples.at] for name, values in driven.fields.items()}
     log = replace(as_recorded(scenario), ego=ego, **fields)
     if driven.boxes is not None:
         tracks, more = _others(driven, driven.boxes, shift, log)
@@ -153,11 +153,10 @@ def _check_rows(driven: Driven) -> None:
     if count < MIN_SAMPLES:
         words = f"{count} samples; the metrics need {MIN_SAMPLES}"
         driven.refuse_one(0, words, "give a sample for each iteration, every 0.1 s")
-    is_given = ~np.isnan(states).all(axis=0)
-    is_given[:3] = True
+    is_given: BoolArray = ~np.isnan(states).all(axis=0) | (np.arange(len(STATE_COLUMNS)) < VX)
     broken = ~np.isfinite(states) & is_given
     driven.refuse(
-        broken.any(axis=1),
+        np.logical_or.reduce(broken, axis=1),
         lambda row: f"{STATE_COLUMNS[np.argmax(broken[row])]} is missing or not finite",
         "give a number in every row; states may lack as whole columns of a rollout",
     )
@@ -285,8 +284,8 @@ def _locate(time_us: IntArray, wanted: IntArray) -> _Samples:
 
 def _at(states: FloatArray, samples: _Samples) -> FloatArray:
     """(K, …, C) of states (F, …, C), which begin with a pose; headings turn the short way."""
-    out, between = np.array(states[samples.index]), np.flatnonzero(samples.weight)
-    index = samples.index[between]
+    out, between = np.array(states[samples.at]), np.flatnonzero(samples.weight)
+    index = samples.at[between]
     change = states[np.minimum(index + 1, len(states) - 1)] - out[between]
     change[..., HEADING] = wrap_angles(change[..., HEADING])
     out[between] += samples.weight[between].reshape(-1, *[1] * (states.ndim - 1)) * change
@@ -303,7 +302,7 @@ def _fill(ego: FloatArray, times: IntArray, driven: Driven, samples: _Samples) -
     if runs.any():
         at = int(np.argmax(runs))
         driven.refuse_one(
-            int(samples.index[at]),
+            int(samples.at[at]),
             f"vx is {ego[at, VX]:.3g} m/s, but the positions move by {derived[at, VX]:.3g} m/s "
             f"along the heading, and so on for {_IN_A_ROW} samples",
             "give velocities in m/s in the frame of the ego, or leave them out",
@@ -333,13 +332,13 @@ def _others(
     if len(given):
         samples = _locate(boxes.time_us + shift, times)
         lost = samples.distance > _NEAR
-        after = np.minimum(samples.index + (samples.weight != 0.0), len(given) - 1)
+        after = np.minimum(samples.at + (samples.weight != 0.0), len(given) - 1)
         tracks = replace(
-            given.rows(samples.index),
-            valid=given.valid[samples.index] & given.valid[after] & ~lost[:, None],
+            given.rows(samples.at),
+            valid=given.valid[samples.at] & given.valid[after] & ~lost[:, None],
             poses=_at(given.poses, samples),
         )
-        tracks = tracks.select(tracks.valid.any(axis=0))
+        tracks = tracks.select(np.logical_or.reduce(tracks.valid, axis=0))
         if samples.weight[~lost].any():
             remarks.append("boxes of others interpolated to the iterations")
     lost &= log.tracks.valid.any(axis=1)
@@ -366,10 +365,10 @@ def _others(
     velocities[:, ~moves] = np.nan
     if np.count_nonzero(tracks.valid) < 2 * tracks.num_tracks:
         remarks.append("tracks last one sample: each contact counts anew")
-    absent = ~tracks.valid[..., None]
-    arrays = {"poses": tracks.poses, "velocities": velocities, "sizes": tracks.sizes}
-    arrays = {name: np.where(absent, np.nan, values) for name, values in arrays.items()}
-    return replace(tracks, kinds=kinds, **arrays), remarks
+    there = tracks.valid[..., None]
+    arrays = (tracks.poses, velocities, tracks.sizes)
+    poses, velocities, sizes = (np.where(there, values, np.nan) for values in arrays)
+    return Tracks(tracks.valid, poses, velocities, sizes, kinds, tracks.tokens), remarks
 
 
 def _differences(tracks: Tracks, times: IntArray) -> FloatArray:
