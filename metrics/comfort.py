@@ -21,7 +21,16 @@ from shiftsim.metrics.result import (
     Violation,
     first_violation,
 )
-from shiftsim.world.state import AX, AY, HEADING, center_accelerations
+from shiftsim.world.state import (
+    AX,
+    AY,
+    HEADING,
+    NUM_STATE,
+    VX,
+    YAW_ACCEL,
+    YAW_RATE,
+    center_accelerations,
+)
 
 NAME = "ego_is_comfortable"
 MIN_SAMPLES = 4  # the yaw acceleration is a cubic fit
@@ -100,6 +109,27 @@ def comfort_signals(time_us: IntArray, states: FloatArray) -> ComfortSignals:
         yaw_rate=_filtered(heading, yaw_rate, step),
         yaw_accel=_filtered(heading, yaw_accel, step**2),
     )
+
+
+def derived_states(time_us: IntArray, poses: FloatArray) -> FloatArray:
+    """(K, 11) states of rear-axle poses (K, 3) at times (K,) [us]; steering is not known: 0.
+
+    Positions go through a filter of window 5 and degree 2, whose derivatives are turned into the
+    heading, as nuPlan's planners of networks do; yaw rates are those of the metrics above.
+    """
+    step, count = float(np.mean(np.diff(time_us / 1e6))), len(poses)
+    window, turned = min(_YAW_WINDOW, count), np.exp(-1j * poses[:, HEADING])
+    states = np.zeros((count, NUM_STATE))
+    states[:, :3] = poses
+    for column, order in ((VX, 1), (AX, 2)):
+        how, scale = make_filter(window, 2, order), step**order
+        x, y = (_filtered(poses[:, axis] - poses[0, axis], how, scale) for axis in (0, 1))
+        along = (x + 1j * y) * turned
+        states[:, column], states[:, column + 1] = along.real, along.imag
+    heading, (_, _, yaw_rate, yaw_accel) = unwrap(poses[:, HEADING]), filters_of(count)
+    states[:, YAW_RATE] = _filtered(heading, yaw_rate, step)
+    states[:, YAW_ACCEL] = _filtered(heading, yaw_accel, step**2)
+    return states
 
 
 def bounds_of(thresholds: Thresholds) -> list[tuple[float, float]]:

@@ -4,8 +4,8 @@ What depends on geometry and on no threshold is measured once; any number of thr
 be applied to the result.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -91,7 +91,7 @@ class Measurements:
 class MetricResult:
     """Everything nuPlan says about one rollout under one threshold profile."""
 
-    score: float  # closed-loop score in [0, 1]
+    score: float  # closed-loop score in [0, 1]; NaN where a metric is undefined
     # score by devkit metric name, None for metrics without one; always the same order
     scores: dict[str, float | None]
     rows: tuple[MetricRow, ...]  # one row per metric, in the same order
@@ -157,6 +157,20 @@ def evaluate(measurements: Measurements, thresholds: str | Thresholds = "nuplan"
         series={part.row.metric: part.series for part in parts if part.series is not None},
         thresholds=profile.name,
         measurements=measurements,
+    )
+
+
+def without(result: MetricResult, undefined: Collection[str]) -> MetricResult:
+    """A result without metrics that cannot be known; where there are some, the score is NaN."""
+    if not undefined:
+        return result
+    return replace(
+        result,
+        score=np.nan,
+        scores={name: s if name not in undefined else None for name, s in result.scores.items()},
+        rows=tuple(row for row in result.rows if row.metric not in undefined),
+        statistics=tuple(one for one in result.statistics if one.metric not in undefined),
+        series={name: one for name, one in result.series.items() if name not in undefined},
     )
 
 

@@ -20,6 +20,7 @@ from shiftsim.env.policy import policy_planner as policy_planner
 from shiftsim.errors import ShiftsimError as ShiftsimError
 from shiftsim.metrics import compute_metrics as score
 from shiftsim.planners.contract import check_planner as check_planner
+from shiftsim.runs.rollouts.elsewhere import score_rollout as score_rollout
 from shiftsim.sim.log import SimulationLog as SimulationLog
 from shiftsim.sim.noise import NoiseModel as NoiseModel
 from shiftsim.sim.planner import Observation as Observation
@@ -61,6 +62,7 @@ __all__ = [
     "policy_planner",
     "run",
     "score",
+    "score_rollout",
     "show",
     "simulate",
 ]

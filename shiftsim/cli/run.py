@@ -306,29 +306,69 @@ def _print_results(finished: "Run", *, allow_partial: bool) -> None:
 
 
 @cli.with_settings(
-    *"thresholds metrics store out workers allow_partial".split(),
-    store="Store. [the one of the run]",
+    *"thresholds metrics store out workers allow_partial traffic controller".split(),
+    store="Store. [that of the run; of files demo]",
+    traffic="What moved the others there, of files: a label. [elsewhere]",
+    controller="What moved the ego there, of files: a label. [elsewhere]",
 )
 def score(
     *,
-    source: Path = Argument(metavar="RUN", help="A run with stored rollouts."),
+    source: Path = Argument(metavar="RUN|FILE", help="A run; poses; nuPlan's simulation logs."),
+    tracks: str = Option("", help="The others: a table of boxes, or recorded. Of files."),
+    point: str = Option("", help="rear_axle or center, whose poses files hold. [rear_axle]"),
+    partial_rollouts: bool = Option(
+        False, "--partial", help="Also rollouts that end before their scenario; labelled so."
+    ),
     settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Score stored rollouts again, under another threshold profile, without simulating."""
-    from shiftsim.runs.derive import rescore
+    """Score rollouts: stored ones again, or what was driven elsewhere.
 
-    run = shiftsim.open_run(source)
+    A run folder is scored under another threshold profile, without simulating. A table of poses
+    (Parquet, CSV) or a simulation log of nuPlan becomes a run folder: docs/score_elsewhere.md.
+    """
     allow_partial = settings.pop("allow_partial", False)
-    settings = {"thresholds": run.manifest["config"]["thresholds"], **settings}
+    given = {"tracks": tracks, "point": point, "partial": partial_rollouts}
+    is_run = source.is_dir() and (source / "manifest.json").is_file()
+    is_run = is_run or not (source.exists() or source.suffix)
+    make = _scored_again if is_run else _scored_elsewhere
     with stdout_to_stderr(), progress_bar(quiet=quiet or as_json) as advance:
 
         def show(progress: "Progress") -> None:
             advance(progress.done, progress.total)
 
-        finished = rescore(run, **settings, on_progress=show, argv=sys.argv)
+        finished = make(source, given, settings, on_progress=show, argv=sys.argv)
     leave_with(finished, allow_partial=allow_partial, as_json=as_json)
+
+
+def _scored_again(source: Path, given: cli.Settings, settings: cli.Settings, **how: Any) -> "Run":
+    from shiftsim.runs.derive import rescore
+
+    run = shiftsim.open_run(source)
+    named = [*filter(given.get, given), *sorted({"traffic", "controller"} & settings.keys())]
+    if named:
+        raise ConfigError(
+            f"--{named[0]} is for what was driven elsewhere; {str(source)!r} is a run",
+            hint="leave it out",
+        )
+    return rescore(run, **{"thresholds": run.manifest["config"]["thresholds"], **settings}, **how)
+
+
+def _scored_elsewhere(
+    source: Path, given: cli.Settings, settings: cli.Settings, **how: Any
+) -> "Run":
+    from shiftsim.runs.derive import score_elsewhere
+    from shiftsim.runs.rollouts.elsewhere import RECORDED, read_source
+    from shiftsim.verify.simulation_log import log_source
+
+    tracks, logs = given["tracks"], log_source(source)
+    if logs and tracks:
+        raise ConfigError("simulation logs say where the others were", hint="leave --tracks out")
+    found = logs or read_source(source, tracks)
+    settings = {"store": DEFAULT_STORE, **settings}
+    options = {"point": given["point"], "partial_rollouts": given["partial"]}
+    return score_elsewhere(found, recorded=tracks == RECORDED, **options, **settings, **how)
 
 
 def merge(

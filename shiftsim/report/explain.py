@@ -98,9 +98,11 @@ def explain_tasks(
 
 
 def why(cls: float | None, metrics: list[dict[str, Any]]) -> str:
-    """A score x 100 in one line: what made it 0, or how it is composed; empty for a failed task."""
+    """A score x 100 in one line: why it is 0 or undefined, or its parts; empty if it failed."""
     if cls is None:
-        return ""
+        lost = {*MULTIPLIERS, *WEIGHTS} - {row["metric"] for row in metrics}
+        names = [in_words(name) for name in SHORT_NAMES if name in lost]
+        return f"no score: undefined without the others: {', '.join(names)}" if metrics else ""
     scored = [row for row in metrics if row["score"] is not None]
     factors = [row for row in scored if row["role"] == "multiplier"]
     parts = [row for row in scored if row["role"] == "weighted"]
@@ -133,7 +135,8 @@ def explain_lines(task: dict[str, Any]) -> list[str]:
         return [f"{head}  {task['status']}", *(f"  {line}" for line in lines)]
     rule = "the score is the product of the × rows and the weighted mean of the + rows, all x 100"
     lines = [*task["edits"], task["why"], rule, *map(_metric_line, task["metrics"])]
-    return [f"{head}  CLS {100.0 * task['cls']:.2f}", *(f"  {line}" for line in lines)]
+    total = "undefined" if task["cls"] is None else f"{100.0 * task['cls']:.2f}"
+    return [f"{head}  CLS {total}", *(f"  {line}" for line in lines)]
 
 
 def _metric_line(row: dict[str, Any]) -> str:

@@ -166,13 +166,21 @@ class Group:
         return np.array([row.mean() for row in seeds if len(row)])
 
     def estimate(self, name: str = "cls") -> Number:
-        """The score of one column, times 100; empty where there are no scenarios."""
+        """The score of one column, times 100; empty of no scenarios, or where it is undefined."""
+        if name in undefined_columns(self.run):
+            return Number(None, done=0, expected=0)
         finished = np.isfinite(self.column(name))
         done, expected = int(finished.sum()), finished.size
         if not done or (done < expected and not self.allow_partial):
             return Number(None, done=done, expected=expected)
         means = 100.0 * self.seed_means(name)
         return Number(float(means.mean()), 2, seed_deviation(means), done, expected)
+
+
+def undefined_columns(run: Run) -> set[str]:
+    """Columns that nobody can know of rollouts that were driven elsewhere, without other tracks."""
+    undefined = run.manifest.get("elsewhere", {}).get("undefined", ())
+    return {"cls", *undefined} if undefined else set()
 
 
 def seed_deviation(values: FloatArray) -> float | None:
@@ -330,6 +338,7 @@ def _groups(run: Run, known: Sequence[KnownSet]) -> Iterator[Group]:
     traffic = str(run.manifest["determining"]["traffic"])
     # nuPlan rule 570: a metric without a score counts as 0
     table = np.stack([pc.fill_null(scores[name], 0.0).to_numpy() for name in COLUMNS], axis=1)
+    table[:, [name in undefined_columns(run) for name in COLUMNS]] = np.nan
     places = pc.index_in(scores["token"], value_set=pa.array(data.tokens, pa.string())).to_numpy()
     order = product(
         _ordered(tasks["planner"], run.manifest["config"]["planners"]),

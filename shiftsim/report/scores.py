@@ -71,7 +71,8 @@ def scores(groups: Sequence[Group], *, by: str | None = None) -> Table:
 
 
 def planner_notes(runs: Iterable[Run]) -> list[str]:
-    """What a reader must know of planners: whose weights they had, and who saw the recording."""
+    """What a reader must know of planners: their weights, who saw the recording, who drove."""
+    runs = list(runs)
     made_up, own, informed = set[str](), set[str](), set[str]()
     for name, identity in (pair for run in runs for pair in planner_identities(run).items()):
         if str(identity.get("checkpoint", "")).startswith("deterministic:"):
@@ -85,7 +86,9 @@ def planner_notes(runs: Iterable[Run]) -> list[str]:
         "; ".join(sorted(own)): own,
         f"given the recorded future: {', '.join(sorted(informed))}": informed,
     }
-    return [note for note, names in notes.items() if names]
+    told = (run.manifest.get("elsewhere", {}).get("remarks", ()) for run in runs)
+    elsewhere = (f"driven elsewhere: {'; '.join(remarks)}" for remarks in told if remarks)
+    return [*(note for note, names in notes.items() if names), *dict.fromkeys(elsewhere)]
 
 
 def _describe(group: Group) -> str:
@@ -109,9 +112,12 @@ def _lines(labels: tuple[str, ...], part: Group, caption: str) -> tuple[list[Row
     found = [part.estimate(name) for name in COLUMNS]
     means = [None if one.value is None else Number(one.value) for one in found]
     spread = [Number(one.std) for one in found if one.std is not None]
-    count, label = f"{found[0].done}/{found[0].expected}", found[0].label
+    known = next((one for one in found if one.expected), found[0])
+    count, label = f"{known.done}/{known.expected}", known.label
     about = (*count.split("/"), f"{label}; {caption}" if label else caption)
     first = f"– ({count} done)" if means[0] is None else f"{means[0]} {label}".rstrip()
+    if known is not found[0]:
+        first = "undefined"
     shown: list[Row] = [(*labels, first, *(number or "–" for number in means[1:]))]
     full: list[Row] = [(*labels, *means, "mean", *about)]
     if spread:
@@ -172,7 +178,7 @@ def _summary(group: Group) -> dict[str, Any]:
     seeds = {name: group.seed_means(name) for name in COLUMNS}
     means = {name: float(values.mean()) for name, values in seeds.items() if len(values)}
     spread = {name: seed_deviation(values) for name, values in seeds.items() if len(values) > 1}
-    finished = np.isfinite(group.column())
+    finished = np.isfinite(group.values).any(axis=2)
     return {
         "set": group.data.label,
         "planner": group.planner,

@@ -1,5 +1,7 @@
-"""Runs made of other runs, without simulating: shards joined, and rollouts scored again."""
+"""Runs made without simulating: of shards, and of rollouts that are stored or driven elsewhere."""
 
+import shutil
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
@@ -7,7 +9,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from shiftsim.errors import ConfigError, DataError
+from shiftsim._version import __version__
+from shiftsim.data import open_store
+from shiftsim.data.store.tables import digest
+from shiftsim.errors import ConfigError, DataError, one_of
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.metrics.open_loop import NAMES as OPEN_LOOP
 from shiftsim.runs.config import RunConfig, default_workers, make_config, parse_shard
@@ -18,10 +23,15 @@ from shiftsim.runs.manifest import check_target, code_digest, difference, make_m
 from shiftsim.runs.prepare import RUNS, run_name
 from shiftsim.runs.results import Run, open_run
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.scenarios import open_run_store
-from shiftsim.runs.tables import MISSING, OK, TaskResult, stored_results
-from shiftsim.runs.task import Batch, ScenarioReader, attempt, score_rollout
+from shiftsim.runs.rollouts.columns import encode_rows, rollout_rows
+from shiftsim.runs.rollouts.elsewhere import Entry, Source
+from shiftsim.runs.rollouts.poses import NEED_BOXES, POINTS, REAR_AXLE, rollout_of
+from shiftsim.runs.scenarios import open_run_store, split_name, token_hash
+from shiftsim.runs.tables import FAILED, MISSING, OK, TaskResult, stored_results
+from shiftsim.runs.task import Batch, ScenarioReader, attempt, planner_times, score_rollout
 from shiftsim.runs.workers import map_unordered
+
+ELSEWHERE = "elsewhere"  # what moved ego and others, where nobody says more
 
 
 def merge_runs(runs: Sequence[Run], *, out: str | None = None, allow_partial: bool = False) -> Run:
@@ -127,7 +137,8 @@ class Rescorer:
     def _score(self, task: Task) -> TaskResult:
         scenario = self._scenarios.read(task.token)
         log = self._run.rollout(task, scenario)
-        scores, metrics = score_rollout(scenario, log, self.config)
+        undefined = self._run.manifest.get("elsewhere", {}).get("undefined", ())
+        scores, metrics = score_rollout(scenario, log, self.config, undefined)
         profile = {"thresholds": self.config.thresholds}
         metrics += [row | profile for row in self._open_loop.get(task, [])]
         return TaskResult(task, OK, scenario.scenario_type, scores=scores, metrics=metrics)
@@ -183,7 +194,8 @@ def rescore(
         fingerprint=fingerprint,
         argv=argv,
     )
-    manifest |= {key: run.manifest[key] for key in ("edits", "split_size") if key in run.manifest}
+    kept = ("edits", "split_size", "elsewhere")
+    manifest |= {key: run.manifest[key] for key in kept if key in run.manifest}
     with closing(RunWriter(target, manifest)) as writer:
         for result in stored_results(run.path):
             if result.status != OK:  # it stays so
@@ -205,3 +217,143 @@ def rescore(
             record(map(results_of, outcomes), add, Progress(0, len(done), 0), on_progress)
         manifest |= {"state": "finished", "ended": now(), "rescored_from": run.path.name}
         return writer.finish(manifest, statuses, dict(_without_result(run)))
+
+
+class ElsewhereScorer:
+    """Scores one rollout after the other that was driven elsewhere."""
+
+    def __init__(self, store: str, config: RunConfig, undefined: Sequence[str], **given: Any):
+        """`given` are arguments of `rollout_of`."""
+        self.config, self._undefined, self._given = config, undefined, given
+        self._scenarios = ScenarioReader(store)
+
+    def __call__(self, entry: Entry) -> tuple[TaskResult, tuple[str, ...]]:
+        """The result of a rollout, and what a reader of it must know."""
+        remarks = list[str]()
+        return attempt(entry.task, partial(self._score, entry, remarks)), tuple(remarks)
+
+    def _score(self, entry: Entry, remarks: list[str]) -> TaskResult:
+        scenario, driven = self._scenarios.read(entry.task.token), entry.read()
+        log, found = rollout_of(driven, scenario, **self._given)
+        remarks += found
+        scores, metrics = score_rollout(scenario, log, self.config, self._undefined)
+        is_recorded = driven.boxes is None and not self._undefined
+        rows = rollout_rows(log, with_tracks=not is_recorded, with_kinds=not is_recorded)
+        return TaskResult(
+            entry.task,
+            OK,
+            scenario.scenario_type,
+            seconds=planner_times(log) if "planning_seconds" in driven.fields else {},
+            scores=scores,
+            metrics=metrics,
+            rollout=encode_rows(rows),
+        )
+
+
+def score_elsewhere(
+    source: Source,
+    *,
+    store: str,
+    recorded: bool = False,
+    partial_rollouts: bool = False,
+    point: str = "",
+    thresholds: str = "nuplan",
+    metrics: tuple[str, ...] = (),
+    traffic: str = "",
+    controller: str = ELSEWHERE,
+    out: str | None = None,
+    workers: int = 0,
+    on_progress: OnProgress = lambda progress: None,
+    argv: Sequence[str] = (),
+) -> Run:
+    """Write a run folder (`runs/<id>`) with the scores of rollouts that were driven elsewhere.
+
+    `recorded` and `partial_rollouts` are as in `rollout_of`, and so is `point`, where the source
+    does not say it; `traffic` and `controller` name what moved others and ego there.
+
+    Raises:
+        ConfigError: Settings contradict the source.
+        DataError: A scenario is unknown, or none of the rollouts can be scored.
+    """
+    if point and one_of("point", point, POINTS) != (source.point or point):
+        words = f"--point {point}, but {source.name} says {source.point}"
+        raise ConfigError(words, hint="leave --point out")
+    found = open_store(store)
+    source = source.in_store(found)
+    for metric in metrics:
+        load_metric(metric)
+    tasks = [entry.task for entry in source.entries]
+    config = RunConfig(
+        planners=tuple(dict.fromkeys(task.planner for task in tasks)),
+        noise=tuple(dict.fromkeys(task.noise for task in tasks)),
+        seeds=tuple(sorted({task.seed for task in tasks})),
+        store=store,
+        traffic=traffic or ("nonreactive" if recorded else ELSEWHERE),
+        thresholds=thresholds,
+        metrics=metrics,
+    )
+    given = {"point": point or source.point or REAR_AXLE, "recorded": recorded}
+    given["partial"] = partial_rollouts
+    fingerprint = _fingerprint(source, found.hash, config) | {"controller": controller, **given}
+    split = split_name(found, source.tokens, Path(source.name).stem)
+    target = Path(out) if out else RUNS / run_name(config, split, fingerprint)
+    is_new = check_target(target, fingerprint) == "new"
+    manifest = make_manifest(
+        target, config=config, split=split, store=found.source, fingerprint=fingerprint, argv=argv
+    )
+    undefined = () if recorded or source.has_boxes else NEED_BOXES
+    remarks, failed = Counter[str](), list[TaskResult]()
+    with closing(RunWriter(target, manifest)) as writer:
+        outcomes = map_unordered(
+            partial(ElsewhereScorer, found.source, config, undefined, **given),
+            source.entries,
+            workers=min(workers or default_workers(), len(tasks)),
+            alone=1,
+            group=lambda entry: entry.task.token,
+        )
+
+        def results() -> Iterator[list[TaskResult]]:
+            for outcome in outcomes:
+                lost = TaskResult(outcome.task.task, FAILED, error=outcome.death), ()
+                result, found = outcome.result or lost
+                remarks.update(found)
+                failed.extend([result] if result.status == FAILED else [])
+                yield [result]
+
+        with closing(outcomes):
+            record(results(), writer.add, Progress(0, len(tasks), 0), on_progress)
+        if len(failed) == len(tasks):
+            if is_new:
+                shutil.rmtree(target)
+            first = min(failed, key=lambda result: result.task)
+            more = f"; {len(tasks) - 1} other rollouts fail as well" if len(tasks) > 1 else ""
+            raise DataError(f"{first.error}{more}", first.hint)
+        counted = _counted(remarks, len(tasks) - len(failed))
+        about = {"undefined": undefined, "remarks": [source.name, *source.remarks, *counted]}
+        manifest |= {"state": "finished", "ended": now(), "elsewhere": about}
+        expected = {task._replace(token=token) for task in tasks for token in source.tokens}
+        return writer.finish(manifest, expected, default=f"not in {source.name}")
+
+
+def _counted(remarks: Counter[str], total: int) -> list[str]:
+    """What is to be known of rollouts, with their number where it is not of all."""
+    found = sorted(remarks.items())
+    return [f"{one} ({n} of {total} rollouts)" if n < total else one for one, n in found]
+
+
+def _fingerprint(source: Source, store: str, config: RunConfig) -> dict[str, Any]:
+    """What scores of rollouts that were driven elsewhere depend on, as JSON values."""
+    files = {path.name: digest(path) for path in source.files}
+    return {
+        "shiftsim": __version__,
+        "code": code_digest(),
+        "store": store,
+        "tokens": token_hash(source.tokens),
+        "planners": {name: {"driven": files} for name in config.planners},
+        "noise": {n: {"kind": "none" if n == "none" else ELSEWHERE} for n in config.noise},
+        "seeds": list(config.seeds),
+        "traffic": config.traffic,
+        "thresholds": asdict(thresholds_of(config.thresholds)),
+        "metrics": config.added_metrics,
+        "metric_version": METRIC_VERSION,
+    }

@@ -109,14 +109,16 @@ def diff_runs(
     single = len(planners[0]) == len(planners[1]) == 1
     names = dict(zip(*planners, strict=True)) if single else {n: n for n in planners[0]}
     ours, theirs = (
-        {task_of(row): row for row in run.scores.to_pylist()} for run in (first, second)
+        {task_of(row): row for row in run.scores.to_pylist() if row["cls"] is not None}
+        for run in (first, second)
     )
     pairs = {task: task._replace(planner=names[task.planner]) for task in sorted(ours)}
     pairs = {task: other for task, other in pairs.items() if other in theirs}
     if not pairs:
         raise ConfigError(
             f"runs {first.path.name!r} and {second.path.name!r} have no rollout in common",
-            hint="compare runs of the same planners, noises, seeds and scenarios",
+            hint="compare runs of the same planners, noises, seeds and scenarios; where the others "
+            "are not given there is no score",
         )
     before = np.array([ours[task]["cls"] for task in pairs])
     after = np.array([theirs[other]["cls"] for other in pairs.values()])

@@ -119,7 +119,8 @@ class Run:
         Raises:
             DataError: It was not stored, cannot be read, or the scenario is another one.
         """
-        return complete_rollout(self.rollout_rows(task), scenario, task)
+        rows, is_partial = self.rollout_rows(task), "elsewhere" in self.manifest
+        return complete_rollout(rows, scenario, task, is_partial=is_partial)
 
     def rollout_rows(self, task: Task) -> pa.RecordBatch:
         """One stored rollout as it lies on disk, a row per sample.

@@ -337,6 +337,15 @@ def read_split(path: Path) -> Split:
     return split
 
 
+def split_name(store: ScenarioStore, tokens: Sequence[str], default: str) -> str:
+    """The split of a store that has these scenarios, sorted; a default where none has."""
+    if list(store.tokens) == list(tokens):
+        return store.path.name
+    files = sorted((Path(store.path) / "splits").glob("*.toml"))
+    named = (path.stem for path in files if sorted(read_split(path).tokens) == list(tokens))
+    return next(named, default)
+
+
 def choose_scenarios(
     rows: Iterable[Mapping[str, str]],
     usable: Collection[str],

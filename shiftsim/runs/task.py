@@ -6,7 +6,7 @@ them: the open store, what copies of each planner are made from, and the last sc
 """
 
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -20,6 +20,7 @@ from shiftsim.data.store.reading import ScenarioStore, open_store
 from shiftsim.errors import ConfigError, ShiftsimError, readable
 from shiftsim.files import place_of
 from shiftsim.metrics import METRIC_VERSION, SHORT_NAMES, MetricRow, compute_metrics, open_loop
+from shiftsim.metrics.score import without
 from shiftsim.planners.registry import RunPlanner
 from shiftsim.runs.config import RunConfig
 from shiftsim.runs.rollouts import Task
@@ -148,10 +149,7 @@ class TaskRunner:
         if isinstance(log, BaseException):
             raise log
         scenario, warning = rollout.scenario, rollout.warning
-        per_step = log.planning_seconds * 1e3
-        seconds["planner_seconds"] = float(log.planning_seconds.sum())
-        seconds["planning_ms_mean"] = float(per_step.mean())
-        seconds["planning_ms_p95"] = float(np.percentile(per_step, 95))
+        seconds.update(planner_times(log))
         with _timed(seconds, "metrics_seconds"):
             scores, metrics = score_rollout(scenario, log, self.config)
         if self.config.open_loop and rollout.planner is not None:
@@ -247,15 +245,30 @@ def attempt(task: Task, work: Callable[[], T]) -> T | TaskResult:
         )
 
 
+def planner_times(log: SimulationLog) -> dict[str, float]:
+    """What the planner of a rollout took, by column of `tasks.parquet`."""
+    per_step = log.planning_seconds * 1e3
+    return {
+        "planner_seconds": float(log.planning_seconds.sum()),
+        "planning_ms_mean": float(per_step.mean()),
+        "planning_ms_p95": float(np.percentile(per_step, 95)),
+    }
+
+
 def score_rollout(
-    scenario: Scenario, log: SimulationLog, config: RunConfig
+    scenario: Scenario, log: SimulationLog, config: RunConfig, undefined: Collection[str] = ()
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The row of `scores.parquet` and the rows of `metrics.parquet`, beyond the key."""
+    """The row of `scores.parquet` and the rows of `metrics.parquet`, beyond the key.
+
+    Where metrics are undefined they have no row, and there is no total.
+    """
     result = compute_metrics(log, scenario.map, thresholds=config.thresholds, own=config.metrics)
     if scenario.script is not None and scenario.script.profile == "interplan":
         from shiftsim.metrics.interplan import add_interplan
 
         result = add_interplan(result, log, scenario.map, scenario.script)
+    if undefined:
+        result = without(result, undefined)
     profile = {"thresholds": config.thresholds, "metric_version": METRIC_VERSION}
     scores = {
         "scenario_type": scenario.scenario_type,
@@ -263,7 +276,7 @@ def score_rollout(
         "duration_class": scenario.duration_class,
         "log_name": scenario.log_name,
         "traffic": config.traffic,
-        "cls": result.score,
+        "cls": None if undefined else result.score,
         **{name: result.scores[name] for name in SHORT_NAMES if name != "score"},
         "degraded_steps": int(log.degraded.sum()),
         **profile,

@@ -9,6 +9,7 @@ import lzma
 import pickle
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from io import BytesIO
 from operator import attrgetter
@@ -22,8 +23,12 @@ import numpy as np
 
 from shiftsim.errors import DataError, MissingExtraError
 from shiftsim.kernels import IntArray
+from shiftsim.runs.rollouts import Task
+from shiftsim.runs.rollouts.elsewhere import Entry
+from shiftsim.runs.rollouts.elsewhere import Source as Rollouts
+from shiftsim.runs.rollouts.poses import Boxes, Driven
 from shiftsim.verify.report import Report
-from shiftsim.verify.rollouts import CENTER_COLUMNS
+from shiftsim.verify.rollouts import CENTER_COLUMNS, origin, read_ego, tracks_of
 from shiftsim.verify.tables import DAMAGED, Source
 from shiftsim.world.state import AgentKind, LightStatus, rear_poses
 
@@ -148,11 +153,56 @@ def find_simulation_logs(folder: Path) -> dict[tuple[str, str], Path]:
         (path.name.partition(".")[0], path.relative_to(root).parts[0]): path
         for path in sorted(root.glob("**/*.xz"))
     }
-    if any(_PACKED in path.suffixes for path in found.values()) and not find_spec("msgpack"):
+    _require_msgpack(found.values())
+    return found
+
+
+def _require_msgpack(files: Iterable[Path]) -> None:
+    if any(_PACKED in path.suffixes for path in files) and not find_spec("msgpack"):
         raise MissingExtraError(
             "simulation logs of nuPlan need msgpack", hint="pip install 'shiftsim[nuplan]'"
         )
-    return found
+
+
+def log_source(path: Path) -> Rollouts | None:
+    """The rollouts of a log, or of all logs in a folder; None where there is none.
+
+    Raises:
+        MissingExtraError: They cannot be read without the extra `nuplan`.
+    """
+    files = sorted(path.rglob("*.xz")) if path.is_dir() else [path] * (path.suffix == ".xz")
+    if not files:
+        return None
+    _require_msgpack(files)
+    entries = [Entry(Task(*_names(file)), partial(_driven, file)) for file in files]
+    entries.sort(key=lambda entry: (entry.task.token, entry.task))
+    return Rollouts(path.name, tuple(files), tuple(entries), True, is_whole=False)
+
+
+def _names(file: Path) -> tuple[str, str, int, str]:
+    """Planner, noise, seed and scenario of a log, by the names of its folders and its own."""
+    folders = file.resolve().parts[:-1]
+    planner = folders[-1]
+    if "simulation_log" in folders[:-1]:
+        planner = folders[folders.index("simulation_log") + 1]
+    return planner, "none", 0, file.name.partition(".")[0]
+
+
+def _driven(path: Path) -> Driven:
+    """What a log says of a rollout, and what its reader must know."""
+    recorded = read_simulation_log(path, Report())
+    ego, plans, count = read_ego(recorded.ego), recorded.plans, recorded.ego.num_rows
+    words = [origin("NR", recorded.ego, plans).replace("other", "driven by another controller")]
+    if plans is not None:
+        steps = np.diff(plans["time_us"].astype(np.int64))
+        steps = steps[np.diff(plans["iteration"]) == 0] * 1e-6
+        words.append(f"plans every {np.median(steps):.2g} s" if len(steps) else "no plans")
+    if recorded.dropped_us:
+        words.append("the last sample repeats a time and is dropped")
+    remarks = [f"simulation log: {', '.join(words)}"]
+    times = recorded.ego["time_us"].astype(np.int64)
+    boxes = Boxes(times, tracks_of(recorded.objects, count))
+    return Driven(path.name, times, ego, np.arange(count), boxes, remarks=tuple(remarks))
 
 
 def read_simulation_log(path: Path, report: Report) -> Recorded:

@@ -106,7 +106,8 @@ class Gallery:
         self.listed = list(self._chosen)
 
     def _place(self, task: Task) -> tuple[float, str, Task]:
-        return float(self._rollouts[task].score.get("cls", -1.0)), task.token, task
+        cls = self._rollouts[task].score.get("cls", -1.0)
+        return 2.0 if cls is None else cls, task.token, task  # undefined ones last
 
     @property
     def tokens(self) -> list[str]:

@@ -16,10 +16,16 @@ from commands import call
 from parity_cases import open_scenes
 
 from shiftsim.errors import DataError, MissingExtraError
+from shiftsim.metrics import compute_metrics
+from shiftsim.runs.rollouts.poses import rollout_of
 from shiftsim.verify import simulation_log
 from shiftsim.verify.experiment import _compare_means, verify_experiment
 from shiftsim.verify.report import Report
-from shiftsim.verify.simulation_log import find_simulation_logs, read_simulation_log
+from shiftsim.verify.simulation_log import (
+    find_simulation_logs,
+    log_source,
+    read_simulation_log,
+)
 from shiftsim.verify.tables import read_table
 
 pytestmark = pytest.mark.golden
@@ -107,6 +113,21 @@ TABLE_NUMBERS = [  # of the last row, and what names them
     ("runner_report", "compute_trajectory_runtimes_mean", 1e-6),
     ("runner_report", "compute_trajectory_runtimes_std", 1e-6),
 ]
+
+
+def test_a_log_gets_the_score_that_nuplan_gave(nuplan_reference):
+    source = log_source(GOLDEN)
+    (entry,) = source.entries
+    assert entry.task == ("SimplePlanner", "none", 0, LOGGED)
+    scenario = open_scenes(nuplan_reference).by_token(LOGGED)
+    log, _ = rollout_of(entry.read(), scenario)
+    result = compute_metrics(log, scenario.map)
+    [path] = GOLDEN.rglob("aggregator_metric/*.parquet")
+    (row,) = (row for row in pq.read_table(path).to_pylist() if row["scenario"] == LOGGED)
+    assert abs(result.score - row["score"]) < 1e-9
+    for name, score in result.scores.items():
+        if score is not None:
+            assert abs(score - row[name]) < 1e-9, name
 
 
 def test_every_changed_number_of_a_table_is_named(folder, nuplan_reference):

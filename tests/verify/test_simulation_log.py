@@ -11,12 +11,14 @@ import msgpack
 import numpy as np
 import places
 import pytest
+from worlds import cruise_scenario
 
+from shiftsim.runs.rollouts.poses import rollout_of
 from shiftsim.sim.dynamics.lqr import track_and_step
 from shiftsim.verify.experiment import verify_experiment
 from shiftsim.verify.report import Report
 from shiftsim.verify.rollouts import origin
-from shiftsim.verify.simulation_log import read_simulation_log
+from shiftsim.verify.simulation_log import log_source, read_simulation_log
 from shiftsim.world.state import NUM_STATE, VX, VY, center_poses
 
 REAL_LOGS = places.REPOSITORY.parent / "shared" / "reference" / "nuplan_real_logs"
@@ -172,6 +174,47 @@ def test_a_last_sample_that_repeats_a_time_is_dropped(tmp_path: Path, monkeypatc
     assert (np.diff(recorded.ego["ego_time_us"]) == STEP).all()
     assert origin("NR", recorded.ego, recorded.plans) == "driven"
     assert "log SimplePlanner: the last sample repeats a time" in "\n".join(remarks(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("driven", "repeats", "words"),
+    [
+        (True, False, "simulation log: driven, plans every 0.5 s"),
+        (True, True, "driven, plans every 0.5 s, the last sample repeats a time and is dropped"),
+        (False, False, "simulation log: played back, plans every 0.5 s"),
+    ],
+)
+def test_a_log_is_a_rollout_to_score(
+    tmp_path: Path, monkeypatch: Any, driven: bool, repeats: bool, words: str
+) -> None:
+    path = write_log(tmp_path, monkeypatch, driven=driven, repeats=repeats)
+    source = log_source(tmp_path)
+    assert source is not None
+    (entry,) = source.entries
+    assert entry.task == ("SimplePlanner", "none", 0, "log")
+    count = NUM_SAMPLES - repeats
+    scenario = cruise_scenario(speed=5.0, start=(0.0, 0.0, 0.0), iterations=count + 1)
+    log, remarks = rollout_of(entry.read(), scenario)
+    assert any(words in one for one in remarks)
+    recorded = read_simulation_log(path, Report())
+    np.testing.assert_array_equal(log.ego[:, VX], recorded.ego["vx"])
+    np.testing.assert_array_equal(log.time_us, scenario.iteration_times[:-1])
+    assert log_source(tmp_path.parent / "none.csv") is None
+
+
+@pytest.mark.skipif(not REAL_LOGS.is_dir(), reason="needs the genuine logs")
+def test_genuine_logs_are_rollouts_to_score() -> None:
+    source = log_source(REAL_LOGS)
+    assert source is not None
+    assert not source.is_whole  # those of unknown scenarios are left out
+    for entry in source.entries:
+        driven = entry.read()
+        assert len(driven.time_us) == len(driven.states) == 149
+        assert driven.boxes is not None
+        assert driven.remarks == (
+            "simulation log: played back, plans every 0.5 s, the last sample repeats a time and "
+            "is dropped",
+        )
 
 
 @pytest.mark.skipif(not REAL_LOGS.is_dir(), reason="needs the genuine logs")

@@ -13,8 +13,10 @@ from shiftsim.data.store.schema import EGO_COLUMNS
 from shiftsim.errors import DataError
 from shiftsim.runs.rollouts.columns import (
     COMMAND_COLUMNS,
+    KINDS,
     NOISE_COLUMNS,
     stack,
+    stored_kinds,
     stored_plans,
     stored_tracks,
 )
@@ -39,15 +41,21 @@ def describe(task: Task) -> str:
     return f"{task.planner} {task.noise}{seed} {task.token}"
 
 
-def complete_rollout(rows: pa.RecordBatch, scenario: Scenario, task: Task) -> SimulationLog:
+def complete_rollout(
+    rows: pa.RecordBatch, scenario: Scenario, task: Task, *, is_partial: bool = False
+) -> SimulationLog:
     """The stored rollout of a task, completed by its noise and what its scenario holds already.
 
-    The rows have columns of `STATES`, and of `TRACKS` where they are not those of the log.
+    The rows have columns of `STATES`, and of `TRACKS` where they are not those of the log. Where
+    they may end before the scenario, the expert ends with them.
 
     Raises:
         DataError: The scenario is not the one that was driven, or the rows are damaged.
     """
     time_us = rows["time_us"].to_numpy()
+    if is_partial:
+        shown = scenario.iteration_rows[: len(time_us) + 1]
+        scenario = replace(scenario, iteration_rows=shown)
     samples = scenario.iteration_rows[:-1]
     if scenario.script is not None and scenario.script.termination is not None:
         samples = samples[: len(time_us)]  # it may have ended before its time
@@ -62,6 +70,10 @@ def complete_rollout(rows: pa.RecordBatch, scenario: Scenario, task: Task) -> Si
     tracks = scenario.tracks.rows(samples)
     try:
         plans = stored_plans(rows)
+        if KINDS in rows.schema.names:
+            kinds = stored_kinds(rows)
+            codes = np.array([*kinds.values()], np.int64)
+            tracks = replace(tracks, tokens=tuple(kinds), kinds=codes)
         if "track_tokens" in rows.schema.names:
             stored: dict[str, Any] = stored_tracks(rows, tracks.tokens)
             tracks = replace(tracks, **stored)

@@ -42,12 +42,16 @@ TRACKS = _schema(
 )
 
 
+KINDS = "track_kinds"  # beside `TRACKS` where there are other tracks than in the scenario
+
+
 def rollout_rows(
-    log: SimulationLog, *, with_tracks: bool, with_noise: bool = True
+    log: SimulationLog, *, with_tracks: bool, with_noise: bool = True, with_kinds: bool = False
 ) -> pa.RecordBatch:
     """Columns of `STATES`, and of `TRACKS` where tracks are not the recorded ones.
 
-    Noise that `complete_rollout` can make again from the task is left out: null.
+    Noise that `complete_rollout` can make again from the task is left out: null. Kinds are needed
+    of tracks that the scenario has not.
     """
     columns = [pa.array(log.time_us)]
     for values in (log.ego, log.commands):
@@ -67,7 +71,11 @@ def rollout_rows(
     columns.append(_lists(lengths, pa.array(tracks.tokens, pa.string()).take(pa.array(track))))
     for values in (tracks.poses, tracks.velocities, tracks.sizes):
         columns += [_lists(lengths, of) for of in values[row, track].T]
-    return pa.RecordBatch.from_arrays(columns, schema=pa.schema([*STATES, *TRACKS]))
+    schema = pa.schema([*STATES, *TRACKS])
+    if with_kinds:
+        columns.append(_lists(lengths, pa.array(tracks.kinds[track], pa.int8())))
+        schema = schema.append(pa.field(KINDS, list_of(pa.int8()), nullable=False))
+    return pa.RecordBatch.from_arrays(columns, schema=schema)
 
 
 def _lists(lengths: np.ndarray, items: np.ndarray | pa.Array) -> pa.Array:
@@ -132,6 +140,12 @@ def stored_tracks(rows: pa.RecordBatch, tokens: Sequence[str]) -> dict[str, np.n
         out[name] = np.full((*valid.shape, part.shape[1]), np.nan)
         out[name][row, track] = part
     return out
+
+
+def stored_kinds(rows: pa.RecordBatch) -> dict[str, int]:
+    """AgentKind code by token of the tracks of a rollout with `KINDS`, in order of appearance."""
+    tokens, kinds = (rows[name].flatten().to_pylist() for name in (TRACKS.names[0], KINDS))
+    return dict(zip(tokens, kinds, strict=True))
 
 
 def encode_rows(rows: pa.RecordBatch) -> bytes:

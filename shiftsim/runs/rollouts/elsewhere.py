@@ -1,0 +1,392 @@
+"""Rollouts that were driven elsewhere, as tables tell of them, and the score of one.
+
+A table, Parquet or CSV, has a row per scenario and sample; another one may have a row per sample
+and box of the others. `shiftsim.runs.derive` makes a run of them.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv
+import pyarrow.parquet as pq
+
+from shiftsim.data.store.reading import ScenarioStore
+from shiftsim.data.store.schema import BOX, EGO_COLUMNS
+from shiftsim.errors import DataError, listed, nearest, one_of
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
+from shiftsim.metrics import MetricResult, Thresholds, compute_metrics
+from shiftsim.metrics.score import without
+from shiftsim.runs.rollouts import Task
+from shiftsim.runs.rollouts.columns import KINDS, STATES, TRACKS
+from shiftsim.runs.rollouts.poses import NEED_BOXES, POINTS, REAR_AXLE, Boxes, Driven, rollout_of
+from shiftsim.sim.log import SimulationLog
+from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import STATE_COLUMNS, AgentKind, tracks_of_boxes
+
+RECORDED = "recorded"  # in place of a table: the others did what was recorded
+_SAME = {  # other names of columns, those of our own rollouts among them
+    **dict(zip(EGO_COLUMNS, STATE_COLUMNS, strict=True)),
+    **{"yaw_acceleration": "yaw_accel", "planning_seconds": "seconds", "scenario": "token"},
+    **{"length_m": "length", "width_m": "width"},
+}
+_KEY = {"planner": pa.string(), "noise": pa.string(), "seed": pa.int64(), "token": pa.string()}
+_TIMES, _POSE = {"time_us": 1.0, "time_s": 1e6}, ("x", "y", "heading")
+_BOX = (*STATE_COLUMNS[:5], "length", "width")
+_KNOWN = {*_KEY, *_TIMES, *STATE_COLUMNS, *_BOX, "seconds", "track_token", "type"}
+_KNOWN |= {*STATES.names, *TRACKS.names, KINDS, "iteration"}  # of rollouts of our own
+_NO_ROWS = np.zeros(0, np.int64)
+_TEXTS = dict.fromkeys(
+    ("planner", "noise", "token", "scenario", "track_token", "type"), pa.string()
+)
+_HINT = "needed are token, time_us (or time_s from 0 on), x, y, heading; docs/score_elsewhere.md"
+_BOX_HINT = f"boxes have token, time_us, track_token, type, {', '.join(_BOX)}"
+
+
+class Entry(NamedTuple):
+    """A rollout that waits to be scored."""
+
+    task: Task
+    read: Callable[[], Driven]
+
+
+@dataclass(frozen=True)
+class Source:
+    """Rollouts that were driven elsewhere."""
+
+    name: str  # of the file or folder
+    files: tuple[Path, ...]  # what it was read from
+    entries: tuple[Entry, ...]  # the rollouts
+    has_boxes: bool = False  # whether it says where the others were
+    point: str = ""  # which point of the ego the poses are of, where it says that
+    remarks: tuple[str, ...] = ()  # what a reader of the scores must know
+    is_whole: bool = True  # whether the store must have all of its scenarios
+
+    @property
+    def tokens(self) -> list[str]:
+        """Their scenarios, sorted."""
+        return sorted({entry.task.token for entry in self.entries})
+
+    def in_store(self, store: ScenarioStore) -> "Source":
+        """The rollouts whose scenarios a store has.
+
+        Raises:
+            DataError: It lacks all of them, or one where the source is to be scored as a whole.
+        """
+        known = [entry for entry in self.entries if entry.task.token in store]
+        lost = [entry.task.token for entry in self.entries if entry.task.token not in store]
+        if lost and (self.is_whole or not known):
+            near = nearest(lost[0], store.tokens)
+            raise DataError(
+                f"{self.name}: store {store.path.name!r} has no scenario {lost[0]!r}, and "
+                f"{len(set(lost)) - 1} more of the file are not in it",
+                f"{f'did you mean {near!r}? ' if near else ''}--store names the one with them",
+            )
+        words = (f"left out: {len(lost)} whose scenarios are not in the store",) if lost else ()
+        return replace(self, entries=tuple(known), remarks=(*self.remarks, *words))
+
+
+class ScoredRollout(NamedTuple):
+    """The score of a rollout that was driven elsewhere."""
+
+    score: float | None  # closed-loop score; None where a metric is undefined
+    scores: dict[str, float | None]  # by metric; None where it is undefined or has no score
+    remarks: tuple[str, ...]  # what was derived, replayed or cut
+    log: SimulationLog  # the rollout
+    result: MetricResult  # everything that nuPlan says of it
+
+
+def score_rollout(
+    poses: Any,
+    scenario: Scenario,
+    *,
+    tracks: Any = None,
+    point: str = REAR_AXLE,
+    partial: bool = False,
+    thresholds: str | Thresholds = "nuplan",
+) -> ScoredRollout:
+    """Score poses that were driven elsewhere, as `shiftsim score FILE` does.
+
+    Args:
+        poses: (K, 3) x [m], y [m], heading [rad] at the iterations of the scenario; or a table
+            (Arrow, pandas, a dict of columns) with `time_us` or `time_s`, `x`, `y`, `heading` and,
+            if known, `vx`, `vy`, `ax`, `ay`, `yaw_rate`, `yaw_acceleration`.
+        scenario: Where they were driven.
+        tracks: The others: a table with `time_us` or `time_s`, `track_token`, `type`, `x`, `y`,
+            `heading`, `length`, `width` and, if known, `vx`, `vy`; or "recorded". Without them
+            collisions, time to collision and the score are undefined.
+        point: Whether poses are of the "rear_axle" or the "center".
+        partial: Whether they may end before the scenario; the expert then ends with them.
+        thresholds: Threshold profile.
+
+    Raises:
+        DataError: Something cannot be right; the message names row and number.
+
+    Example:
+        ```python
+        scenario = shiftsim.open_store("demo")["01f13e"]
+        poses = shiftsim.simulate(scenario, "idm").ego[:, :3]
+        found = shiftsim.score_rollout(poses, scenario, tracks="recorded")
+        print(found.score, found.remarks)
+        ```
+    """
+    one_of("point", point, POINTS)
+    is_recorded = isinstance(tracks, str) and bool(one_of("tracks", tracks, [RECORDED]))
+    boxes = None if tracks is None or is_recorded else _as_table(tracks, scenario)
+    source = table_source(_as_table(poses, scenario), "poses", boxes)
+    if len(source.entries) != 1:
+        words = f"{len(source.entries)} rollouts of scenario {scenario.token!r} in the poses"
+        raise DataError(words, hint="give those of one")
+    driven = source.entries[0].read()
+    log, remarks = rollout_of(driven, scenario, point=point, recorded=is_recorded, partial=partial)
+    undefined = () if source.has_boxes or is_recorded else NEED_BOXES
+    result = without(compute_metrics(log, scenario.map, thresholds=thresholds), undefined)
+    total, remarks = None if undefined else result.score, (*source.remarks, *remarks)
+    return ScoredRollout(total, result.scores, remarks, log, result)
+
+
+def _as_table(given: Any, scenario: Scenario) -> pa.Table:
+    """What is given of one scenario as a table."""
+    if isinstance(given, (pa.Table, Mapping)):
+        table = given if isinstance(given, pa.Table) else pa.table(dict(given))
+    elif hasattr(given, "iloc"):
+        table = pa.Table.from_pandas(given, preserve_index=False)
+    else:
+        poses, times = np.asarray(given, np.float64), scenario.iteration_times
+        if poses.ndim != 2 or poses.shape[1] != 3 or len(poses) > len(times):
+            raise ValueError(f"need a table, or poses (K, 3) with K <= {len(times)}: {poses.shape}")
+        columns = dict(zip(_POSE, poses.T, strict=True))
+        table = pa.table({"time_us": times[: len(poses)], **columns})
+    table = _renamed(table, "poses")
+    if "token" not in table.column_names:
+        return table.append_column("token", pa.array([scenario.token] * len(table), pa.string()))
+    return table.filter(pc.equal(table["token"], scenario.token))
+
+
+def read_source(path: Path, tracks: str = "") -> Source:
+    """The rollouts of a table of poses, or of the tables in a folder.
+
+    `tracks` is the path of a table of boxes; empty or `RECORDED` without one.
+
+    Raises:
+        DataError: A file cannot be read, or a column is missing or holds something else.
+    """
+    files = tuple(sorted([*path.glob("*.parquet"), *path.glob("*.csv")])) or (path,)
+    table = pa.concat_tables(map(_read_table, files), promote_options="default")
+    if tracks == RECORDED and TRACKS.names[0] in table.column_names:
+        table = table.drop_columns([TRACKS.names[0]])
+    others = [] if tracks in ("", RECORDED) else [Path(tracks)]
+    boxes = _read_table(others[0]) if others else None
+    source = table_source(table, path.name, boxes, tracks)
+    return replace(source, files=(*files, *others))
+
+
+def _read_table(path: Path) -> pa.Table:
+    if path.is_dir():
+        raise DataError(
+            f"{str(path)!r} is no run, and holds no tables of poses and no simulation logs",
+            hint="name a run folder, a Parquet or CSV file, or what nuPlan's simulation wrote",
+        )
+    try:
+        if ".csv" in path.suffixes:
+            texts = pyarrow.csv.ConvertOptions(column_types=_TEXTS)
+            return pyarrow.csv.read_csv(path, convert_options=texts)
+        return pq.ParquetFile(path).read()
+    except (OSError, pa.ArrowException) as error:
+        words = f"{str(path)!r} is no readable table: {error}"
+        raise DataError(words, hint="give a Parquet or CSV file") from error
+
+
+def table_source(
+    table: pa.Table, where: str, boxes: pa.Table | None = None, where_boxes: str = "tracks"
+) -> Source:
+    """The rollouts in a table of poses, among the boxes of another one.
+
+    Raises:
+        DataError: A column is missing, or holds something else.
+    """
+    point = (table.schema.metadata or {}).get(b"point", b"").decode()
+    if point:
+        one_of(f"{where}: point", point, POINTS)
+    table = _renamed(table, where)
+    _require(table, where, ("token", *_POSE), _HINT)
+    if boxes is None and TRACKS.names[0] in table.column_names:
+        boxes, where_boxes = _nested(table), where
+    others = None if boxes is None else _Others(_renamed(boxes, where_boxes), where_boxes)
+    time_us, states = _times(table, where), _numbers(table, STATE_COLUMNS, where)
+    seconds = _numbers(table, ["seconds"], where)[:, 0] if "seconds" in table.column_names else None
+    entries = []
+    for key, rows in _groups(table, where).items():
+        task = Task(**{"planner": where.partition(".")[0], "noise": "none", "seed": 0, **dict(key)})
+        fields = {} if seconds is None else {"planning_seconds": seconds[rows]}
+        driven = Driven(where, time_us[rows], states[rows], rows, fields=fields)
+        read = partial(_with_boxes, driven, others.of(task) if others else None)
+        entries.append(Entry(task, read))
+    if not entries:
+        raise DataError(f"{where} has no rows", hint=_HINT)
+    unused = sorted({*table.column_names, *(others.columns if others else ())} - _KNOWN)
+    remarks = [f"columns not used: {listed(unused)}"] if unused else []
+    entries.sort(key=lambda entry: (entry.task.token, entry.task))
+    return Source(where, (), tuple(entries), others is not None, point, tuple(remarks))
+
+
+def _with_boxes(driven: Driven, make: Callable[[], Boxes] | None) -> Driven:
+    return driven if make is None else replace(driven, boxes=make())
+
+
+def _renamed(table: pa.Table, where: str) -> pa.Table:
+    """A table with the names of columns here."""
+    names = [_SAME.get(name, name) for name in table.column_names]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise DataError(f"{where}: column {twice!r} is there twice", hint="leave one of them out")
+    return table.rename_columns(names)
+
+
+def _require(table: pa.Table, where: str, needed: Sequence[str], hint: str) -> None:
+    missing = [name for name in needed if name not in table.column_names]
+    missing += [] if {*_TIMES} & {*table.column_names} else ["time_us"]
+    if missing:
+        raise DataError(f"{where}: column {', '.join(map(repr, missing))} is missing", hint)
+
+
+def _column(table: pa.Table, name: str, kind: pa.DataType, where: str) -> pa.Array:
+    """A column of a type."""
+    try:
+        column = table[name].cast(kind).combine_chunks()
+    except pa.ArrowException as error:
+        raise DataError(f"{where}: column {name!r} is no {kind}: {error}", hint=_HINT) from error
+    if column.null_count and kind != pa.float64():
+        row = column.is_null().index(True).as_py()
+        raise DataError(f"{where}, row {row}: {name} is missing", hint="give it in every row")
+    return column
+
+
+def _numbers(table: pa.Table, names: Sequence[str], where: str) -> FloatArray:
+    """(A, C) values of columns; NaN where one is missing."""
+    out = np.full((len(table), len(names)), np.nan)
+    for index, name in enumerate(names):
+        if name in table.column_names:
+            column = _column(table, name, pa.float64(), where)
+            out[:, index] = column.to_numpy(zero_copy_only=False)
+    return out
+
+
+def _times(table: pa.Table, where: str) -> IntArray:
+    """(A,) times [us]."""
+    name = next(name for name in _TIMES if name in table.column_names)
+    times = _numbers(table, [name], where)[:, 0]  # microseconds since 1970 are exact
+    if (missing := ~np.isfinite(times)).any():
+        words = f"{where}, row {np.argmax(missing)}: {name} is missing"
+        raise DataError(words, hint="give it in every row")
+    return np.rint(times * _TIMES[name]).astype(np.int64)
+
+
+def _groups(table: pa.Table, where: str) -> dict[tuple[tuple[str, Any], ...], IntArray]:
+    """The rows of each rollout, by the names and values of the key columns there are."""
+    names = [name for name in _KEY if name in table.column_names]
+    codes, columns = np.zeros(len(table), np.int64), []
+    for name in names:
+        column = _column(table, name, _KEY[name], where).dictionary_encode()
+        columns.append(column)
+        codes = codes * len(column.dictionary) + column.indices.to_numpy()
+    order = np.argsort(codes, kind="stable")
+    starts = np.flatnonzero(np.diff(codes[order], prepend=-1))
+    parts = np.split(order, starts[1:]) if len(order) else []
+    return {
+        tuple((n, c[int(rows[0])].as_py()) for n, c in zip(names, columns, strict=True)): rows
+        for rows in parts
+    }
+
+
+def _nested(table: pa.Table) -> pa.Table:
+    """The boxes in rollouts as a run stores them, a row per box."""
+    tokens = table[TRACKS.names[0]].combine_chunks()
+    owner = np.repeat(np.arange(len(table)), tokens.value_lengths().to_numpy())
+    kept = [name for name in (*_KEY, "time_us") if name in table.column_names]
+    columns = {name: table[name].take(pa.array(owner)) for name in kept}
+    nested = {"track_token": TRACKS.names[0], "type": KINDS, **{n: f"track_{n}" for n in BOX}}
+    for name, of in nested.items():
+        if of in table.column_names:
+            columns[name] = pc.list_flatten(table[of])
+    return pa.table(columns)
+
+
+class _Others:
+    """A table of boxes. B rows."""
+
+    def __init__(self, table: pa.Table, where: str) -> None:
+        _require(table, where, ("token", "track_token", *_POSE, "length", "width"), _BOX_HINT)
+        self.where, self.columns = where, table.column_names
+        self._groups = _groups(table, where)
+        self._time_us, self._values = _times(table, where), _numbers(table, _BOX, where)
+        tokens = _column(table, "track_token", pa.string(), where).dictionary_encode()
+        self._names, self._tracks = tokens.dictionary, tokens.indices.to_numpy()
+        self._kinds, self._is_ego = np.full(len(table), -1), np.zeros(len(table), np.bool_)
+        if "type" in table.column_names:
+            self._read_kinds(_column(table, "type", pa.string(), where).dictionary_encode())
+        broken = ~np.isfinite(self._values[:, [0, 1, 2, 5, 6]])
+        _refuse(
+            np.logical_or.reduce(broken, axis=1),
+            where,
+            np.arange(len(table)),
+            "a number is missing",
+        )
+        flat = self._values[:, 5:].min(axis=1) <= 0.0
+        _refuse(flat, where, np.arange(len(table)), "length and width must be above 0")
+
+    def _read_kinds(self, types: pa.DictionaryArray) -> None:
+        known = {word: kind.value for kind in AgentKind for word in (kind.name, str(kind.value))}
+        codes = types.indices.to_numpy()
+        for code, name in enumerate(types.dictionary.to_pylist()):
+            if name.upper() == "EGO":
+                self._is_ego |= codes == code
+                continue
+            if name.upper() not in known:
+                words = f"type {name!r} is none of {', '.join(k.name for k in AgentKind)} and EGO"
+                _refuse(codes == code, self.where, np.arange(len(codes)), words)
+            self._kinds[codes == code] = known[name.upper()]
+
+    def of(self, task: Task) -> Callable[[], Boxes]:
+        """Makes the boxes of a rollout; those of its scenario where no column says more."""
+        names = [name for name, _ in next(iter(self._groups), ())]
+        rows = self._groups.get(tuple((name, getattr(task, name)) for name in names), _NO_ROWS)
+        rows = rows[~self._is_ego[rows]]
+        tracks = np.unique(self._tracks[rows])
+        tokens = dict(zip(tracks.tolist(), self._names.take(tracks).to_pylist(), strict=True))
+        times, numbers, kinds = self._time_us[rows], self._tracks[rows], self._kinds[rows]
+        return partial(_boxes, self.where, rows, times, numbers, kinds, self._values[rows], tokens)
+
+
+def _boxes(
+    where: str,  # the table
+    rows: IntArray,  # (B,) of it
+    time_us: IntArray,  # (B,) [us]
+    tracks: IntArray,  # (B,) numbers
+    kinds: IntArray,  # (B,) AgentKind codes, -1 where not given
+    values: FloatArray,  # (B, 7) columns of `_BOX`
+    tokens: Mapping[int, str],  # by number
+) -> Boxes:
+    """The tracks at all times that have rows, in order of appearance."""
+    _, first, track = np.unique(tracks, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    first, track = first[order], np.argsort(order)[track]
+    times, frame = np.unique(time_us, return_inverse=True)
+    is_first = np.zeros(len(rows), np.bool_)
+    is_first[np.unique(frame * len(first) + track, return_index=True)[1]] = True
+    _refuse(~is_first, where, rows, "its track is there twice at one time")
+    _refuse(kinds[first][track] != kinds, where, rows, "its track changes its type")
+    dense = np.full((len(times), len(first), len(_BOX)), np.nan)
+    dense[frame, track] = values
+    names = [tokens[number] for number in tracks[first].tolist()]
+    return Boxes(times, tracks_of_boxes(dense, kinds[first], names))
+
+
+def _refuse(bad: BoolArray, where: str, rows: IntArray, words: str) -> None:
+    """Refuse the first of some rows of boxes that is bad."""
+    if bad.any():
+        raise DataError(f"{where}, row {rows[np.argmax(bad)]}: {words}", hint=_BOX_HINT)
