@@ -14,14 +14,13 @@ import numpy as np
 
 from shiftsim.errors import DataError
 from shiftsim.metrics import MetricResult, evaluate, measure
-from shiftsim.metrics.score import closed_loop_score
+from shiftsim.metrics.score import closed_loop_score, nuplan_columns
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.planner import Observation, Planner, SceneInfo
 from shiftsim.verify.report import Report
 from shiftsim.verify.rollouts import (
-    CATEGORIES,
     CHALLENGES,
     DERIVED,
     LOGGED,
@@ -29,7 +28,6 @@ from shiftsim.verify.rollouts import (
     REACTIVE,
     SCORES,
     SIMULATED,
-    UNITS,
     RecordedRun,
     compare_plans,
     ego_columns,
@@ -150,7 +148,9 @@ def _compare_results(path: Path, challenge: str, find: FindScenario, report: Rep
             recorded = read_simulation_log(logs[run.key], report) if run.key in logs else None
             if recorded:
                 left_out |= recorded.left_out
-                source = origin(challenge, recorded.ego, recorded.plans)
+                source = "exported"
+                if not recorded.is_exported:
+                    source = origin(challenge, recorded.ego, recorded.plans)
                 report.remarks.append(f"{run}: {ORIGINS[source]}")
             if recorded and recorded.dropped_us:
                 report.remarks.append(f"{run}: the last sample repeats a time (dt = 0): dropped")
@@ -164,7 +164,7 @@ def _compare_results(path: Path, challenge: str, find: FindScenario, report: Rep
                 continue
             if recorded:
                 rollout = _compare_log(run, scenario, recorded, report)
-                if source != "played back":
+                if source not in ("played back", "exported"):
                     with report.attempt("replay", str(run)):
                         _compare_replay(run, scenario, recorded)
             elif planner in _TWINS:
@@ -336,20 +336,12 @@ def _compare_result(
 
 def _metric_row(metric: str, result: MetricResult) -> tuple[dict[str, Any], dict[str, float]]:
     """The row of a metric in nuPlan's table, by column, and tolerances."""
-    series, score = result.series.get(metric), result.scores[metric]
-    row = {
-        "metric_category": CATEGORIES.get(metric, "Planning"),
-        "metric_score_unit": UNITS.get(metric),
-        "metric_score": np.nan if score is None else score,
-        "time_series_unit": series.unit or None if series else None,
-        "time_series_timestamps": result.measurements.time_us if series else None,
-        "time_series_values": series.values if series else None,
-    }
+    series, row = result.series.get(metric), nuplan_columns(result, metric)
+    if row["metric_score"] is None:
+        row["metric_score"] = np.nan
     atol = {"metric_score": SCORES.get(metric, EXACT)}
     atol["time_series_values"] = EXACT if series and series.unit == "boolean" else TOLERANCE
     for one in (one for one in result.statistics if one.metric == metric):
-        values = {"unit": one.unit or None, "type": one.kind or None, "value": one.value}
-        row |= {f"{one.name}_stat_{name}": value for name, value in values.items()}
         atol[f"{one.name}_stat_value"] = EXACT if one.unit in ("boolean", "count") else TOLERANCE
     return row, atol
 
