@@ -137,6 +137,21 @@ class Run(results.Run):
         bundle_run(self, store)
         return self
 
+    def export_results(self, out: str | Path, **settings: Any) -> Any:
+        """Write the run as nuPlan's own result folders, one per noise and seed, for nuBoard.
+
+        Settings are `logs` and `maps`, the folders of the recordings and maps that nuBoard opens,
+        `simulation_logs` (False for tables alone), `store`, `workers` and `progress`. Returned are
+        the `folders`, and counts of `rollouts` and `failed` tasks.
+
+        Raises:
+            ConfigError: The folder is not empty, or two planners would have the same name.
+            DataError: Rollouts are missing, or the store is another one.
+        """
+        from shiftsim.compat.nuplan.results import export_results
+
+        return export_results(self, out, **settings)
+
     def _gallery(self) -> Any:
         from shiftsim.runs.scenarios import open_run_store
         from shiftsim.view.build import Gallery

@@ -47,7 +47,7 @@ from shiftsim.verify.simulation_log import (
 )
 from shiftsim.verify.tables import DAMAGED, EXACT, TOLERANCE, Groups, Source, Tolerances, read_table
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import AX, AY, PACIFICA, Trajectory, speeds
+from shiftsim.world.state import AX, AY, PACIFICA, Tracks, Trajectory, speeds
 
 _PARTS = ("metrics", "aggregator_metric", "simulation_log")  # folders that nuPlan makes
 _CHALLENGES = {"closed_loop_nonreactive_agents": "NR", "closed_loop_reactive_agents": "R"}
@@ -164,9 +164,12 @@ def _compare_results(path: Path, challenge: str, find: FindScenario, report: Rep
                 continue
             if recorded:
                 rollout = _compare_log(run, scenario, recorded, report)
-                if source not in ("played back", "exported"):
-                    with report.attempt("replay", str(run)):
+                with report.attempt("replay", str(run)):
+                    if source not in ("played back", "exported"):
                         _compare_replay(run, scenario, recorded)
+                    elif source == "exported" and challenge == "NR":
+                        tracks = scenario.tracks.rows(scenario.iteration_rows[:-1])
+                        _compare_objects(run, recorded.objects, tracks)
             elif planner in _TWINS:
                 rollout = run.drive(scenario, load_planner(_TWINS[planner]))
             else:
@@ -283,12 +286,16 @@ def _compare_replay(run: Run, scenario: Scenario, recorded: Recorded) -> None:
     stamps = dict.fromkeys(("time_us", "ego_time_us"), log.time_us)
     ours = {"iteration": np.arange(len(log.ego)), **stamps, **ego_columns(log.ego)}
     ego.match(where, ours, SIMULATED)
-    shown = object_columns(log.tracks, *np.nonzero(log.tracks.valid))
-    atol = REACTIVE if run.challenge == "R" else LOGGED
-    _match_unordered(where, objects, shown, "track_token", atol)
+    _compare_objects(run, objects, log.tracks)
     if run.planner in _TWINS:
         recorded_run = RecordedRun(scenario, ego, objects, run.challenge)
         compare_plans(where, _TWINS[run.planner], recorded_run, plans)
+
+
+def _compare_objects(run: Run, theirs: Source, ours: Tracks) -> None:
+    shown = object_columns(ours, *np.nonzero(ours.valid))
+    atol = REACTIVE if run.challenge == "R" else LOGGED
+    _match_unordered(str(run), theirs, shown, "track_token", atol)
 
 
 def _match_unordered(

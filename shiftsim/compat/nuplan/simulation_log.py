@@ -17,7 +17,7 @@ import numpy as np
 from shiftsim._version import __version__
 from shiftsim.data.nuplan.export_log import HEIGHTS, connector_number
 from shiftsim.files import atomic_write
-from shiftsim.kernels import BoolArray, FloatArray, IntArray
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.runs.rollouts import Task
 from shiftsim.sim.dynamics.perfect import KEPT_US
 from shiftsim.sim.log import SimulationLog
@@ -29,37 +29,36 @@ MAP_VERSION = "nuplan-maps-v1.0"
 _COG = 1.67  # m, rear axle to centre of gravity, which nothing here depends on
 _ACTOR, _SIMULATION = "nuplan.common.actor_state", "nuplan.planning.simulation"
 _SCENARIO, _MAPS = "nuplan.planning.scenario_builder.nuplan_db", "nuplan.common.maps"
-_MODULES = {
-    "Agent": f"{_ACTOR}.agent",
-    "CarFootprint": f"{_ACTOR}.car_footprint",
-    "DynamicCarState": f"{_ACTOR}.dynamic_car_state",
-    "EgoState": f"{_ACTOR}.ego_state",
-    "OrientedBox": f"{_ACTOR}.oriented_box",
-    "SceneObjectMetadata": f"{_ACTOR}.scene_object",
-    **dict.fromkeys(("StateSE2", "StateVector2D", "TimePoint"), f"{_ACTOR}.state_representation"),
-    "StaticObject": f"{_ACTOR}.static_object",
-    "TrackedObjects": f"{_ACTOR}.tracked_objects",
-    "TrackedObjectType": f"{_ACTOR}.tracked_objects_types",
-    "VehicleParameters": f"{_ACTOR}.vehicle_parameters",
-    "TrafficLightStatusData": f"{_MAPS}.maps_datatypes",
-    "TrafficLightStatusType": f"{_MAPS}.maps_datatypes",
-    "NuPlanMap": f"{_MAPS}.nuplan_map.nuplan_map",
-    "GPKGMapsDB": "nuplan.database.maps_db.gpkg_mapsdb",
-    "NuPlanScenario": f"{_SCENARIO}.nuplan_scenario",
-    "ScenarioExtractionInfo": f"{_SCENARIO}.nuplan_scenario_utils",
-    "SimulationHistory": f"{_SIMULATION}.history.simulation_history",
-    "SimulationHistorySample": f"{_SIMULATION}.history.simulation_history",
-    "DetectionsTracks": f"{_SIMULATION}.observation.observation_type",
-    "SimplePlanner": f"{_SIMULATION}.planner.simple_planner",
-    "SimulationLog": f"{_SIMULATION}.simulation_log",
-    "SimulationIteration": f"{_SIMULATION}.simulation_time_controller.simulation_iteration",
-    "InterpolatedTrajectory": f"{_SIMULATION}.trajectory.interpolated_trajectory",
-    "PosixPath": "pathlib",
-    "_frombuffer": "numpy.core.numeric",  # its name in NumPy 1, which the devkit needs
-    "dtype": "numpy",
-    "partial": "functools",
-    "str": "builtins",
+_CLASSES = {  # and functions, by module
+    f"{_ACTOR}.agent": "Agent",
+    f"{_ACTOR}.car_footprint": "CarFootprint",
+    f"{_ACTOR}.dynamic_car_state": "DynamicCarState",
+    f"{_ACTOR}.ego_state": "EgoState",
+    f"{_ACTOR}.oriented_box": "OrientedBox",
+    f"{_ACTOR}.scene_object": "SceneObjectMetadata",
+    f"{_ACTOR}.state_representation": "StateSE2 StateVector2D TimePoint",
+    f"{_ACTOR}.static_object": "StaticObject",
+    f"{_ACTOR}.tracked_objects": "TrackedObjects",
+    f"{_ACTOR}.tracked_objects_types": "TrackedObjectType",
+    f"{_ACTOR}.vehicle_parameters": "VehicleParameters",
+    f"{_MAPS}.maps_datatypes": "TrafficLightStatusData TrafficLightStatusType",
+    f"{_MAPS}.nuplan_map.nuplan_map": "NuPlanMap",
+    "nuplan.database.maps_db.gpkg_mapsdb": "GPKGMapsDB",
+    f"{_SCENARIO}.nuplan_scenario": "NuPlanScenario",
+    f"{_SCENARIO}.nuplan_scenario_utils": "ScenarioExtractionInfo",
+    f"{_SIMULATION}.history.simulation_history": "SimulationHistory SimulationHistorySample",
+    f"{_SIMULATION}.observation.observation_type": "DetectionsTracks",
+    f"{_SIMULATION}.planner.simple_planner": "SimplePlanner",
+    f"{_SIMULATION}.simulation_log": "SimulationLog",
+    f"{_SIMULATION}.simulation_time_controller.simulation_iteration": "SimulationIteration",
+    f"{_SIMULATION}.trajectory.interpolated_trajectory": "InterpolatedTrajectory",
+    "pathlib": "PosixPath",
+    "numpy.core.numeric": "_frombuffer",  # its place in NumPy 1, which the devkit needs
+    "numpy": "dtype",
+    "functools": "partial",
+    "builtins": "str",
 }
+_MODULES = {name: module for module, names in _CLASSES.items() for name in names.split()}
 
 
 class _Made(NamedTuple):
@@ -406,24 +405,14 @@ def _planned(log: SimulationLog) -> tuple[IntArray, FloatArray, IntArray]:
 
     A plan begins with the state of the ego. Where there is none, the ego stands.
     """
-    poses, seconds = log.plans.copy(), KEPT_US * 1e-6
-    no_plan = np.isnan(poses[:, 1, 0])
-    poses[no_plan, :2] = log.ego[no_plan, None, :3]
-    known: BoolArray = np.isfinite(poses[..., 0])
+    poses, is_bare = log.plans.copy(), np.isnan(log.plans[:, 1, 0])
+    poses[is_bare, :2] = log.ego[is_bare, None, :3]
+    known = np.isfinite(poses[..., 0])
     states = np.zeros((*known.shape, state.NUM_STATE))
-    states[..., :3] = poses
-    heading = poses[..., 2]
-    along = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-    steps = _rate(poses[..., :2], seconds)
-    states[..., state.VX] = (steps * along).sum(axis=-1)
-    states[..., state.AX] = _rate(states[..., [state.VX]], seconds)[..., 0]
+    states[..., :3], headings = poses, poses[..., 2]
+    steps = np.diff(poses[..., :2], axis=1) / (np.diff(KEPT_US) * 1e-6)[:, None]
+    # since the pose before
+    states[:, 1:, state.VX] = steps[..., 0] * np.cos(headings[:, 1:])
+    states[:, 1:, state.VX] += steps[..., 1] * np.sin(headings[:, 1:])
     states[:, 0] = log.ego
-    times = log.time_us[:, None] + KEPT_US
-    return times[known], states[known], known.sum(axis=1)
-
-
-def _rate(values: FloatArray, seconds: FloatArray) -> FloatArray:
-    """Change (K, P, C) from each of P times [s] to the next; at the last as at the one before."""
-    rate = np.full(values.shape, np.nan)
-    rate[:, :-1] = np.diff(values, axis=1) / np.diff(seconds)[:, None]
-    return np.where(np.isnan(rate), np.roll(rate, 1, axis=1), rate)
+    return (log.time_us[:, None] + KEPT_US)[known], states[known], known.sum(axis=1)
