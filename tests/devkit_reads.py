@@ -4,16 +4,19 @@
 
 FOLDER is what `shiftsim export results` wrote with --logs and --maps. It needs nuplan-devkit 1.2.2
 on the path and what its requirements name; nothing of shiftsim is imported. Every simulation log
-is unpickled by the devkit's classes, the means are computed again by its aggregator, and nuBoard's
-data class collects the folders.
+is unpickled by the devkit's classes and scored again by its metrics, the means are computed again
+by its aggregator, and nuBoard's data class collects the folders.
 """
 
 import math
 import sys
 import tempfile
+from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
+import yaml
 
 
 def read_logs(folder):
@@ -21,6 +24,7 @@ def read_logs(folder):
     from nuplan.common.actor_state.ego_state import EgoState
     from nuplan.planning.simulation.simulation_log import SimulationLog
 
+    metrics, tables = closed_loop_metrics(), tables_of(folder)
     files = sorted(folder.glob("simulation_log/*/*/*/*/*.msgpack.xz"))
     for file in files:
         log = SimulationLog.load_data(file)
@@ -69,7 +73,61 @@ def read_logs(folder):
             lights = {(s.lane_connector_id, s.status) for s in sample.traffic_light_status}
             wanted = scenario.get_traffic_light_status_at_iteration(index)
             assert lights == {(s.lane_connector_id, s.status) for s in wanted}
+        score_again(log, metrics, tables)
     return len(files)
+
+
+def closed_loop_metrics():
+    """The metrics of nuPlan's closed-loop challenges, made from its own configuration."""
+    import nuplan.planning.script as script
+
+    place = Path(script.__path__[0]) / "config/common/simulation_metric"
+    chosen = yaml.safe_load((place / "simulation_closed_loop_reactive_agents.yaml").read_text())
+    made = {}
+    for level, names in (pair for group in chosen["defaults"] for pair in group.items()):
+        for name in names:
+            settings = yaml.safe_load((place / level / f"{name}.yaml").read_text())[name]
+            module, _, kind = settings.pop("_target_").rpartition(".")
+            settings.pop("_convert_", None)
+            parts = settings.pop("required_metrics", {})
+            needed = {parameter: made[part] for parameter, part in parts.items()}
+            made[name] = getattr(import_module(module), kind)(**settings, **needed)
+    return list(made.values())
+
+
+def tables_of(folder):
+    return {path.stem: pd.read_parquet(path) for path in folder.glob("metrics/*.parquet")}
+
+
+def score_again(log, metrics, tables):
+    """Compute every metric of a log, as `run_metric.py` does: the rows are those written."""
+    from nuplan.planning.metrics.metric_engine import construct_dataframe
+
+    scenario, planner = log.scenario, log.planner.name()
+    key = (scenario.log_name, scenario.scenario_name, scenario.scenario_type, planner)
+    found = [one for metric in metrics for one in metric.compute(log.simulation_history, scenario)]
+    assert {one.name for one in found} == set(tables)
+    for one in found:
+        theirs, table = construct_dataframe(*key, one), tables[one.name]
+        is_own = (table.scenario_name == scenario.token) & (table.planner_name == planner)
+        [ours] = table[is_own].to_dict("records")
+        for column, value in theirs.items():
+            where = f"{one.name} {' '.join(key)} {column}"
+            value = value[0] if isinstance(value, list) else value  # one row
+            if is_number(value):
+                np.testing.assert_allclose(
+                    np.asarray(ours[column], float), np.asarray(value, float), 0, 1e-8, True, where
+                )
+            else:
+                assert ours[column] == value or (is_absent(ours[column]) and value is None), where
+
+
+def is_number(value):
+    return not isinstance(value, str) and value is not None
+
+
+def is_absent(value):
+    return value is None or (isinstance(value, float) and math.isnan(value))
 
 
 def assert_same_objects(ours, theirs):

@@ -44,7 +44,8 @@ CHALLENGES = ("closed_loop_nonreactive_agents", "closed_loop_reactive_agents")
 _DATA = Path("~/nuplan/dataset")  # where the devkit looks by default
 _RECORDINGS = ("*.db", "*/*.db", "nuplan-v1.1/splits/*/*.db")
 _METRICS, _MEANS, _LOGS = "metrics", "aggregator_metric", "simulation_log"
-_RUNTIMES = {"mean": np.mean, "median": np.median, "std": np.std}
+_COMPUTED_WITH = {"corners_in_drivable_area": "drivable_area_compliance"}
+_RUNTIMES: dict[str, Any] = {"mean": np.mean, "median": np.median, "std": np.std}
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +172,7 @@ class _Exporter:
         rows = {
             metric: {
                 **key,
-                "metric_computator": metric,
+                "metric_computator": _COMPUTED_WITH.get(metric, metric),
                 "metric_statistics_name": metric,
                 **nuplan_columns(result, metric),
                 "time_series_selected_frames": None,

@@ -73,7 +73,7 @@ class _Made(NamedTuple):
 class _Known(NamedTuple):
     """Something that the pickle holds already."""
 
-    index: int
+    number: int
 
 
 class _Cell(NamedTuple):
@@ -148,8 +148,8 @@ class _Pickle:
                 return b"G" + pack(">d", value), []
             case str():
                 return self._form(self.text(value))
-            case _Known(index):
-                return b"j" + pack("<I", index), []
+            case _Known(number):
+                return b"j" + pack("<I", number), []
             case _Cell(_, opcode, dtype):
                 return opcode + bytes(np.dtype(dtype).itemsize), [(len(opcode), value)]
             case _Buffer():
@@ -341,9 +341,9 @@ class _LogWriter:
             "height": np.array([HEIGHTS[kind] for kind in AgentKind])[kinds],
             "time_us": self.log.time_us[row],
             "track": track,
-            "token": np.array([one.index for one in tokens], np.int64)[track],
-            "type": np.array([one.index for one in types])[kinds],
-            "category": np.array([one.index for one in names])[kinds],
+            "token": np.array([one.number for one in tokens], np.int64)[track],
+            "type": np.array([one.number for one in types])[kinds],
+            "category": np.array([one.number for one in names])[kinds],
         }
         about = {
             "timestamp_us": _integer("time_us"),
@@ -358,7 +358,11 @@ class _LogWriter:
             "_tracked_object_type": _index("type"),
             "_box": _Made("OrientedBox", {**_CENTER, **_BOX}),
         }
-        agent = {"_initial_time_stamp": _CLOCK, "_predictions": [], "_past_trajectory": None}
+        agent: dict[str, Any] = {
+            "_initial_time_stamp": _CLOCK,
+            "_predictions": [],
+            "_past_trajectory": None,
+        }
         motion = {"_velocity": self._vector("vx", "vy"), "_angular_velocity": np.nan}
         still = {"predictions": None, "past_trajectory": None, "velocity": motion["_velocity"]}
         moves = kinds <= state.LAST_AGENT_KIND
@@ -378,7 +382,7 @@ class _LogWriter:
         is_listed = lights.status != LightStatus.ABSENT
         row, connector = np.nonzero(is_listed)
         kind = "TrafficLightStatusType"
-        codes = [pickle.known((kind, k), _Made(kind, None, (k,))).index for k in range(4)]
+        codes = [pickle.known((kind, k), _Made(kind, None, (k,))).number for k in range(4)]
         numbers = [connector_number(self.scenario, name) for name in lights.connector_ids]
         columns = {
             "status": np.array(codes)[lights.status[row, connector]],
