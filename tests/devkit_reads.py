@@ -138,6 +138,7 @@ def assert_same_objects(ours, theirs):
         other = found[one.track_token]
         assert type(one) is type(other)
         assert one.tracked_object_type == other.tracked_object_type
+        assert one.metadata.category_name == other.metadata.category_name
         assert math.dist((one.center.x, one.center.y), (other.center.x, other.center.y)) < 1e-6
         assert (one.box.length, one.box.width) == (other.box.length, other.box.width)
 

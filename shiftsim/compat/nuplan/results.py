@@ -109,8 +109,7 @@ def export_results(
                 raise DataError(f"{describe(outcome.task)}: {result.error}", result.hint)
             found[outcome.task] = result
             progress(len(found), len(tasks))
-    summary = (opened.summary()[name].to_pylist() for name in ("token", "recording"))
-    names = dict(zip(*summary, strict=True))
+    names = {task.token: result["key"]["log_name"] for task, result in found.items()}
     ended = datetime.fromisoformat(run.manifest["ended"])
     written = tuple(dict.fromkeys(folders.values()))
     for folder in written:

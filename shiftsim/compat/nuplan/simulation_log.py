@@ -118,7 +118,7 @@ class _Pickle:
         return [row.tobytes() for row in rows]
 
     def known(self, key: object, value: Any) -> _Known:
-        """Something that occurs often; `key` tells it from others."""
+        """Something that occurs often; `key` tells it from others, and from texts."""
         if key not in self._indices:
             code = self._form(value)[0]
             self._head += code + b"\x940"  # memoize, pop
@@ -242,9 +242,13 @@ class _LogWriter:
         self.scenario, self.log, self.pickle = scenario, log, _Pickle()
         sizes = (PACIFICA.width, PACIFICA.front_length, PACIFICA.rear_length, _COG)
         about = (*sizes, PACIFICA.wheel_base, "pacifica", "gen1", PACIFICA.height)
-        self._vehicle = self.pickle.known("vehicle", _Made("VehicleParameters", None, about))
+        self._vehicle = self.pickle.known(
+            ("pacifica", "gen1"), _Made("VehicleParameters", None, about)
+        )
         order = (3, "<", None, None, None, -1, -1, 0)
-        self._float64 = self.pickle.known("float64", _Made("dtype", order, ("f8", False, True)))
+        self._float64 = self.pickle.known(
+            ("dtype", "f8"), _Made("dtype", order, ("f8", False, True))
+        )
 
     def scenario_of(self, database: Path, maps: Path) -> _Made:
         """The scenario, which finds the rest of itself in the recording."""
@@ -330,7 +334,8 @@ class _LogWriter:
         tracks, pickle = self.log.tracks, self.pickle
         row, track = np.nonzero(tracks.valid)
         kinds = tracks.kinds[track]
-        types = [pickle.known(k, _Made("TrackedObjectType", None, (int(k),))) for k in AgentKind]
+        name = "TrackedObjectType"
+        types = [pickle.known((name, k), _Made(name, None, (int(k),))) for k in AgentKind]
         names = [pickle.text(kind.name.lower()) for kind in AgentKind]
         tokens = [pickle.text(token) for token in tracks.tokens]
         numbers = [tracks.poses, tracks.sizes, np.nan_to_num(tracks.velocities)]
