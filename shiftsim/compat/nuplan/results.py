@@ -110,15 +110,15 @@ def export_results(
             found[outcome.task] = result
             progress(len(found), len(tasks))
     names = {task.token: result["key"]["log_name"] for task, result in found.items()}
-    ended = datetime.fromisoformat(run.manifest["ended"])
+    began = datetime.fromisoformat(run.manifest["started"])
     written = tuple(dict.fromkeys(folders.values()))
     for folder in written:
         members = [row for row in rows if folders[task_of(row)] == folder]
         done = [task for task in map(task_of, members) if task in found]
-        _write_tables(folder, {task: found[task] for task in done}, ended)
+        _write_tables(folder, {task: found[task] for task in done}, began)
         reports = [_runner_row(row, found.get(task_of(row)), names) for row in members]
         _write_table(folder / "runner_report.parquet", reports)
-        _write_nuboard(folder, ended, with_logs=simulation_logs)
+        _write_nuboard(folder, began, with_logs=simulation_logs)
     return ResultsExport(written, len(found), len(rows) - len(found))
 
 
@@ -181,7 +181,7 @@ class _Exporter:
         return {"key": key, "metrics": rows, "runtimes": seconds}
 
 
-def _write_tables(folder: Path, found: Mapping[Task, Row], ended: datetime) -> None:
+def _write_tables(folder: Path, found: Mapping[Task, Row], began: datetime) -> None:
     """Scores, statistics and series by metric, and the scores of scenarios, types and all."""
     rows: dict[str, list[Row]] = {}
     scenarios = []
@@ -208,7 +208,7 @@ def _write_tables(folder: Path, found: Mapping[Task, Row], ended: datetime) -> N
             {name: row[name] for name in columns} | tail | {m: row[m] for m in (*metrics, "score")}
             for row in means
         ]
-        name = f"{folder.parent.name}_weighted_average_metrics_{ended:%Y.%m.%d.%H.%M.%S}.parquet"
+        name = f"{folder.parent.name}_weighted_average_metrics_{began:%Y.%m.%d.%H.%M.%S}.parquet"
         _write_table(folder / _MEANS / name, table)
 
 
@@ -254,11 +254,11 @@ def _write_table(path: Path, rows: Sequence[Row]) -> None:
         pq.write_table(table, partial_file)
 
 
-def _write_nuboard(folder: Path, ended: datetime, *, with_logs: bool) -> None:
+def _write_nuboard(folder: Path, began: datetime, *, with_logs: bool) -> None:
     """The file that nuBoard opens."""
     place = str(folder.resolve())
     names = {"simulation_main_path": place, "metric_main_path": place}
     names |= {"metric_folder": _METRICS, "aggregator_metric_folder": _MEANS}
     names |= {"simulation_folder": _LOGS} if with_logs else {}
-    path = folder / f"nuboard_{ended.timestamp():.0f}.nuboard"
+    path = folder / f"nuboard_{began.timestamp():.0f}.nuboard"
     path.write_bytes(pickle.dumps(names))
