@@ -6,6 +6,7 @@ be applied to the result.
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -58,6 +59,19 @@ SHORT_NAMES = {
     "ego_is_comfortable": "EIC",
     "score": "CLS",
 }
+_CATEGORIES = {  # as nuPlan files metrics; the others are of `Planning`
+    **dict.fromkeys(("speed_limit_compliance", "ego_is_comfortable"), "Violations"),
+    **dict.fromkeys(("ego_jerk", "ego_lat_acceleration", "ego_lon_acceleration"), "Dynamics"),
+    **dict.fromkeys(("ego_lon_jerk", "ego_yaw_acceleration", "ego_yaw_rate"), "Dynamics"),
+    "no_ego_at_fault_collisions": "Dynamics",
+}
+_SCORE_UNITS = {  # of scores that have one
+    **dict.fromkeys(("drivable_area_compliance", "driving_direction_compliance"), "bool"),
+    **dict.fromkeys(("ego_is_comfortable", "ego_is_making_progress"), "bool"),
+    "time_to_collision_within_bound": "bool",
+    **dict.fromkeys(("no_ego_at_fault_collisions", "speed_limit_compliance"), "float"),
+}
+_TYPES = {"boolean": bool, "count": int}  # of statistics, by unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,6 +186,26 @@ def without(result: MetricResult, undefined: Collection[str]) -> MetricResult:
         statistics=tuple(one for one in result.statistics if one.metric not in undefined),
         series={name: one for name, one in result.series.items() if name not in undefined},
     )
+
+
+def nuplan_columns(result: MetricResult, metric: str) -> dict[str, Any]:
+    """The row of a metric in nuPlan's own table, by column: score, statistics and time series."""
+    series = result.series.get(metric)
+    row: dict[str, Any] = {
+        "metric_score": result.scores[metric],
+        "metric_score_unit": _SCORE_UNITS.get(metric),
+        "metric_category": _CATEGORIES.get(metric, "Planning"),
+    }
+    for one in (one for one in result.statistics if one.metric == metric):
+        # nuPlan has the booleans of the drivable area as numbers
+        kind = float if "drivable_area" in metric else _TYPES.get(one.unit, float)
+        values = {"type": one.kind or None, "unit": one.unit or None, "value": kind(one.value)}
+        row |= {f"{one.name}_stat_{name}": value for name, value in values.items()}
+    return row | {
+        "time_series_unit": series.unit or None if series else None,
+        "time_series_timestamps": result.measurements.time_us if series else None,
+        "time_series_values": series.values if series else None,
+    }
 
 
 def closed_loop_score(scores: Mapping[str, float | None]) -> float:

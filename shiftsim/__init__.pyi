@@ -1,7 +1,6 @@
 from typing import Any
 
 from shiftsim._version import __version__ as __version__
-from shiftsim.api import Run as Run
 from shiftsim.api import bench as bench
 from shiftsim.api import demo as demo
 from shiftsim.api import demo_store as demo_store
@@ -11,6 +10,7 @@ from shiftsim.api import open_run as open_run
 from shiftsim.api import open_store as open_store
 from shiftsim.api import run as run
 from shiftsim.api import simulate as simulate
+from shiftsim.api.finished import Run as Run
 from shiftsim.api.stores import convert_dataset as convert_dataset
 from shiftsim.api.stores import convert_dsc3d as convert_dsc3d
 from shiftsim.api.stores import convert_nuplan as convert_nuplan

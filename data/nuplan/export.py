@@ -88,7 +88,7 @@ def export_nuplan(
     windows = {token: store.window(token) for token in chosen}
     cities = dict(zip(*(store.summary()[n].to_pylist() for n in ("token", "city")), strict=True))
     names = _log_names(windows, cities)
-    logs = out / "nuplan-v1.1" / "splits" / _plain(store.path.resolve().name)
+    logs = out / "nuplan-v1.1" / "splits" / plain_name(store.path.resolve().name)
     report = ExportReport(logs, maps=out / "maps", token_file=out / "tokens.txt")
     report.cities = sorted({cities[token] for token in chosen})
     _write_maps(store, report)
@@ -159,12 +159,13 @@ def _log_names(windows: dict[str, Window], cities: dict[str, str]) -> dict[str, 
     for token, window in windows.items():
         recording = window.log_name.removeprefix(f"{cities[token]}_")
         parts = (cities[token], recording, window.ego, str(window.first_row))
-        names[token] = "_".join(map(_plain, parts))
+        names[token] = "_".join(map(plain_name, parts))
     count = Counter(names.values())
-    return {t: name if count[name] == 1 else f"{name}_{_plain(t)}" for t, name in names.items()}
+    return {t: name if count[name] == 1 else f"{name}_{plain_name(t)}" for t, name in names.items()}
 
 
-def _plain(name: str) -> str:
+def plain_name(name: str) -> str:
+    """A name that can be part of a file name."""
     return re.sub(r"[^A-Za-z0-9._+-]+", "-", name)
 
 

@@ -23,7 +23,7 @@ Rows: TypeAlias = list[tuple[Value, ...]]
 UNKNOWN_TYPE = "unknown"
 _TOKEN = re.compile(r"[0-9a-f]{16}\Z")
 # Heights are not kept in a store and are not used in the plane; typical ones are written.
-_HEIGHTS = {
+HEIGHTS = {
     AgentKind.VEHICLE: 1.6,
     AgentKind.PEDESTRIAN: 1.75,
     AgentKind.BICYCLE: 1.7,
@@ -105,6 +105,21 @@ def log_token(text: str) -> bytes:
     if _TOKEN.match(text):
         return bytes.fromhex(text)
     return hashlib.blake2b(text.encode(), digest_size=8).digest()
+
+
+def connector_number(scenario: Scenario, name: str) -> int:
+    """The id of a lane connector that a traffic light of a scenario names.
+
+    Raises:
+        ConversionError: It is no integer.
+    """
+    try:
+        return int(name)
+    except ValueError as error:
+        raise ConversionError(
+            f"scenario {scenario.token!r}: a traffic light names connector {name!r}",
+            hint="nuPlan's format has integer ids",
+        ) from error
 
 
 def write_nuplan_log(path: Path, scenario: Scenario, *, epsg: int) -> Mapping:
@@ -197,7 +212,7 @@ class _Log:
         tracks = self.scenario.tracks
         row, track = np.nonzero(tracks.valid)  # each row lists the tracks in our order
         names = self._track_tokens()
-        heights = [_HEIGHTS[AgentKind(kind)] for kind in tracks.kinds.tolist()]
+        heights = [HEIGHTS[AgentKind(kind)] for kind in tracks.kinds.tolist()]
         after, before = _neighbours(row, track)
         prefix = self.make("lidar_box")[:4]
         own: list[bytes | None] = [prefix + i.to_bytes(4, "big") for i in range(len(row))]
@@ -233,21 +248,12 @@ class _Log:
         lights = self.scenario.traffic_lights
         row, connector = np.nonzero(lights.status != LightStatus.ABSENT)
         codes = lights.status[row, connector].tolist()
-        names = [self._integer(name) for name in lights.connector_ids]
+        names = [connector_number(self.scenario, name) for name in lights.connector_ids]
         out: Rows = []
         for at, which, code in zip(row.tolist(), connector.tolist(), codes, strict=True):
             token, status = self.make(f"light {at} {which}"), LightStatus(code).name.lower()
             out.append((token, self.samples[at], names[which], status))
         return out
-
-    def _integer(self, name: str) -> int:
-        try:
-            return int(name)
-        except ValueError as error:
-            raise ConversionError(
-                f"scenario {self.scenario.token!r}: a traffic light names connector {name!r}",
-                hint="nuPlan's format has integer ids",
-            ) from error
 
 
 def quaternions_of(headings: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Commands that work on a whole store: check, filter, stats, split, export nuplan."""
+"""Commands that work on a whole store: check, filter, stats, split, export."""
 
 from collections import Counter
 from dataclasses import asdict
@@ -16,6 +16,8 @@ from shiftsim.files import store_path
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from shiftsim.api import Run
+    from shiftsim.compat.nuplan.results import ResultsExport
     from shiftsim.data.nuplan.export import ExportReport
     from shiftsim.data.store.check import CheckReport
     from shiftsim.data.store.reading import ScenarioStore
@@ -206,6 +208,49 @@ def _export_lines(report: "ExportReport", mappings: list[dict[str, Any]]) -> "It
         f" read back: shiftsim convert nuplan {report.logs} {report.maps}"
         f" --tokens {report.token_file}{mapping} --store NAME"
     )
+
+
+@export.command("results")
+@cli.with_settings("store", "workers", store="Store. [the one of the run]")
+def export_results(
+    *,
+    source: Path = Argument(metavar="RUN", help="A run with stored rollouts."),
+    out: Path = Option(..., "--out", "-o", help="Folder to write to."),
+    logs: Path | None = Option(
+        None, envvar="NUPLAN_DATA_ROOT", help="Folder of the .db logs, which nuBoard opens."
+    ),
+    maps: Path | None = Option(
+        None, envvar="NUPLAN_MAPS_ROOT", help="Folder of the maps, which nuBoard opens."
+    ),
+    tables_only: bool = Option(False, "--tables-only", help="Write no simulation logs."),
+    settings: cli.Settings,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Write a run as nuPlan's own result folders, which nuBoard and other scripts read.
+
+    nuPlan knows neither noise nor seeds: each of them has a folder of its own.
+    """
+    import shiftsim
+
+    run, places = shiftsim.open_run(source), cli.given(logs=logs, maps=maps)
+    with progress_bar(quiet=quiet or as_json) as advance:
+        values = {"simulation_logs": not tables_only, "progress": advance, **settings, **places}
+        report = run.export_results(out, **values)
+    print_result(asdict(report), _result_lines(report, run), as_json=as_json)
+
+
+def _result_lines(report: "ResultsExport", run: "Run") -> "Iterator[str]":
+    failed = f", {plural(report.failed, 'task')} without" if report.failed else ""
+    yield f" {plural(report.rollouts, 'scored rollout')}{failed}"
+    yield from (f" experiment: {folder}" for folder in report.folders)
+    facts = run.manifest["determining"]
+    if facts["thresholds"]["name"] != "nuplan":
+        yield f" thresholds {facts['thresholds']['name']}: nuPlan's own code gives other scores"
+    for what, known in ("traffic", "nonreactive reactive"), ("controller", "lqr"):
+        if facts[what] not in known.split():
+            yield f" {what} {facts[what]}, which nuPlan does not have"
+    yield f" read back: shiftsim verify --experiment {report.folders[0].parent.parent}"
 
 
 @cli.with_settings("split", "all_scenarios")

@@ -144,6 +144,22 @@ class Rescorer:
         return TaskResult(task, OK, scenario.scenario_type, scores=scores, metrics=metrics)
 
 
+def tasks_with_rollouts(run: Run) -> list[Task]:
+    """The tasks of a run that have a score, as their rollouts lie in files.
+
+    Raises:
+        DataError: Rollouts of some of them were not stored.
+    """
+    statuses = zip(run.rollout_places.items(), run.tasks["status"].to_pylist(), strict=True)
+    done = {task: place for (task, place), status in statuses if status == OK}
+    if without := sum(place is None for place in done.values()):
+        raise DataError(
+            f"run {run.path.name!r} holds no rollouts for {without} of {len(done)} tasks",
+            hint="run again with --save-rollouts all",
+        )
+    return sorted(done, key=lambda task: task.token)
+
+
 def rescore(
     run: Run,
     *,
@@ -178,14 +194,8 @@ def rescore(
     }
     target = Path(out) if out else RUNS / run_name(config, run.manifest["split"], fingerprint)
     check_target(target, fingerprint)
+    done = tasks_with_rollouts(run)
     statuses = dict(zip(run.rollout_places, run.tasks["status"].to_pylist(), strict=True))
-    done = [task for task, status in statuses.items() if status == OK]
-    without = [task for task in done if run.rollout_places[task] is None]
-    if without:
-        raise DataError(
-            f"run {run.path.name!r} holds no rollouts for {len(without)} of {len(done)} tasks",
-            hint="run again with --save-rollouts all",
-        )
     manifest = make_manifest(
         target,
         config=config,
@@ -200,8 +210,7 @@ def rescore(
         for result in stored_results(run.path):
             if result.status != OK:  # it stays so
                 writer.add(replace(result, seconds={}))
-        # as rollouts lie in their files
-        batches: list[Batch] = [(task,) for task in sorted(done, key=lambda task: task.token)]
+        batches: list[Batch] = [(task,) for task in done]
         outcomes = map_unordered(
             partial(Rescorer, run.path.resolve(), found.source, config),
             batches,

@@ -14,14 +14,13 @@ import numpy as np
 
 from shiftsim.errors import DataError
 from shiftsim.metrics import MetricResult, evaluate, measure
-from shiftsim.metrics.score import closed_loop_score
+from shiftsim.metrics.score import closed_loop_score, nuplan_columns
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.planner import Observation, Planner, SceneInfo
 from shiftsim.verify.report import Report
 from shiftsim.verify.rollouts import (
-    CATEGORIES,
     CHALLENGES,
     DERIVED,
     LOGGED,
@@ -29,7 +28,6 @@ from shiftsim.verify.rollouts import (
     REACTIVE,
     SCORES,
     SIMULATED,
-    UNITS,
     RecordedRun,
     compare_plans,
     ego_columns,
@@ -49,7 +47,7 @@ from shiftsim.verify.simulation_log import (
 )
 from shiftsim.verify.tables import DAMAGED, EXACT, TOLERANCE, Groups, Source, Tolerances, read_table
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import AX, AY, PACIFICA, Trajectory, speeds
+from shiftsim.world.state import AX, AY, PACIFICA, Tracks, Trajectory, speeds
 
 _PARTS = ("metrics", "aggregator_metric", "simulation_log")  # folders that nuPlan makes
 _CHALLENGES = {"closed_loop_nonreactive_agents": "NR", "closed_loop_reactive_agents": "R"}
@@ -150,7 +148,9 @@ def _compare_results(path: Path, challenge: str, find: FindScenario, report: Rep
             recorded = read_simulation_log(logs[run.key], report) if run.key in logs else None
             if recorded:
                 left_out |= recorded.left_out
-                source = origin(challenge, recorded.ego, recorded.plans)
+                source = "exported"
+                if not recorded.is_exported:
+                    source = origin(challenge, recorded.ego, recorded.plans)
                 report.remarks.append(f"{run}: {ORIGINS[source]}")
             if recorded and recorded.dropped_us:
                 report.remarks.append(f"{run}: the last sample repeats a time (dt = 0): dropped")
@@ -164,9 +164,12 @@ def _compare_results(path: Path, challenge: str, find: FindScenario, report: Rep
                 continue
             if recorded:
                 rollout = _compare_log(run, scenario, recorded, report)
-                if source != "played back":
-                    with report.attempt("replay", str(run)):
+                with report.attempt("replay", str(run)):
+                    if source not in ("played back", "exported"):
                         _compare_replay(run, scenario, recorded)
+                    elif source == "exported" and challenge == "NR":
+                        tracks = scenario.tracks.rows(scenario.iteration_rows[:-1])
+                        _compare_objects(run, recorded.objects, tracks)
             elif planner in _TWINS:
                 rollout = run.drive(scenario, load_planner(_TWINS[planner]))
             else:
@@ -283,12 +286,16 @@ def _compare_replay(run: Run, scenario: Scenario, recorded: Recorded) -> None:
     stamps = dict.fromkeys(("time_us", "ego_time_us"), log.time_us)
     ours = {"iteration": np.arange(len(log.ego)), **stamps, **ego_columns(log.ego)}
     ego.match(where, ours, SIMULATED)
-    shown = object_columns(log.tracks, *np.nonzero(log.tracks.valid))
-    atol = REACTIVE if run.challenge == "R" else LOGGED
-    _match_unordered(where, objects, shown, "track_token", atol)
+    _compare_objects(run, objects, log.tracks)
     if run.planner in _TWINS:
         recorded_run = RecordedRun(scenario, ego, objects, run.challenge)
         compare_plans(where, _TWINS[run.planner], recorded_run, plans)
+
+
+def _compare_objects(run: Run, theirs: Source, ours: Tracks) -> None:
+    shown = object_columns(ours, *np.nonzero(ours.valid))
+    atol = REACTIVE if run.challenge == "R" else LOGGED
+    _match_unordered(str(run), theirs, shown, "track_token", atol)
 
 
 def _match_unordered(
@@ -336,20 +343,12 @@ def _compare_result(
 
 def _metric_row(metric: str, result: MetricResult) -> tuple[dict[str, Any], dict[str, float]]:
     """The row of a metric in nuPlan's table, by column, and tolerances."""
-    series, score = result.series.get(metric), result.scores[metric]
-    row = {
-        "metric_category": CATEGORIES.get(metric, "Planning"),
-        "metric_score_unit": UNITS.get(metric),
-        "metric_score": np.nan if score is None else score,
-        "time_series_unit": series.unit or None if series else None,
-        "time_series_timestamps": result.measurements.time_us if series else None,
-        "time_series_values": series.values if series else None,
-    }
+    series, row = result.series.get(metric), nuplan_columns(result, metric)
+    if row["metric_score"] is None:
+        row["metric_score"] = np.nan
     atol = {"metric_score": SCORES.get(metric, EXACT)}
     atol["time_series_values"] = EXACT if series and series.unit == "boolean" else TOLERANCE
     for one in (one for one in result.statistics if one.metric == metric):
-        values = {"unit": one.unit or None, "type": one.kind or None, "value": one.value}
-        row |= {f"{one.name}_stat_{name}": value for name, value in values.items()}
         atol[f"{one.name}_stat_value"] = EXACT if one.unit in ("boolean", "count") else TOLERANCE
     return row, atol
 

@@ -51,22 +51,11 @@ CHALLENGES = {  # controller and traffic
 ORIGINS = {  # of the ego states in a simulation log
     "driven": "driven: every state follows from the plan before it",
     "played back": "played back: its states are the recorded ego and do not follow from the plans",
+    "exported": "exported by shiftsim: its plans are kept in part, and it is not driven again",
     "other": "driven by another controller: its states do not follow from the plans",
     "unknown": "driven or played back: its plans are of a class that is not known here",
 }
 _STEP_ERROR = 1e-6  # m, rad, m/s, …: of a state that follows from the plan before it
-CATEGORIES = {  # as the devkit files metrics; the others are of `Planning`
-    **dict.fromkeys(("speed_limit_compliance", "ego_is_comfortable"), "Violations"),
-    **dict.fromkeys(("ego_jerk", "ego_lat_acceleration", "ego_lon_acceleration"), "Dynamics"),
-    **dict.fromkeys(("ego_lon_jerk", "ego_yaw_acceleration", "ego_yaw_rate"), "Dynamics"),
-    "no_ego_at_fault_collisions": "Dynamics",
-}
-UNITS = {  # of scores that have one
-    **dict.fromkeys(("drivable_area_compliance", "driving_direction_compliance"), "bool"),
-    **dict.fromkeys(("ego_is_comfortable", "ego_is_making_progress"), "bool"),
-    "time_to_collision_within_bound": "bool",
-    **dict.fromkeys(("no_ego_at_fault_collisions", "speed_limit_compliance"), "float"),
-}
 
 
 def ego_states(columns: Mapping[str, Any]) -> FloatArray:

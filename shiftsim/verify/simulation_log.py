@@ -138,6 +138,7 @@ class Recorded:
     lights: Source  # a row per sample and listed connector
     plans: Source | None  # a row per sample and state of the plan; None where it is left out
     seconds: Any  # what the planner took at every sample [s]; None where it is left out
+    is_exported: bool  # whether it is a rollout of shiftsim, whose plans are kept in part
     left_out: frozenset[str]  # names of the classes whose objects were left out
     dropped_us: int | None  # iteration time of a last sample whose ego has the time before [us]
 
@@ -259,6 +260,7 @@ def _recorded(log: Any, report: Report, left_out: frozenset[str]) -> Recorded:
         lights=Source("lights", "column", _lights(samples), report),
         plans=_plans(_values(samples, "trajectory"), report),
         seconds=getattr(log.planner, "_compute_trajectory_runtimes", None),
+        is_exported=hasattr(log.planner, "shiftsim"),
         left_out=left_out,
         dropped_us=dropped_us,
     )

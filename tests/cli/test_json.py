@@ -101,6 +101,7 @@ def test_a_benchmark(call):
         "stats store",
         "split store --out mine.toml",
         "export nuplan store --out exported",
+        "export results {run} --out results --tables-only",
         "filter store --workers 1",
         "data",
     ],

@@ -27,15 +27,14 @@ from parity_cases import (
 )
 
 from shiftsim.metrics import MetricResult, evaluate, measure
+from shiftsim.metrics.score import nuplan_columns
 from shiftsim.planners.registry import PLANNERS, load_planner
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import simulate
 from shiftsim.verify.rollouts import (
-    CATEGORIES,
     CHALLENGES,
     DERIVED,
     SCORES,
-    UNITS,
     RecordedRun,
     compare_plans,
     ego_columns,
@@ -173,7 +172,8 @@ def compare_profile(
     tables["scores"].match(key, {name: [value] for name, value in row.items()})
     tables["metrics"].match_keys(key, [(name,) for name in scores])
     for name, score in scores.items():
-        filed = {"category": [CATEGORIES.get(name, "Planning")], "unit": [UNITS.get(name)]}
+        row = nuplan_columns(result, name)
+        filed = {"category": [row["metric_category"]], "unit": [row["metric_score_unit"]]}
         atol = {"score": SCORES.get(name, EXACT)}
         tables["metrics"].match((*key, name), {**filed, "score": [score]}, atol)
     found = result.statistics

@@ -1,0 +1,264 @@
+"""A run in the folders that nuPlan's own simulation writes, for nuBoard and scripts of one's own.
+
+nuPlan knows neither noise nor seeds, so each of them has a folder:
+
+    OUT/CHALLENGE/NOISE/metrics/METRIC.parquet          scores, statistics, time series
+    OUT/CHALLENGE/NOISE/aggregator_metric/*.parquet     scores of scenarios, types and all
+    OUT/CHALLENGE/NOISE/simulation_log/PLANNER/TYPE/LOG/TOKEN/TOKEN.msgpack.xz
+    OUT/CHALLENGE/NOISE/runner_report.parquet, nuboard_TIME.nuboard
+"""
+
+import pickle
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from datetime import datetime
+from functools import partial
+from itertools import chain
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from shiftsim.compat.nuplan.simulation_log import write_simulation_log
+from shiftsim.data.nuplan.export import plain_name
+from shiftsim.data.store.reading import ScenarioStore
+from shiftsim.errors import ConfigError, DataError
+from shiftsim.files import atomic_write, safe_join
+from shiftsim.metrics import evaluate, measure
+from shiftsim.metrics.score import closed_loop_score, nuplan_columns
+from shiftsim.runs.config import default_workers
+from shiftsim.runs.derive import tasks_with_rollouts
+from shiftsim.runs.results import Run, open_run
+from shiftsim.runs.rollouts import Task, describe
+from shiftsim.runs.scenarios import open_run_store
+from shiftsim.runs.tables import FAILED, TaskResult, task_of
+from shiftsim.runs.task import attempt
+from shiftsim.runs.workers import map_unordered
+
+Row: TypeAlias = dict[str, Any]
+
+CHALLENGES = ("closed_loop_nonreactive_agents", "closed_loop_reactive_agents")
+_DATA = Path("~/nuplan/dataset")  # where the devkit looks by default
+_RECORDINGS = ("*.db", "*/*.db", "nuplan-v1.1/splits/*/*.db")
+_METRICS, _MEANS, _LOGS = "metrics", "aggregator_metric", "simulation_log"
+_COMPUTED_WITH = {"corners_in_drivable_area": "drivable_area_compliance"}
+_RUNTIMES: dict[str, Any] = {"mean": np.mean, "median": np.median, "std": np.std}
+
+
+@dataclass(frozen=True, slots=True)
+class ResultsExport:
+    """What an export wrote."""
+
+    folders: tuple[Path, ...]  # one per noise and seed
+    rollouts: int  # rollouts in all of them
+    failed: int  # tasks without a score, which runner_report.parquet names
+
+
+def export_results(
+    run: Run,
+    out: str | Path,
+    *,
+    store: str | None = None,
+    logs: str | Path = _DATA,
+    maps: str | Path = _DATA / "maps",
+    simulation_logs: bool = True,
+    workers: int = 0,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> ResultsExport:
+    """Write the results of a run as nuPlan's own simulation would have written them.
+
+    Args:
+        run: A run with stored rollouts.
+        out: Folder to write to; must be new or empty.
+        store: Where the store of the run has moved.
+        logs: Folder of the recordings (.db), which nuBoard opens.
+        maps: Folder of the maps, likewise.
+        simulation_logs: Whether to write simulation logs; without them nuBoard shows tables only.
+        workers: Worker processes; 0 chooses from the cores.
+        progress: Called with tasks done and tasks in all.
+
+    Raises:
+        ConfigError: The folder is not empty, or two planners would have the same name.
+        DataError: Rollouts are missing, or the store is another one.
+    """
+    out, tasks, rows = Path(out), tasks_with_rollouts(run), run.tasks.to_pylist()
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ConfigError(f"{str(out)!r} is there and not empty", hint="name another folder")
+    planners = sorted({row["planner"] for row in rows})
+    if len(set(map(plain_name, planners))) < len(planners):
+        what = f"two of the planners {', '.join(planners)} would have the same folder"
+        raise ConfigError(what, hint="run them with other names")
+    opened, found = open_run_store(run, store), dict[Task, Row]()
+    folders = {task_of(row): _folder(out, run, task_of(row)) for row in rows}
+    exporter = partial(
+        _Exporter,
+        run=run.path.resolve(),
+        store=opened,
+        folders=folders if simulation_logs else {},
+        recordings=Path(logs).expanduser().resolve(),
+        maps=Path(maps).expanduser().resolve(),
+    )
+    number = min(workers or default_workers(), len(tasks))
+    with closing(map_unordered(exporter, tasks, workers=number, alone=1)) as outcomes:
+        for outcome in outcomes:
+            result = outcome.result or TaskResult(outcome.task, FAILED, error=outcome.death)
+            if isinstance(result, TaskResult):
+                raise DataError(f"{describe(outcome.task)}: {result.error}", result.hint)
+            found[outcome.task] = result
+            progress(len(found), len(tasks))
+    names = {task.token: result["key"]["log_name"] for task, result in found.items()}
+    began = datetime.fromisoformat(run.manifest["started"])
+    written = tuple(dict.fromkeys(folders.values()))
+    for folder in written:
+        members = [row for row in rows if folders[task_of(row)] == folder]
+        done = [task for task in map(task_of, members) if task in found]
+        _write_tables(folder, {task: found[task] for task in done}, began)
+        reports = [_runner_row(row, found.get(task_of(row)), names) for row in members]
+        _write_table(folder / "runner_report.parquet", reports)
+        _write_nuboard(folder, began, with_logs=simulation_logs)
+    return ResultsExport(written, len(found), len(rows) - len(found))
+
+
+def _folder(out: Path, run: Run, task: Task) -> Path:
+    """The folder of a noise and seed, below that of the challenge, whose name others read."""
+    is_replayed = run.manifest["determining"]["traffic"] == "nonreactive"
+    name = "no-noise" if task.noise == "none" else f"{task.noise}-seed-{task.seed}"
+    return out / CHALLENGES[not is_replayed] / plain_name(name)
+
+
+class _Exporter:
+    """Scores stored rollouts in nuPlan's words, and writes their simulation logs."""
+
+    def __init__(
+        self,
+        run: Path,
+        store: ScenarioStore,
+        folders: Mapping[Task, Path],
+        recordings: Path,
+        maps: Path,
+    ) -> None:
+        """`folders` are those of the simulation logs to write."""
+        self.run, self.store, self.folders = open_run(run), store, folders
+        self.recordings, self.maps = recordings, maps
+        found = chain.from_iterable(map(recordings.glob, _RECORDINGS if folders else ()))
+        self.databases = {path.stem: path for path in found}
+
+    def __call__(self, task: Task) -> Row | TaskResult:
+        """What the tables say of a rollout, or why there is nothing."""
+        return attempt(task, partial(self._export, task))
+
+    def _export(self, task: Task) -> Row:
+        scenario = self.store.read(task.token)
+        log, planner = self.run.rollout(task, scenario), plain_name(task.planner)
+        result = evaluate(measure(log, scenario.map), self.run.manifest["config"]["thresholds"])
+        name, kind = plain_name(scenario.log_name), plain_name(scenario.scenario_type)
+        if self.folders:
+            place = "/".join((_LOGS, planner, kind, name, task.token, f"{task.token}.msgpack.xz"))
+            write_simulation_log(
+                safe_join(self.folders[task], place),
+                task,
+                scenario,
+                log,
+                database=self.databases.get(name, self.recordings / f"{name}.db"),
+                maps=self.maps,
+            )
+        key = {"log_name": name, "scenario_name": task.token, "scenario_type": kind}
+        key |= {"planner_name": planner}
+        seconds = {n: float(of(log.planning_seconds)) for n, of in _RUNTIMES.items()}
+        rows = {
+            metric: {
+                **key,
+                "metric_computator": _COMPUTED_WITH.get(metric, metric),
+                "metric_statistics_name": metric,
+                **nuplan_columns(result, metric),
+                "time_series_selected_frames": None,
+            }
+            for metric in result.scores
+        }
+        return {"key": key, "metrics": rows, "runtimes": seconds}
+
+
+def _write_tables(folder: Path, found: Mapping[Task, Row], began: datetime) -> None:
+    """Scores, statistics and series by metric, and the scores of scenarios, types and all."""
+    rows: dict[str, list[Row]] = {}
+    scenarios = []
+    for result in found.values():
+        for metric, row in result["metrics"].items():
+            rows.setdefault(metric, []).append(row)
+        scores = {metric: row["metric_score"] for metric, row in sorted(result["metrics"].items())}
+        scenarios.append(result["key"] | scores | {"score": closed_loop_score(scores)})
+    for metric, members in rows.items():
+        _write_table(folder / _METRICS / f"{metric}.parquet", members)
+    metrics, means = sorted(rows), list[Row]()
+    for planner in sorted({row["planner_name"] for row in scenarios}):
+        own = [row for row in scenarios if row["planner_name"] == planner]
+        means += [{"scenario": row["scenario_name"], "num_scenarios": None, **row} for row in own]
+        for kind in dict.fromkeys(row["scenario_type"] for row in own):
+            members = [row for row in own if row["scenario_type"] == kind]
+            # nuPlan rule 606: metrics of a scenario type are added up, only the score is a mean
+            means.append(_several(kind, members, metrics, 1))
+        means.append(_several("final_score", own, metrics, len(own)))
+    if means:
+        columns = ("scenario", "log_name", "scenario_type", "num_scenarios", "planner_name")
+        tail = {"aggregator_type": "weighted_average"}
+        table = [
+            {name: row[name] for name in columns} | tail | {m: row[m] for m in (*metrics, "score")}
+            for row in means
+        ]
+        name = f"{folder.parent.name}_weighted_average_metrics_{began:%Y.%m.%d.%H.%M.%S}.parquet"
+        _write_table(folder / _MEANS / name, table)
+
+
+def _several(name: str, rows: Sequence[Row], metrics: Iterable[str], count: int) -> Row:
+    """A row of several scenarios: sums over a count, and the mean of the score."""
+    out = {
+        "scenario": name,
+        "log_name": None,
+        "scenario_type": name,
+        "num_scenarios": float(len(rows)),
+        "planner_name": rows[0]["planner_name"],
+        "score": float(np.mean([row["score"] for row in rows])),
+    }
+    for metric in metrics:
+        values = [row[metric] for row in rows if row[metric] is not None]
+        out[metric] = float(np.sum(values)) / count if values else None
+    return out
+
+
+def _runner_row(row: Row, result: Row | None, names: Mapping[str, str]) -> Row:
+    """How a task went; the time of its beginning is not kept, and is 0."""
+    seconds = row["simulate_seconds"]
+    runtimes = result["runtimes"] if result else {}
+    return {
+        "succeeded": result is not None,
+        "error_message": row["traceback"] or row["error"] or None,
+        "start_time": 0.0,
+        "end_time": seconds,
+        "scenario_name": row["token"],
+        "planner_name": plain_name(row["planner"]),
+        "log_name": names.get(row["token"]),
+        **{f"compute_trajectory_runtimes_{name}": runtimes.get(name) for name in _RUNTIMES},
+        "duration": seconds,
+    }
+
+
+def _write_table(path: Path, rows: Sequence[Row]) -> None:
+    """Write rows as a table; some may have columns that others have not."""
+    names = dict.fromkeys(chain.from_iterable(rows))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    table = pa.table({name: pa.array([row.get(name) for row in rows]) for name in names})
+    with atomic_write(path) as partial_file:
+        pq.write_table(table, partial_file)
+
+
+def _write_nuboard(folder: Path, began: datetime, *, with_logs: bool) -> None:
+    """The file that nuBoard opens."""
+    place = str(folder.resolve())
+    names = {"simulation_main_path": place, "metric_main_path": place}
+    names |= {"metric_folder": _METRICS, "aggregator_metric_folder": _MEANS}
+    names |= {"simulation_folder": _LOGS} if with_logs else {}
+    path = folder / f"nuboard_{began.timestamp():.0f}.nuboard"
+    path.write_bytes(pickle.dumps(names))
