@@ -282,7 +282,8 @@ def main() -> None:
     began = time.monotonic()
     group_of, chosen = modules(), shared_sample(options.count, options.seed)
     if only := options.only:
-        chosen = [m for m in chosen if only == group_of[m.module] or only in m.name]
+        is_group = only in GROUPS
+        chosen = [m for m in chosen if only in (group_of[m.module] if is_group else m.name)]
     rows: dict[str, dict[str, Any]] = {}
     if options.kept and options.kept.is_file():
         for line in options.kept.read_text().splitlines():

@@ -18,6 +18,7 @@ METRIC_TESTS = (
 )
 OFFICIAL_PLANNERS = "parity/test_pdm.py"
 PDM_TESTS = (
+    "planners/pdm/test_scorer.py",
     *(f"{OFFICIAL_PLANNERS}::{name}" for name in ("test_kernel", "test_steps")),
     "planners/pdm/test_pdm.py",
     f"{OFFICIAL_PLANNERS}::test_loops",
