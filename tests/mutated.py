@@ -16,6 +16,7 @@ METRIC_TESTS = (
     "parity/test_metric_worlds.py::test_world",
     "parity/test_nuplan_runs.py",
 )
+EDITED = "parity/test_scenario_edits.py::test_edits"
 OFFICIAL_PLANNERS = "parity/test_pdm.py"
 PDM_TESTS = (
     "planners/pdm/test_scorer.py",
@@ -46,11 +47,12 @@ GROUPS: dict[str, dict[str, tuple[str, ...]]] = {
             "sim/test_lock_step.py",
             "metrics/test_open_loop.py",
         ),
-        "sim.traffic": ("sim/traffic/test_own_traffic.py", "sim/traffic/test_learned.py"),
+        "sim.traffic": ("sim/traffic/test_own_traffic.py", "sim/traffic/test_learned.py", EDITED),
         "sim.traffic.idm": (
             "parity/test_dynamics.py::test_idm_world",
             "sim/traffic/test_idm_buffer.py",
             "sim/traffic/test_idm.py",
+            EDITED,
         ),
     },
     "pdm": {

@@ -112,6 +112,25 @@ def test_vehicle_without_room_on_its_lane_is_not_simulated() -> None:
     assert tracks.valid[0].tolist() == [True, False]
 
 
+def test_vehicle_that_overlaps_a_long_object_is_not_simulated() -> None:
+    scenario = scene([(40.0, 0.0, 0.0), (50.0, 0.0, 0.0)], [VEHICLE, CONE])
+    sizes = scenario.tracks.sizes * np.array([[1.0, 1.0], [4.0, 1.0]])
+    scenario = replace(scenario, tracks=replace(scenario.tracks, sizes=sizes))
+
+    assert drive(scenario, steps=1).valid[0].tolist() == [False, True]
+
+
+@pytest.mark.parametrize(("gone", "stops"), [(1, True), (2, False)])
+def test_a_cone_is_in_the_way_while_it_is_there(gone: int, stops: bool) -> None:
+    poses = [(40.0, 0.0, 0.0), (75.0, 9.0, 0.0), (75.0, 0.0, 0.0)]
+    scenario = scene(poses, [VEHICLE, CONE, CONE], speed=5.0)
+    valid = scenario.tracks.valid.copy()
+    valid[scenario.iteration_rows[20] :, gone] = False
+    scenario = replace(scenario, tracks=replace(scenario.tracks, valid=valid))
+
+    assert (drive(scenario).poses[100, 0, 0] < 72.0) == stops
+
+
 def test_agents_beyond_the_radius_are_removed_for_good() -> None:
     scenario = scene([(105.0, 0.0, 0.0)], [VEHICLE], speed=15.0)
 
