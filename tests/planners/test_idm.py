@@ -112,6 +112,19 @@ def test_the_corridor_goes_on_by_half_a_width_after_eight_seconds(rear, leads):
     assert roll_out(scenario)[1][1] == pytest.approx(2.0 + 0.5 * accel, abs=1e-9)
 
 
+@pytest.mark.parametrize(("side", "leads"), [(1.14, True), (1.155, False)])
+def test_what_lies_along_the_edge_of_the_corridor_is_decided_by_its_polygon(side, leads):
+    """Half a width is 1.1485 m; what lies on the other side is another object."""
+    scenario = with_objects((40.0, side + 1.0, 0.0), (40.0, -4.0, 0.0))
+    accel = accel_behind(8.0, 15.0, (40.0 - 2.25 if leads else 419.0) - 11.461 - 2.588)
+    assert roll_out(scenario)[1][1] == pytest.approx(8.0 + 0.5 * accel, abs=1e-9)
+
+
+def test_a_fast_ego_sees_what_is_just_ahead_at_the_start_of_its_path():
+    scenario = with_objects((6.75, 0.0, 0.0), speed=12.0, start=(-0.961, 0.0, 0.0))
+    assert roll_out(scenario)[1][1] == 12.0 - 0.5 * 3.0
+
+
 @pytest.mark.parametrize(("corner", "leads"), [((420.1, 1.1), True), ((420.2, 1.1), False)])
 def test_the_corridor_has_square_corners_at_the_end_of_the_path(corner, leads):
     scenario = with_objects((corner[0] + 2.25, corner[1] + 1.0, 0.0), start=(395.0, 0.0, 0.0))

@@ -273,6 +273,23 @@ def test_order_of_replayed_objects_does_not_matter(order: list[int]) -> None:
     np.testing.assert_array_equal(usual.poses[:, :3], other.poses[:, :3])
 
 
+@pytest.mark.parametrize(("side", "lead_speed"), [(1.5, 5.0), (-1.5, 0.0)])
+def test_of_ego_and_pedestrian_the_lower_one_leads(side: float, lead_speed: float) -> None:
+    """Both come to touch a slow agent in its second step, the ego at 5 m/s."""
+    base = scene([(40.0, 0.0, 0.0), (143.9, side, 0.0)], [VEHICLE, PEDESTRIAN], speed=0.5)
+    first, second = base.iteration_rows[1:3]
+    poses, ego = base.tracks.poses.copy(), base.ego.copy()
+    poses[second:, 1, 0] -= 100.0
+    ego[first:, [0, 1, 3]] = 40.0 - 1.461, -side, 5.0
+
+    tracks = drive(replace(base, ego=ego, tracks=replace(base.tracks, poses=poses)), steps=2)
+
+    before, after = tracks.velocities[1:3, 0, 0]
+    closing = before * (before - lead_speed) / (2.0 * np.sqrt(2.0))
+    accel = 1.0 - (before / 15.0) ** 4 - (1.0 + 1.5 * before + closing) ** 2
+    assert after == pytest.approx(before + 0.1 * max(accel, -2.0), abs=1e-6)
+
+
 def test_of_two_that_an_agent_touches_the_lower_one_in_y_leads() -> None:
     """nuPlan rule 131; whole scenes are compared by tests/parity."""
     assert comes_first(0.0, 3.0, 0.0, 4.0)
