@@ -27,7 +27,7 @@ from typing import Any
 
 import pytest
 from hypothesis import Phase, settings
-from mutated import GROUPS, ROOT, SLOW_AS_PYTHON, TESTS, modules, shared_sample, tests_of
+from mutated import GROUPS, LEFT_OUT, ROOT, TESTS, modules, shared_sample, tests_of
 from mutations import Mutant, names_of
 
 CPU_SECONDS = 60  # of a child; one that takes longer hangs
@@ -175,7 +175,7 @@ def run_tests(tests: list[str], quiet: bool = True) -> str:
         "no:cacheprovider",
         "-m",
         "not slow and not thorough and not long",
-        *(f"--deselect=tests/{name}" for name in SLOW_AS_PYTHON),
+        *(f"--deselect=tests/{name}" for name in LEFT_OUT),
     ]
     code = pytest.main([*options, *tests], plugins=[failure])
     if code not in (0, 1):

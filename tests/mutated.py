@@ -80,7 +80,10 @@ GROUPS: dict[str, dict[str, tuple[str, ...]]] = {
         "data.readers.tracks": TABLE_TESTS,
     },
 }
-SLOW_AS_PYTHON = (
+LEFT_OUT = (  # takes long, and notices little more
+    "data/readers/tracks/test_diagnostics.py::test_the_map_of_another_place_is_named",
+    "data/readers/tracks/test_reader.py::test_a_recording_that_is_converted_again",
+    "data/readers/tracks/test_reader.py::test_the_command_converts_and_draws",
     "sim/traffic/test_idm.py::test_order_of_replayed_objects_does_not_matter",
     "planners/pdm/test_pdm.py::test_tracks_of_a_corridor_are_those_its_polygon_touches",
 )
