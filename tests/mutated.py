@@ -25,7 +25,11 @@ PDM_TESTS = (
     f"{OFFICIAL_PLANNERS}::test_loops",
 )
 IDM_TESTS = ("planners/test_idm.py", f"{OFFICIAL_PLANNERS}::test_idm_calls")
-READER_TESTS = ("data/readers/test_dsc3d.py", "data/readers/test_scenarios.py")
+READER_TESTS = (
+    "data/readers/test_build.py",
+    "data/readers/test_dsc3d.py",
+    "data/readers/test_scenarios.py",
+)
 OPEN_DATA_TESTS = (
     "data/readers/test_open_data_samples.py",
     "data/readers/test_open_data.py",
