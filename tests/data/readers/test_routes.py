@@ -1,11 +1,14 @@
 """Routes of recorded egos, on a road of three blocks: 200 m, a connector of 20 m, 200 m."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from worlds import straight_road
 
-from shiftsim.data.readers.routes import find_route, starts_on_lane
+from shiftsim.data.readers.routes import _path_between, find_route, starts_on_lane
 from shiftsim.data.readers.windows import ConversionConfig
+from shiftsim.world.layers import make_lists
 
 ROAD, CONFIG = straight_road(), ConversionConfig()
 
@@ -38,6 +41,15 @@ def test_the_way_ahead_is_appended():
 def test_driving_against_the_lanes_leaves_a_route_that_is_not_linked():
     route = find_route(ROAD, poses_at(250.0, 150.0), CONFIG)
     assert (route.ids[:2], route.num_driven, route.is_linked) == (("3", "1"), 2, False)
+
+
+def test_gaps_of_up_to_three_blocks_are_closed_on_the_shortest_way():
+    road = SimpleNamespace(block_outgoing=make_lists([[6, 1], [2], [3], [4], [5], [], [0, 7], []]))
+    assert _path_between(road, 0, 1) == []
+    assert _path_between(road, 0, 3) == [1, 2]
+    assert _path_between(road, 0, 4) == [1, 2, 3]
+    assert _path_between(road, 0, 5) == []
+    assert _path_between(road, 0, 7) == [6]
 
 
 def test_off_the_road_there_is_no_route():
