@@ -31,6 +31,7 @@ READER_TESTS = (
     "data/readers/test_scenarios.py",
 )
 OPEN_DATA_TESTS = (
+    "data/readers/test_build.py",
     "data/readers/test_open_data_samples.py",
     "data/readers/test_open_data.py",
     "data/readers/test_open_data_faults.py",
@@ -78,7 +79,7 @@ GROUPS: dict[str, dict[str, tuple[str, ...]]] = {
     "readers": {
         "data.readers": READER_TESTS,
         **dict.fromkeys(
-            (f"data.readers.{name}" for name in ("av2", "commonroad", "py123d", "files")),
+            (f"data.readers.{name}" for name in ("av2", "codes", "commonroad", "py123d", "files")),
             OPEN_DATA_TESTS,
         ),
         "data.readers.tracks": TABLE_TESTS,
