@@ -213,7 +213,7 @@ class Runner:
         )
         os.environ["HYPOTHESIS_PROFILE"] = "mutants"
         files = [test for module in modules for test in tests_of(module)]
-        if failed := run_tests(list(dict.fromkeys(files))):
+        if files and (failed := run_tests(list(dict.fromkeys(files)))):
             raise SystemExit(f"fails without any change: {failed}")
         self.definitions = Definitions()
 
@@ -289,9 +289,6 @@ def main() -> None:
         for line in options.kept.read_text().splitlines():
             row = json.loads(line)
             rows[row["mutant"]] = row
-    runner = Runner(options.workers, sorted({mutant.module for mutant in chosen}))
-    if options.check:
-        runner.check()
 
     def is_done(mutant: Mutant) -> bool:
         row = rows.get(mutant.name, {})
@@ -299,6 +296,9 @@ def main() -> None:
 
     # what was never run comes before what survived
     waiting = sorted((m for m in chosen if not is_done(m)), key=lambda m: m.name in rows)
+    runner = Runner(options.workers, sorted({mutant.module for mutant in waiting}))
+    if options.check:
+        runner.check()
     in_time = takewhile(lambda _: time.monotonic() - began < options.seconds, waiting)
     versions = {mutant.name: mutant.version for mutant in chosen}
     for row in runner.run(in_time):
