@@ -1,4 +1,4 @@
-"""Whether the tests notice small changes of the metrics, the dynamics, the noise and the loop.
+"""Whether the tests notice small changes of metrics, simulation, PDM, IDM and data readers.
 
     python tests/mutants.py --count 400 --seed 1 --workers 2
 
@@ -18,7 +18,7 @@ import resource
 import signal
 import sys
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from itertools import takewhile
 from pathlib import Path
@@ -27,66 +27,13 @@ from typing import Any
 
 import pytest
 from hypothesis import Phase, settings
-from mutations import Mutant, mutants_of, names_of, sample
+from mutated import GROUPS, LEFT_OUT, ROOT, TESTS, modules, shared_sample, tests_of
+from mutations import Mutant, names_of
 
-TESTS = Path(__file__).resolve().parent
-ROOT = TESTS.parent
 CPU_SECONDS = 60  # of a child; one that takes longer hangs
 MEMORY = 8 << 30  # bytes that a child may have mapped
 
-METRIC_TESTS = (
-    "metrics/test_comfort.py",
-    "metrics/test_examples.py",
-    "metrics/test_errors.py",
-    "metrics/test_open_loop.py",
-    "parity/test_metric_worlds.py::test_world",
-    "parity/test_nuplan_runs.py",
-)
-DYNAMICS_TESTS = ("parity/test_dynamics.py",)
-# the tests of each module, fast ones first; a folder's come after the module's own
-TESTS_OF = {
-    "shiftsim.metrics": METRIC_TESTS,
-    "shiftsim.sim.dynamics": DYNAMICS_TESTS,
-    "shiftsim.sim.noise": (),
-    "shiftsim.sim.loop": (
-        "sim/test_plan_check.py",
-        "sim/test_lock_step.py",
-        "metrics/test_open_loop.py",
-    ),
-}
 Name = tuple[str, str]  # a module and a top-level name of it
-
-
-def modules() -> list[str]:
-    """The modules that are mutated."""
-    files = [*(ROOT / "metrics").glob("*.py"), *(ROOT / "shiftsim/sim/dynamics").glob("*.py")]
-    names = {"metrics": "shiftsim.metrics", "dynamics": "shiftsim.sim.dynamics"}
-    found = [f"{names[file.parent.name]}.{file.stem}" for file in sorted(files)]
-    return [name.removesuffix(".__init__") for name in found] + [
-        "shiftsim.sim.noise",
-        "shiftsim.sim.loop",
-    ]
-
-
-def tests_of(module: str) -> list[str]:
-    """Tests that concern a module."""
-    own = Path(*module.split(".")[1:])
-    first = own.parent / f"test_{own.name}.py"
-    group = next(name for name in TESTS_OF if module.startswith(name))
-    tests = [str(first)] if (TESTS / first).is_file() else []
-    tests += [test for test in TESTS_OF[group] if test != str(first)]
-    return [str(TESTS / test) for test in tests]
-
-
-def source_of(module: str) -> str:
-    """The text of a module."""
-    path = ROOT / Path(*module.split("."))
-    return (path / "__init__.py" if path.is_dir() else path.with_suffix(".py")).read_text()
-
-
-def all_mutants() -> list[Mutant]:
-    """Every mutant of every module."""
-    return [mutant for module in modules() for mutant in mutants_of(module, source_of(module))]
 
 
 class Definitions:
@@ -133,7 +80,7 @@ def _loaded() -> Iterator[tuple[str, ast.Module]]:
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)
         if file and Path(file).resolve().is_relative_to(ROOT) and ".venv" not in file:
-            if name not in ("mutants", "mutations", "__main__", "__mp_main__"):
+            if name not in ("mutants", "mutated", "mutations", "__main__", "__mp_main__"):
                 yield name, ast.parse(Path(file).read_text())
 
 
@@ -228,6 +175,7 @@ def run_tests(tests: list[str], quiet: bool = True) -> str:
         "no:cacheprovider",
         "-m",
         "not slow and not thorough and not long",
+        *(f"--deselect=tests/{name}" for name in LEFT_OUT),
     ]
     code = pytest.main([*options, *tests], plugins=[failure])
     if code not in (0, 1):
@@ -255,17 +203,17 @@ def _child(mutant: Mutant | None, start: list[Name], definitions: Definitions, p
 class Runner:
     """Runs mutants in forked processes, a few at a time."""
 
-    def __init__(self, workers: int) -> None:
-        self.workers = workers
-        self.running: dict[int, tuple[str, int, float]] = {}
+    def __init__(self, workers: int, modules: list[str]) -> None:
+        self.workers, self.modules = workers, modules
+        self.running: dict[int, tuple[str, int]] = {}
         # looking for the smallest example that fails would take minutes without compiled kernels
         phases = (Phase.explicit, Phase.generate)
         settings.register_profile(
             "mutants", max_examples=25, deadline=None, derandomize=True, phases=phases
         )
         os.environ["HYPOTHESIS_PROFILE"] = "mutants"
-        files = [test for module in modules() for test in tests_of(module)]
-        if failed := run_tests(list(dict.fromkeys(files))):
+        files = [test for module in modules for test in tests_of(module)]
+        if files and (failed := run_tests(list(dict.fromkeys(files)))):
             raise SystemExit(f"fails without any change: {failed}")
         self.definitions = Definitions()
 
@@ -280,13 +228,15 @@ class Runner:
             yield self._next()
 
     def check(self) -> None:
-        """All kernels as plain Python, and nothing else, fail no test."""
-        for module in modules():
+        """All kernels as plain Python, and nothing else, fail no test and leave time to spare."""
+        for module in self.modules:
             names = [name for name in self.definitions.statements if name[0] == module]
             if names and tests_of(module):
                 self._start(module, None, names)
-                if (row := self._next())["result"] != "survived":
-                    raise SystemExit(f"{module} fails as plain Python: {row['by']}")
+                row = self._next()
+                print(f"{row['seconds']:6.1f} s {module}", flush=True)
+                if row["result"] != "survived" or row["seconds"] > CPU_SECONDS / 2:
+                    raise SystemExit(f"{module} fails as plain Python: {row['by'] or 'too slow'}")
 
     def _start(self, name: str, mutant: Mutant | None, start: list[Name]) -> None:
         reading, writing = os.pipe()
@@ -296,16 +246,16 @@ class Runner:
             os.close(reading)
             _child(mutant, start, self.definitions, writing)
         os.close(writing)
-        self.running[child] = (name, reading, time.monotonic())
+        self.running[child] = (name, reading)
 
     def _next(self) -> dict[str, Any]:
-        child, status = os.wait()
-        name, reading, began = self.running.pop(child)
+        child, status, used = os.wait4(-1, 0)
+        name, reading = self.running.pop(child)
         with os.fdopen(reading, "rb") as pipe:
             by = pipe.read().decode(errors="replace")
         if status != 0:
             by = f"signal {os.WTERMSIG(status)}" if os.WIFSIGNALED(status) else f"exit {status}"
-        seconds = round(time.monotonic() - began, 2)
+        seconds = round(used.ru_utime + used.ru_stime, 2)
         result = "killed" if by else "survived"
         return {"mutant": name, "result": result, "by": by, "seconds": seconds}
 
@@ -321,26 +271,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("--count", type=int, default=400, help="number of mutants")
+    parser.add_argument("--count", type=int, default=400, help="number of mutants, of all groups")
     parser.add_argument("--seed", type=int, default=1, help="which of them")
     parser.add_argument("--workers", type=int, default=2, help="processes at a time")
-    parser.add_argument("--only", default="", help="part of the name of the mutants to run")
+    parser.add_argument("--only", default="", help="a group, or part of the names")
     parser.add_argument("--kept", type=Path, help="JSON lines of results, read and added to")
     parser.add_argument("--seconds", type=float, default=1e9, help="start none after that time")
     parser.add_argument("--check", action="store_true", help="try the tests as plain Python first")
     options = parser.parse_args()
     began = time.monotonic()
-    chosen = [
-        m for m in sample(all_mutants(), options.count, options.seed) if options.only in m.name
-    ]
+    group_of, chosen = modules(), shared_sample(options.count, options.seed)
+    if only := options.only:
+        is_group = only in GROUPS
+        chosen = [m for m in chosen if only in (group_of[m.module] if is_group else m.name)]
     rows: dict[str, dict[str, Any]] = {}
     if options.kept and options.kept.is_file():
         for line in options.kept.read_text().splitlines():
             row = json.loads(line)
             rows[row["mutant"]] = row
-    runner = Runner(options.workers)
-    if options.check:
-        runner.check()
 
     def is_done(mutant: Mutant) -> bool:
         row = rows.get(mutant.name, {})
@@ -348,6 +296,9 @@ def main() -> None:
 
     # what was never run comes before what survived
     waiting = sorted((m for m in chosen if not is_done(m)), key=lambda m: m.name in rows)
+    runner = Runner(options.workers, sorted({mutant.module for mutant in waiting}))
+    if options.check:
+        runner.check()
     in_time = takewhile(lambda _: time.monotonic() - began < options.seconds, waiting)
     versions = {mutant.name: mutant.version for mutant in chosen}
     for row in runner.run(in_time):
@@ -361,14 +312,25 @@ def main() -> None:
 
 def report(rows: dict[str, dict[str, Any]], chosen: list[Mutant]) -> int:
     """Print the rate and the survivors; 1 if one of them is not listed as equal."""
-    found = [rows[mutant.name] for mutant in chosen if mutant.name in rows]
-    survived = [row["mutant"] for row in found if row["result"] == "survived"]
-    known = equal_mutants()
-    for name in sorted(survived):
-        print(f"{'equal   ' if name in known else 'SURVIVED'} {name}")
-    killed = len(found) - len(survived)
-    print(f"{killed} of {len(found)} killed ({killed / max(len(found), 1):.1%}) of {len(chosen)}")
-    return int(not known.issuperset(survived))
+    group_of, known = modules(), equal_mutants()
+    ended: dict[str, Counter[str]] = {group: Counter() for group in ["all", *GROUPS]}
+    unknown = 0
+    for mutant in sorted(chosen, key=lambda m: m.name):
+        if row := rows.get(mutant.name):
+            result = row["result"]
+            if result == "survived":
+                result = "equal" if mutant.name in known else "SURVIVED"
+                unknown += result == "SURVIVED"
+                print(f"{result:8} {mutant.name}")
+            for group in ("all", group_of[mutant.module]):
+                ended[group][result] += 1
+    for group, counts in reversed(ended.items()):
+        killed, total = counts["killed"], max(counts.total(), 1)
+        print(
+            f"{group}: {killed} of {counts.total()} killed ({killed / total:.1%}), "
+            f"{counts['equal']} survivors equal, {counts['SURVIVED']} not"
+        )
+    return int(unknown > 0)
 
 
 if __name__ == "__main__":

@@ -4,10 +4,12 @@ import ast
 import re
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
-from mutants import all_mutants, equal_mutants
+from mutants import equal_mutants
+from mutated import GROUPS, all_mutants, modules, shared_sample
 from mutations import mutants_of, sample
 
 SCRIPT = Path(__file__).with_name("mutants.py")
@@ -60,19 +62,25 @@ def test_a_sample_hardly_changes_with_the_source() -> None:
     assert len(set(chosen) & set(sample(after, 8, 1))) >= 6
 
 
+def test_every_group_has_the_same_share_of_a_sample() -> None:
+    group_of, chosen = modules(), shared_sample(40, 1)
+    assert Counter(group_of[mutant.module] for mutant in chosen) == dict.fromkeys(GROUPS, 8)
+    assert set(chosen) < set(shared_sample(80, 1))
+
+
 def run(*options: str) -> float:
     """Run the script, which must find no survivor that is not listed; per cent that are noticed."""
     command = [sys.executable, str(SCRIPT), "--workers", "1", *options]
     done = subprocess.run(command, capture_output=True, text=True, cwd=SCRIPT.parent.parent)
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-2000:]
-    rate = re.search(r"killed \((.*)%\)", done.stdout)
+    rate = re.search(r"all: .* killed \((.*)%\)", done.stdout)
     assert rate is not None
     return float(rate[1])
 
 
 @pytest.mark.thorough
 def test_a_few_mutants_are_noticed_or_listed_as_equal() -> None:
-    run("--count", "24")
+    run("--count", "25")
 
 
 @pytest.mark.thorough

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from worlds import cruise_scenario, standing_tracks, straight_road
+from worlds import cruise_scenario, standing_tracks, straight_road, with_velocities
 
 from shiftsim.errors import PlannerError
 from shiftsim.planners.idm import Idm
@@ -86,6 +86,68 @@ def test_what_is_beside_behind_or_far_away_changes_nothing(pose):
 def test_an_object_that_touches_the_ego_from_behind_brakes_it_fully():
     _, speeds = roll_out(with_objects((8.0, 0.0, 0.0), kind=AgentKind.GENERIC_OBJECT))
     assert speeds[1] == 8.0 - 0.5 * 3.0
+
+
+@pytest.mark.parametrize("speeds", [(0.0, 5.0), (5.0, 0.0)])
+def test_of_two_that_are_touched_the_lower_one_leads(speeds):
+    """At 0.5 m/s the ego does not brake for them as hard as it can."""
+    scenario = with_objects((12.0, 1.5, 0.0), (12.0, -1.5, 0.0), speed=0.5)
+    scenario = with_velocities(scenario, slice(2), np.column_stack([speeds, (0.0, 0.0)]))
+    desired = 1.0 + 0.5 * 1.5 + 0.5 * (0.5 - speeds[1]) / (2.0 * np.sqrt(3.0))
+    accel = 1.0 - (0.5 / 15.0) ** 4 - desired**2
+    assert roll_out(scenario)[1][1] == pytest.approx(max(0.5 + 0.5 * accel, 0.0), abs=1e-12)
+
+
+def accel_behind(speed, target, gap):
+    """Of the model, behind what stands."""
+    desired = 1.0 + speed * 1.5 + speed * speed / (2.0 * np.sqrt(3.0))
+    return 1.0 - (speed / target) ** 4 - (desired / gap) ** 2
+
+
+@pytest.mark.parametrize(("rear", "leads"), [(28.5, True), (28.7, False)])
+def test_the_corridor_goes_on_by_half_a_width_after_eight_seconds(rear, leads):
+    """It ends at 11.461 m + 8 s at 2 m/s + 1.1485 m, and the path at 419 m."""
+    scenario = with_objects((rear + 2.25, 0.0, 0.0), speed=2.0, road=straight_road(2.0))
+    accel = accel_behind(2.0, 2.0, (rear if leads else 419.0) - 11.461 - 2.588)
+    assert roll_out(scenario)[1][1] == pytest.approx(2.0 + 0.5 * accel, abs=1e-9)
+
+
+@pytest.mark.parametrize(("side", "leads"), [(1.14, True), (1.155, False)])
+def test_what_lies_along_the_edge_of_the_corridor_is_decided_by_its_polygon(side, leads):
+    """Half a width is 1.1485 m; what lies on the other side is another object."""
+    scenario = with_objects((40.0, side + 1.0, 0.0), (40.0, -4.0, 0.0))
+    accel = accel_behind(8.0, 15.0, (40.0 - 2.25 if leads else 419.0) - 11.461 - 2.588)
+    assert roll_out(scenario)[1][1] == pytest.approx(8.0 + 0.5 * accel, abs=1e-9)
+
+
+def test_a_fast_ego_sees_what_is_just_ahead_at_the_start_of_its_path():
+    scenario = with_objects((6.75, 0.0, 0.0), speed=12.0, start=(-0.961, 0.0, 0.0))
+    assert roll_out(scenario)[1][1] == 12.0 - 0.5 * 3.0
+
+
+@pytest.mark.parametrize(("corner", "leads"), [((420.1, 1.1), True), ((420.2, 1.1), False)])
+def test_the_corridor_has_square_corners_at_the_end_of_the_path(corner, leads):
+    scenario = with_objects((corner[0] + 2.25, corner[1] + 1.0, 0.0), start=(395.0, 0.0, 0.0))
+    accel = accel_behind(8.0, 15.0, (corner[0] if leads else 419.0) - 395.0 - 1.461 - 2.588)
+    assert roll_out(scenario)[1][1] == pytest.approx(8.0 + 0.5 * accel, abs=1e-9)
+
+
+def test_of_the_history_only_the_last_row_counts():
+    now, tracks = 60, standing_tracks(NUM_ROWS, np.array([[45.0, 0.0, 0.0]]), [AgentKind.VEHICLE])
+    tracks.poses[:now, 0, 0] += 9.0
+    tracks.sizes[:now] *= 0.5
+    tracks.velocities[:now] += 3.0
+    scenario = cruise_scenario(tracks=tracks)
+    seen = observe_log(scenario, 0, ego=scenario.expert[0], samples=5)
+    np.testing.assert_array_equal(started(scenario).roll_out(seen)[1], roll_out(scenario)[1])
+
+
+def test_rolling_back_the_ego_meets_what_is_just_behind_it():
+    """Its rear left corner is at x = 9.512 m, and at 9.262 m after the first step."""
+    scenario = with_objects((9.28 - 2.25, 1.14 + 1.0, 0.0), speed=-0.5, start=(10.639, 0.0, 0.0))
+    free = cruise_scenario(speed=-0.5, start=(10.639, 0.0, 0.0))
+    assert roll_out(scenario)[1][:3].tolist() == [-0.5, 0.0, 0.0]
+    assert roll_out(free)[1][2] == pytest.approx(0.5, abs=1e-4)
 
 
 def test_a_red_light_counts_as_a_standing_object_and_green_does_not():

@@ -2,6 +2,7 @@ from collections import Counter
 
 import dsc3d_writer as writer
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
@@ -138,6 +139,20 @@ def test_bad_numbers_are_named(tmp_path, group, row, value, message):
     track[group][row, 0] = value
     with pytest.raises(ConversionError, match=message):
         read_recording(open_site(_site(tmp_path, [track])), "r")
+
+
+@pytest.mark.parametrize(
+    ("ids", "message"), [([0, 2, 2, 4], "increase strictly"), ([0, 2, 4, 7], "frame_distance")]
+)
+def test_frame_ids_that_repeat_or_are_no_distance_apart_are_refused(tmp_path, ids, message):
+    folder = _site(tmp_path)
+    path = folder / "annotations/r/frames.parquet"
+    frames = pq.read_table(path).slice(0, len(ids))
+    number = frames.column_names.index("frame_id")
+    frames = frames.set_column(number, "frame_id", pa.array(ids, frames["frame_id"].type))
+    pq.write_table(frames, path)
+    with pytest.raises(ConversionError, match=message):
+        read_recording(open_site(folder), "r")
 
 
 def test_an_unknown_category_is_refused_unless_mapped(tmp_path):

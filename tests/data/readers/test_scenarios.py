@@ -6,13 +6,16 @@ import pytest
 import shapely
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.signal import savgol_filter
 
 from shiftsim.data.readers.annotations import read_recording
 from shiftsim.data.readers.build import make_samples
 from shiftsim.data.readers.dsc3d import convert_dsc3d, open_site
 from shiftsim.data.readers.samples import ego_states, resample, slope
+from shiftsim.data.readers.scenarios import _spans
 from shiftsim.data.readers.windows import (
     ConversionConfig,
+    Span,
     evaluate_windows,
     overlap_partners,
     window_spans,
@@ -147,6 +150,17 @@ def test_slope_is_exact_for_parabolas_also_at_the_ends():
     np.testing.assert_allclose(
         slope(3.0 + 2.0 * t - 1.5 * t**2, 0.05), 2.0 - 3.0 * t, rtol=0, atol=1e-9
     )
+
+
+def test_slope_is_the_one_of_savitzky_and_golay(rng):
+    values = rng.normal(size=40)
+    expected = savgol_filter(values, 11, 2, deriv=1, delta=0.05, mode="interp")
+    np.testing.assert_allclose(slope(values, 0.05), expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("rows", "spans"), [(45, []), (46, [Span(5.0, 2.3, 2.0, 3)])])
+def test_where_no_window_fits_a_short_one_does_from_two_seconds_on(rows, spans):
+    assert list(_spans(100, rows, 3, CONFIG)) == spans
 
 
 def test_the_ego_turns_about_its_rear_axle():

@@ -1,15 +1,18 @@
 """Areas and the tracker of proposals, against slow obvious versions."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from worlds import straight_road
 
 from shiftsim.planners.proposals.areas import areas_of, index_ranks, make_areas, select_areas
-from shiftsim.planners.proposals.places import OFF_ROAD, OFF_ROUTE, EgoBox, find_places
+from shiftsim.planners.proposals.places import MULTIPLE, OFF_ROAD, OFF_ROUTE, EgoBox, find_places
 from shiftsim.planners.proposals.tracker import fit_speed
-from shiftsim.world.layers import make_polygons
+from shiftsim.world.layers import make_layer, make_polygons
 from shiftsim.world.state import NUM_STATE
 
 
@@ -19,6 +22,30 @@ def test_areas_and_their_order_are_those_of_the_map():
     ids = [road.edges.ids[i] for i in selected]
     assert ids == ["10", "11", "20", "21"]
     assert np.flatnonzero(make_areas(road, [1, 3]).on_route).tolist() == [1, 3]
+
+
+def test_a_car_park_is_no_lane_but_may_bear_the_id_of_one():
+    road = straight_road()
+    names, ring = (*road.car_parks.ids, "77", "11"), np.array([[0.0, 9.0], [5.0, 9.0], [5.0, 14.0]])
+    parks = make_layer(names, [shapely.Polygon(ring)] * len(names))
+    areas = make_areas(replace(road, car_parks=parks), [0])
+    assert areas.lane[-2:].tolist() == [-1, road.edges.index["11"]]
+    assert np.flatnonzero(areas.on_route).tolist() == [0]
+
+
+@pytest.mark.parametrize("place", [(100.0, 0.0), (-100.0, 0.0), (0.0, 100.0), (0.0, -100.0)])
+def test_on_one_area_is_not_on_several_even_if_others_are_touched(place):
+    """Two halves hold two corners each; what holds the whole ego comes last."""
+    shapes = [shapely.box(-9, -9, 0, 9), shapely.box(0, -9, 9, 9), shapely.box(-5, -2, 5, 2)]
+    rings = [shapely.get_coordinates(shape)[:-1] + place for shape in shapes]
+    areas = areas_of(make_polygons([[r] for r in rings]), np.ones(3, bool), np.arange(3))
+    states = np.zeros((1, 3, NUM_STATE))
+    states[0, :, :2] = np.array([[0.5, 0.0], [0.5, 1.5], [4.0, 0.0]]) + place
+    chosen, size = np.arange(3), EgoBox(4.0, 2.0, 0.0)
+    places = find_places(states, size, areas, chosen, np.zeros(3), by_center=True)
+    assert places.flags[0, :, MULTIPLE].tolist() == [False, True, False]
+    assert not places.flags[..., OFF_ROAD].any()
+    assert not places.flags[..., OFF_ROUTE].any()
 
 
 @settings(max_examples=20)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from worlds import straight_road
@@ -11,11 +12,12 @@ from shiftsim.errors import PlannerError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.planners.routes.correction import (
     RouteCorrector,
+    Start,
     correct_route,
     find_start,
     known_blocks,
 )
-from shiftsim.world.build import build_map
+from shiftsim.world.build import BlockSpec, build_map
 from shiftsim.world.layers import square_around
 
 
@@ -71,6 +73,16 @@ def test_a_map_without_roads_is_an_error():
     road = build_map("nowhere", edges=[], blocks=[])
     with pytest.raises(PlannerError, match="map 'nowhere' has no roadblocks"):
         find_start(road, [], np.zeros(3), square_around(0.0, 0.0, 1.0))
+
+
+@pytest.mark.parametrize(("overlap", "kept"), [(0.9, ["1", "8", "9"]), (1.1, ["1", "8"])])
+def test_a_route_ends_before_a_connector_that_overlaps_one_before_it(overlap, kept):
+    """Areas of roadblocks do not count, nor does up to a square metre."""
+    shapes = {"1": (0, 0, 9, 9), "8": (0, 0, 4, 2), "9": (4 - overlap, 1, 8, 5)}
+    blocks = [BlockSpec(name, name > "1", shapely.box(*box)) for name, box in shapes.items()]
+    road = build_map("loop", edges=[], blocks=blocks)
+    route = known_blocks(road, list(shapes), "token", "test")
+    assert names(road, correct_route(road, route, Start(route[0], []))) == kept
 
 
 @pytest.fixture(scope="module")

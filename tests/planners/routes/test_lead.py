@@ -42,6 +42,13 @@ def test_the_gap_to_the_lead_is_the_distance_between_the_polygons(rng):
         assert find_lead(footprint, objects, occupancy)[0] == few[truth[few].argmin()]
 
 
+def test_what_crosses_the_footprint_is_no_gap_away():
+    footprint = boxes_to_corners(np.zeros(3), np.array([5.176, 2.297]))
+    across = boxes_to_corners(np.array([0.0, 0.0, np.pi / 2.0]), np.array([9.0, 1.0]))
+    objects = objects_of([across + 20.0, across])
+    assert find_lead(footprint, objects, np.array([HIT, OVERLAPPING])) == (1, 0.0)
+
+
 def test_of_two_objects_that_are_touched_the_lower_one_leads_whatever_their_order():
     footprint = boxes_to_corners(np.zeros(3), np.array([5.176, 2.297]))
     low, high, far = (footprint + shift for shift in ((1.0, -1.0), (-1.0, 1.0), (30.0, -9.0)))

@@ -112,6 +112,25 @@ def test_vehicle_without_room_on_its_lane_is_not_simulated() -> None:
     assert tracks.valid[0].tolist() == [True, False]
 
 
+def test_vehicle_that_overlaps_a_long_object_is_not_simulated() -> None:
+    scenario = scene([(40.0, 0.0, 0.0), (50.0, 0.0, 0.0)], [VEHICLE, CONE])
+    sizes = scenario.tracks.sizes * np.array([[1.0, 1.0], [4.0, 1.0]])
+    scenario = replace(scenario, tracks=replace(scenario.tracks, sizes=sizes))
+
+    assert drive(scenario, steps=1).valid[0].tolist() == [False, True]
+
+
+@pytest.mark.parametrize(("gone", "stops"), [(1, True), (2, False)])
+def test_a_cone_is_in_the_way_while_it_is_there(gone: int, stops: bool) -> None:
+    poses = [(40.0, 0.0, 0.0), (75.0, 9.0, 0.0), (75.0, 0.0, 0.0)]
+    scenario = scene(poses, [VEHICLE, CONE, CONE], speed=5.0)
+    valid = scenario.tracks.valid.copy()
+    valid[scenario.iteration_rows[20] :, gone] = False
+    scenario = replace(scenario, tracks=replace(scenario.tracks, valid=valid))
+
+    assert (drive(scenario).poses[100, 0, 0] < 72.0) == stops
+
+
 def test_agents_beyond_the_radius_are_removed_for_good() -> None:
     scenario = scene([(105.0, 0.0, 0.0)], [VEHICLE], speed=15.0)
 
@@ -252,6 +271,23 @@ def test_order_of_replayed_objects_does_not_matter(order: list[int]) -> None:
     other = drive(scene([poses[i] for i in shuffled], [kinds[i] for i in shuffled], speed=4.0))
 
     np.testing.assert_array_equal(usual.poses[:, :3], other.poses[:, :3])
+
+
+@pytest.mark.parametrize(("side", "lead_speed"), [(1.5, 5.0), (-1.5, 0.0)])
+def test_of_ego_and_pedestrian_the_lower_one_leads(side: float, lead_speed: float) -> None:
+    """Both come to touch a slow agent in its second step, the ego at 5 m/s."""
+    base = scene([(40.0, 0.0, 0.0), (143.9, side, 0.0)], [VEHICLE, PEDESTRIAN], speed=0.5)
+    first, second = base.iteration_rows[1:3]
+    poses, ego = base.tracks.poses.copy(), base.ego.copy()
+    poses[second:, 1, 0] -= 100.0
+    ego[first:, [0, 1, 3]] = 40.0 - 1.461, -side, 5.0
+
+    tracks = drive(replace(base, ego=ego, tracks=replace(base.tracks, poses=poses)), steps=2)
+
+    before, after = tracks.velocities[1:3, 0, 0]
+    closing = before * (before - lead_speed) / (2.0 * np.sqrt(2.0))
+    accel = 1.0 - (before / 15.0) ** 4 - (1.0 + 1.5 * before + closing) ** 2
+    assert after == pytest.approx(before + 0.1 * max(accel, -2.0), abs=1e-6)
 
 
 def test_of_two_that_an_agent_touches_the_lower_one_in_y_leads() -> None:

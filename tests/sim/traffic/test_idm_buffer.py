@@ -70,6 +70,8 @@ def test_gap_inside_a_larger_ring_is_zero() -> None:
 
     assert ring_gap(0.1 * box, box, np.inf) == 0.0
     assert ring_gap(box, 0.1 * box, np.inf) == 0.0
+    wide, narrow = (outline(np.array([[0.0, 0.0], [9.0, 9.0]]), by) for by in (2.0, 1.0))
+    assert ring_gap(wide, 0.5 * narrow + 2.0, np.inf) == 0.0
 
 
 def test_gap_beyond_the_limit_is_the_limit() -> None:

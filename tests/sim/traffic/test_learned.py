@@ -7,6 +7,7 @@ import pytest
 from worlds import cruise_scenario, moved, standing_tracks, straight_road
 
 from shiftsim.errors import CheckpointError, ConfigError, TrafficError
+from shiftsim.planners.basic.constant_velocity import ConstantVelocity
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.traffic import lanes as following
@@ -14,7 +15,7 @@ from shiftsim.sim.traffic.learned import features, model
 from shiftsim.sim.traffic.learned.model import LearnedTraffic
 from shiftsim.sim.traffic.mixed import Mixed
 from shiftsim.sim.traffic.planned import PlannedTraffic
-from shiftsim.world.state import AgentKind
+from shiftsim.world.state import HEADING, NUM_STATE, VX, VY, YAW_RATE, AgentKind
 
 ROAD = straight_road()
 ROWS = 60 + 2 * 60 + 1 + 160
@@ -118,6 +119,64 @@ def test_features_say_who_leads_and_how_far():
     assert row[leader + 2] * 5.0 == pytest.approx(SPEED)  # it comes nearer by its own speed
 
 
+def pedestrian_off_the_road():
+    """A pedestrian that heads for (cos 0.5, sin 0.5), two others, and one who is absent."""
+    frame = np.array([[np.cos(0.5), np.sin(0.5)], [-np.sin(0.5), np.cos(0.5)]])  # ahead, left
+    xy = np.array([[0.0, 0.0], [8.0, 1.0], [-3.0, 5.0], [4.0, 0.0]]) @ frame + [-100.0, 100.0]
+    pedestrian, vehicle = features.PEDESTRIAN, features.VEHICLE
+    return features.Motion(
+        present=np.array([True, True, True, False]),
+        poses=np.column_stack([xy, [0.5, 2.0, 1.0, 0.0]]),
+        speeds=np.array([2.0, 3.0, 1.0, 0.0]),
+        accelerations=np.array([0.6, 0.0, 0.0, 0.0]),
+        turns=np.array([0.1, 0.0, 0.0, 0.0]),
+        velocities=np.array([[2.0, 0.0], [1.5, 0.5], [-0.5, 1.0], [0.0, 0.0]]) @ frame,
+        sizes=np.array([[0.8, 0.6], [4.5, 2.0], [0.7, 0.6], [4.5, 2.0]]),
+        kinds=np.array([pedestrian, vehicle, pedestrian, vehicle]),
+    )
+
+
+def test_features_are_in_the_frame_of_the_agent_and_nearest_others_come_first():
+    out, lanes = np.full((2, features.NUM_FEATURES), 7.0), following.lanes_of(ROAD)
+    features.observe_agents(
+        lanes, pedestrian_off_the_road(), np.array([0, 3]), np.full(2, following.NO_LANE), out
+    )
+    own = [0.2, 0.2, 0.1, 0.16, 0.3, 0.0, 1.0, 0.0, 0.0]
+    lane, path = np.zeros(features.LANE), np.column_stack([features.AHEAD / 20.0, np.zeros(8)])
+    leader = [1.0, 1.0 - 5.35 / 60.0, 0.1, 0.15, 2.0 / 6.35]  # 8 m less half of 0.8 m and 4.5 m
+    others = np.zeros((features.NEIGHBOURS, features.OTHER))
+    others[0] = 1.0, -0.3, 0.5, -0.5, 0.2, 0.14, 1.0
+    others[1] = 1.0, 0.8, 0.1, -0.1, 0.1, 0.9, 0.0
+    expected = np.concatenate([own, lane, path.ravel(), leader, others.ravel()])
+    np.testing.assert_allclose(out[0], expected, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(out[1], 0.0)
+
+
+def test_agents_move_along_the_middle_of_their_turn():
+    moved, controls = np.empty((1, 4)), np.array([[1.0, 0.4]])
+    features.move_agents(pedestrian_off_the_road(), np.array([0]), controls, 0.5, moved)
+    way = 0.5 * (2.0 + 2.5) * 0.5
+    xy = -100.0 + way * np.cos(0.6), 100.0 + way * np.sin(0.6)
+    np.testing.assert_allclose(moved[0], [*xy, 0.7, 2.5], rtol=0, atol=1e-12)
+
+
+def test_changes_are_measured_over_three_rows_and_the_ego_moves_as_its_centre():
+    scenario, model = scene(), LearnedTraffic()
+    tracks, squares = scenario.tracks.rows(scenario.iteration_rows), np.arange(61.0) ** 2
+    tracks.velocities[:, 0, 0] = 0.1 * squares
+    tracks.poses[:, 3, 2] = 0.01 * squares
+    model.start(scenario, tracks, 0)
+    ego = np.zeros(NUM_STATE)
+    ego[[HEADING, VX, VY, YAW_RATE]] = 0.3, 5.0, 0.2, 0.4
+    motion = model._seen(6, ego, tracks, 6)
+    assert motion.accelerations[0] == pytest.approx(0.1 * (36.0 - 9.0) / 0.3)
+    assert motion.turns[3] == pytest.approx(0.01 * (36.0 - 9.0) / 0.3)
+    ahead, left = 5.0, 0.2 + 1.461 * 0.4
+    cos, sin = np.cos(0.3), np.sin(0.3)
+    expected = [cos * ahead - sin * left, sin * ahead + cos * left]
+    np.testing.assert_allclose(motion.velocities[-1], expected, rtol=0, atol=1e-12)
+
+
 def test_a_red_light_ahead_is_seen():
     lanes = following.lanes_of(ROAD)
     path, edge = np.zeros((len(features.AHEAD) + 1, 3)), int(ROAD.outgoing.items[0])
@@ -156,6 +215,21 @@ def test_a_driven_vehicle_stops_behind_the_ego():
     )
     driven = drive(scenario, PlannedTraffic(lambda: load_planner("idm"))).poses[:, 0, 0]
     assert 10.0 < driven[-1] < 35.0 - 3.5
+
+
+def test_a_driver_is_told_the_time():
+    seen = []
+
+    class Watch(ConstantVelocity):
+        def plan(self, observation):
+            seen.append((observation.time_us, observation.history.time_us[-1]))
+            return super().plan(observation)
+
+    scenario = scene()
+    drive(scenario, PlannedTraffic(Watch))
+    times = scenario.iteration_times[: len(seen) // 2].tolist()
+    assert len(times) >= 59
+    assert seen[::2] == seen[1::2] == [(time, time) for time in times]
 
 
 def test_what_a_driver_does_wrong_names_the_vehicle():

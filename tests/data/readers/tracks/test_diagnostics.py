@@ -1,5 +1,7 @@
 """Tables with wrong units, axes, orders or origins: each is named, and its remedy repairs it."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -8,7 +10,8 @@ from track_files import export_town, write_tracks
 
 from shiftsim.data.maps.opendrive.map import build_road_map
 from shiftsim.data.maps.opendrive.reading import read_opendrive
-from shiftsim.data.readers.tracks.diagnostics import diagnose
+from shiftsim.data.readers.tracks.axes import Diagnostics
+from shiftsim.data.readers.tracks.diagnostics import _check_starts, diagnose
 from shiftsim.data.readers.tracks.table import read_tracks
 from shiftsim.errors import ConfigError, ConversionError
 
@@ -458,6 +461,19 @@ def test_a_clock_of_its_own_for_every_object_is_named(town, tmp_path):
     (note,) = _diagnose(path, road).warnings
     assert f"{len(first)} objects appear at the first time" in note.what
     assert "one clock for all" in note.remedy
+
+
+@pytest.mark.parametrize(
+    ("late", "gone", "is_doubted"), [(0, 10, False), (0, 11, True), (1, 19, False)]
+)
+def test_a_clock_is_doubted_where_all_begin_at_once_and_most_end_early(late, gone, is_doubted):
+    """Of 20 objects; the last second is from 9 s on."""
+    first = np.where(np.arange(20) < late, 1.0, 0.0)
+    last = np.where(np.arange(20) < gone, 8.9, np.where(np.arange(20) < 19, 9.0, 10.0))
+    table = SimpleNamespace(time=np.column_stack([first, last]).ravel(), ends=2 * np.arange(21))
+    out = Diagnostics()
+    _check_starts(table, out)
+    assert bool(out.warnings) == is_doubted
 
 
 def test_a_column_that_is_there_twice_is_named(town, tmp_path):

@@ -200,14 +200,46 @@ def test_parquet_and_other_delimiters_give_the_same_table(town, tmp_path):
         assert found.categories == expected.categories
 
 
+def test_two_files_are_one_table_also_where_ids_are_texts_in_one(town, tmp_path):
+    half = len(town[0]["track"]) // 2
+    first, second = (
+        {n: v[part] for n, v in town[0].items()} for part in (slice(half), slice(half, None))
+    )
+    second["track"] = np.array([f"p{number}" for number in second["track"]])
+    paths = [write_tracks(tmp_path / name, c) for name, c in (("a.csv", first), ("b.csv", second))]
+    found = read_tracks(paths)
+    assert len(found.xy) == len(town[0]["track"])
+    ids = {*map(str, first["track"]), *second["track"]}
+    assert {str(name) for name in found.track_ids} == ids
+
+
+def test_recordings_that_share_ids_are_refused_and_one_is_not(town, tmp_path):
+    case, path = np.zeros(len(town[0]["track"]), int), tmp_path / "t.csv"
+    assert len(read_tracks(write_tracks(path, town[0], case_id=case)).xy) == len(case)
+    case[5] = 1
+    with pytest.raises(ConversionError, match="'case_id' tells 2 recordings apart"):
+        read_tracks(write_tracks(path, town[0], case_id=case))
+
+
+def test_the_corner_with_the_least_numbers_is_half_a_size_from_the_middle(town, tmp_path):
+    c = town[0]
+    half = 0.5 * np.column_stack([c["length_m"], c["width_m"]])
+    path = write_tracks(
+        tmp_path / "t.csv", c, x_m=c["x_m"] - half[:, 0], y_m=-c["y_m"] - half[:, 1]
+    )
+    columns = {"reference": "corner", "columns": {"y": "-y_m"}}
+    expected = np.column_stack([c["x_m"], c["y_m"]])[np.lexsort((c["time_s"], c["track"]))]
+    np.testing.assert_allclose(read_tracks(path, overrides=columns).xy, expected, rtol=0, atol=1e-6)
+
+
 def test_files_of_levelxdata_need_nothing_said(town, tmp_path):
     c = town[0]
     table = {
         "trackId": c["track"],
         "frame": c["frame"],
         "trackLifetime": c["frame"],
-        "xCenter": c["x_m"],
-        "yCenter": c["y_m"],
+        "xCenter": c["x_m"] + 7e5,  # the origin of their frame brings them back
+        "yCenter": c["y_m"] - 3e5,
         "heading": np.rad2deg(c["heading_rad"]) % 360.0,
         "width": c["width_m"],
         "length": c["length_m"],
@@ -218,7 +250,8 @@ def test_files_of_levelxdata_need_nothing_said(town, tmp_path):
     tracks, first = np.unique(c["track"], return_index=True)
     kinds = {"trackId": tracks, "class": c["kind"][first]}
     pc.write_csv(pa.table(kinds), tmp_path / "07_tracksMeta.csv")
-    pc.write_csv(pa.table({"frameRate": [12.5]}), tmp_path / "07_recordingMeta.csv")
+    meta = {"frameRate": [12.5], "xUtmOrigin": [-7e5], "yUtmOrigin": [3e5]}
+    pc.write_csv(pa.table(meta), tmp_path / "07_recordingMeta.csv")
     inspection = TracksReader(tmp_path / "07_tracks.csv", town[1])
     assert inspection.diagnostics.errors == []
     assert inspection.table.hz == 12.5

@@ -1,0 +1,41 @@
+"""Headings and velocities that follow from how objects move."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from shiftsim.data.readers.motion import contradiction, headings_of_motion, track_medians
+
+
+def test_a_standing_object_keeps_its_heading_or_gets_the_next():
+    velocities = [(0, 0), (1, 1), (0, 0), (0, 0), (0, 0), (0, -2), (0, 0), (0.2, 0.2), (0, 0)]
+    track, warnings = np.array([0, 0, 0, 1, 1, 2, 2, 3, 3]), Counter()
+    found = headings_of_motion(np.array(velocities, np.float64), track, warnings)
+    expected = np.pi * np.array([0.25, 0.25, 0.25, 0.0, 0.0, -0.5, -0.5, 0.0, 0.0])
+    np.testing.assert_allclose(found, expected)
+    assert warnings == {"tracks without heading that never move (heading 0)": 2}
+
+
+@pytest.mark.parametrize(
+    ("speed", "stored", "is_wrong"),
+    [(10.0, 10.99, False), (10.0, 11.01, True), (2.0, 2.29, False), (2.0, 1.69, True)],
+)
+def test_velocities_contradict_from_a_tenth_of_the_speed_and_three_decimetres_on(
+    speed, stored, is_wrong
+):
+    """The first and the last second, which are far off, are left out of a track of 4 s."""
+    time, track = np.arange(41) * 0.1, np.zeros(41, np.int64)
+    derived, given = np.full((2, 41, 2), [speed, 0.0])
+    given[:, 0] = np.where((time > 0.95) & (time < 3.05), stored, 99.0)
+    wrong, share = contradiction(given, derived, time, track)
+    assert wrong.tolist() == [is_wrong]
+    assert share.tolist() == pytest.approx([abs(stored - speed) / speed])
+
+
+def test_medians_are_those_of_each_track():
+    values, track = np.array([3.0, 1.0, 2.0, 7.0, 5.0]), np.array([0, 0, 0, 2, 2])
+    assert track_medians(values, track, 4).tolist()[::2] == [2.0, 6.0]
+    assert np.isnan(track_medians(values, track, 4)[1::2]).all()
+    both = track_medians(np.column_stack([values, -values]), track)
+    np.testing.assert_array_equal(both[[0, 2]], [[2.0, -2.0], [6.0, -6.0]])
