@@ -83,6 +83,11 @@ class Line:
         return f"<Line: {self.arc[-1]:.0f} m along {len(self.lanes)} lanes and connectors>"
 
     @property
+    def curvature(self) -> FloatArray:
+        """(K,) curvature, positive to the left [1/m]."""
+        return np.gradient(np.unwrap(self.poses[:, 2]), self.arc)
+
+    @property
     def _ahead(self) -> FloatArray:
         return np.stack([np.cos(self.poses[:, 2]), np.sin(self.poses[:, 2])], axis=1)
 
