@@ -11,6 +11,8 @@ from typing import Any
 
 import shiftsim.edits  # noqa: F401  # attaches Scenario.edited
 from shiftsim.data import open_store as open_store
+from shiftsim.errors import ConfigError
+from shiftsim.files import DEFAULT_STORE
 from shiftsim.planners import registry
 from shiftsim.runs import results
 from shiftsim.sim import loop
@@ -199,6 +201,39 @@ def run(
     plan = prepare(make_config(values), planners=planners, noises=models)
     finished = execute(plan, **{"on_progress": on_progress} if on_progress else {})
     return Run(finished.path, finished.manifest)
+
+
+def score_files(
+    source: str | Path,
+    *,
+    store: str = DEFAULT_STORE,
+    tracks: str = "",
+    partial: bool = False,
+    **settings: Any,
+) -> Run:
+    """Score what was driven elsewhere, as `shiftsim score FILE` does: tables of poses, or logs.
+
+    Args:
+        source: Parquet or CSV, a folder of those, or simulation logs of nuPlan.
+        store: The store with the scenarios.
+        tracks: The others: a table of boxes, or "recorded"; logs have their own.
+        partial: Whether rollouts may end before their scenarios.
+        settings: `point`, `traffic`, `controller`, `thresholds`, `metrics`, `out`, …
+
+    Raises:
+        DataError: Something cannot be right; the message names row and number.
+    """
+    from shiftsim.runs.derive import score_elsewhere
+    from shiftsim.runs.rollouts.elsewhere import RECORDED, read_source
+    from shiftsim.verify.simulation_log import log_source
+
+    logs = log_source(Path(source))
+    if logs and tracks:
+        raise ConfigError("simulation logs say where the others were", hint="leave tracks out")
+    found = logs or read_source(Path(source), tracks)
+    settings |= {"recorded": tracks == RECORDED, "partial_rollouts": partial}
+    made = score_elsewhere(found, store=store, **settings)
+    return Run(made.path, made.manifest)
 
 
 def open_run(path: str | Path) -> Run:
