@@ -145,6 +145,39 @@ def merge(runs: Iterable[Any], *, out: str | None = None, allow_partial: bool = 
     return Run(merged.path, merged.manifest)
 
 
+def score_files(
+    source: str | Path,
+    *,
+    store: str = DEFAULT_STORE,
+    tracks: str = "",
+    partial: bool = False,
+    **settings: Any,
+) -> Run:
+    """Score what was driven elsewhere, as `shiftsim score FILE` does: tables of poses, or logs.
+
+    Args:
+        source: Parquet or CSV, a folder of those, or simulation logs of nuPlan.
+        store: The store with the scenarios.
+        tracks: The others: a table of boxes, or "recorded"; logs have their own.
+        partial: Whether rollouts may end before their scenarios.
+        settings: `point`, `traffic`, `controller`, `thresholds`, `metrics`, `out`, …
+
+    Raises:
+        DataError: Something cannot be right; the message names row and number.
+    """
+    from shiftsim.runs.derive import score_elsewhere
+    from shiftsim.runs.rollouts.elsewhere import RECORDED, read_source
+    from shiftsim.verify.simulation_log import log_source
+
+    logs = log_source(Path(source))
+    if logs and tracks:
+        raise ConfigError("simulation logs say where the others were", hint="leave tracks out")
+    found = logs or read_source(Path(source), tracks)
+    settings |= {"recorded": tracks == RECORDED, "partial_rollouts": partial}
+    made = score_elsewhere(found, store=store, **settings)
+    return Run(made.path, made.manifest)
+
+
 def open_run(path: str | Path) -> Run:
     """A run folder.
 

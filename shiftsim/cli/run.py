@@ -316,59 +316,33 @@ def score(
     source: Path = Argument(metavar="RUN|FILE", help="A run; poses; nuPlan's simulation logs."),
     tracks: str = Option("", help="The others: a table of boxes, or recorded. Of files."),
     point: str = Option("", help="rear_axle or center, whose poses files hold. [rear_axle]"),
-    partial_rollouts: bool = Option(
-        False, "--partial", help="Also rollouts that end before their scenario; labelled so."
-    ),
+    partial: bool = Option(False, "--partial", help="Also rollouts that end early; labelled so."),
     settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Score rollouts: stored ones again, or what was driven elsewhere.
+    """Score stored rollouts again, under other thresholds, or what was driven elsewhere.
 
-    A run folder is scored under another threshold profile, without simulating. A table of poses
-    (Parquet, CSV) or a simulation log of nuPlan becomes a run folder: docs/score_elsewhere.md.
+    Tables of poses and nuPlan's simulation logs become a run folder: docs/score_elsewhere.md.
     """
-    allow_partial = settings.pop("allow_partial", False)
-    given = {"tracks": tracks, "point": point, "partial": partial_rollouts}
-    is_run = source.is_dir() and (source / "manifest.json").is_file()
-    is_run = is_run or not (source.exists() or source.suffix)
-    make = _scored_again if is_run else _scored_elsewhere
-    with stdout_to_stderr(), progress_bar(quiet=quiet or as_json) as advance:
-
-        def show(progress: "Progress") -> None:
-            advance(progress.done, progress.total)
-
-        finished = make(source, given, settings, on_progress=show, argv=sys.argv)
-    leave_with(finished, allow_partial=allow_partial, as_json=as_json)
-
-
-def _scored_again(source: Path, given: cli.Settings, settings: cli.Settings, **how: Any) -> "Run":
+    from shiftsim.api import score_files
     from shiftsim.runs.derive import rescore
 
-    run = shiftsim.open_run(source)
-    named = [*filter(given.get, given), *sorted({"traffic", "controller"} & settings.keys())]
-    if named:
-        raise ConfigError(
-            f"--{named[0]} is for what was driven elsewhere; {str(source)!r} is a run",
-            hint="leave it out",
-        )
-    return rescore(run, **{"thresholds": run.manifest["config"]["thresholds"], **settings}, **how)
-
-
-def _scored_elsewhere(
-    source: Path, given: cli.Settings, settings: cli.Settings, **how: Any
-) -> "Run":
-    from shiftsim.runs.derive import score_elsewhere
-    from shiftsim.runs.rollouts.elsewhere import RECORDED, read_source
-    from shiftsim.verify.simulation_log import log_source
-
-    tracks, logs = given["tracks"], log_source(source)
-    if logs and tracks:
-        raise ConfigError("simulation logs say where the others were", hint="leave --tracks out")
-    found = logs or read_source(source, tracks)
-    settings = {"store": DEFAULT_STORE, **settings}
-    options = {"point": given["point"], "partial_rollouts": given["partial"]}
-    return score_elsewhere(found, recorded=tracks == RECORDED, **options, **settings, **how)
+    allow_partial = settings.pop("allow_partial", False)
+    given: cli.Settings = {"tracks": tracks, "point": point, "partial": partial}
+    is_run = (source / "manifest.json").is_file() or not (source.exists() or source.suffix)
+    run = shiftsim.open_run(source) if is_run else None
+    if is_run and (any(given.values()) or {"traffic", "controller"} & {*settings}):
+        hint = "leave out --tracks, --point, --partial, --traffic and --controller"
+        raise ConfigError(f"{str(source)!r} is a run, and not driven elsewhere", hint)
+    with stdout_to_stderr(), progress_bar(quiet=quiet or as_json) as advance:
+        settings |= {"on_progress": lambda now: advance(now.done, now.total), "argv": sys.argv}
+        if run is None:
+            finished: Run = score_files(source, **given, **settings)
+        else:
+            settings = {"thresholds": run.manifest["config"]["thresholds"], **settings}
+            finished = rescore(run, **settings)
+    leave_with(finished, allow_partial=allow_partial, as_json=as_json)
 
 
 def merge(

@@ -529,7 +529,7 @@ def test_the_command_scores_a_table(toy, tmp_path, call):
     assert "driven elsewhere: mine.parquet" in out
     code, _, err = call("score", tmp_path / "run", "--tracks", "recorded")
     assert code == 1
-    assert "--tracks is for what was driven elsewhere" in err
+    assert "is a run, and not driven elsewhere" in err
     code, _, err = call("score", tmp_path / "nothing.csv")
     assert code == 2
     assert "nothing.csv' is no readable table" in err
