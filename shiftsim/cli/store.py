@@ -237,10 +237,11 @@ def export_results(
     with progress_bar(quiet=quiet or as_json) as advance:
         values = {"simulation_logs": not tables_only, "progress": advance, **settings, **places}
         report = run.export_results(out, **values)
-    print_result(asdict(report), _result_lines(report, run), as_json=as_json)
+    place = settings.get("store") or run.manifest["config"]["store"]
+    print_result(asdict(report), _result_lines(report, run, place), as_json=as_json)
 
 
-def _result_lines(report: "ResultsExport", run: "Run") -> "Iterator[str]":
+def _result_lines(report: "ResultsExport", run: "Run", store: str) -> "Iterator[str]":
     failed = f", {plural(report.failed, 'task')} without" if report.failed else ""
     yield f" {plural(report.rollouts, 'scored rollout')}{failed}"
     yield from (f" experiment: {folder}" for folder in report.folders)
@@ -250,7 +251,8 @@ def _result_lines(report: "ResultsExport", run: "Run") -> "Iterator[str]":
     for what, known in ("traffic", "nonreactive reactive"), ("controller", "lqr"):
         if facts[what] not in known.split():
             yield f" {what} {facts[what]}, which nuPlan does not have"
-    yield f" read back: shiftsim verify --experiment {report.folders[0].parent.parent}"
+    out = report.folders[0].parent.parent
+    yield f" read back: shiftsim verify --experiment {out} --store {store}"
 
 
 @cli.with_settings("split", "all_scenarios")
