@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from worlds import cruise_scenario
 
 import shiftsim
 from shiftsim.errors import DataError, PlannerError
@@ -108,6 +109,13 @@ def test_the_recorded_future_has_the_full_score(scenario):
     # the last plan that is compared is made 8 s before the end of the recording
     behind = (scenario.time_us[-1] - recording(scenario).time_us[: len(made)]) * 1e-6
     assert (counted.value, counted.threshold) == (np.count_nonzero(behind >= 8.0), len(made))
+
+
+def test_the_recording_reaches_eight_seconds_behind_the_last_plan():
+    """It is made at 14 s; 15 s are both the last iteration and the second after (rule 732)."""
+    scenario = cruise_scenario()
+    seconds = 1e-6 * (recording(scenario).time_us - scenario.iteration_times[0])
+    assert seconds.tolist() == pytest.approx([*range(16), *range(15, 23)])
 
 
 def test_commands_are_no_plans(scenario):

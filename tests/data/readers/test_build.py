@@ -50,3 +50,14 @@ def test_rows_at_one_time_are_refused():
     late["time_us"][4:] += 86_399_800_000
     with pytest.raises(ConversionError, match=r"no object has a row between 0.3 s and 86400.2 s"):
         make_samples("r", **late)
+
+
+def test_a_track_goes_on_as_another_run_after_a_long_hole():
+    given = columns([0, 1], rows=20)
+    given["time_us"][30:] += 500_000  # of the second object, from its row 10 on
+    whole = make_samples("r", **given).runs
+    assert (whole.first.tolist(), whole.last.tolist()) == ([0, 20], [19, 39])
+    given["time_us"][30:] += 2
+    split = make_samples("r", **given).runs
+    assert (split.first.tolist(), split.last.tolist()) == ([0, 20, 30], [19, 29, 39])
+    assert (split.track.tolist(), list(split.tokens)) == ([0, 1, 1], ["0", "1", "1_2"])

@@ -59,6 +59,13 @@ def test_reads_a_recording_sorted_by_track_and_frame(tmp_path):
     assert recording.start_us == writer.START_US
 
 
+def test_the_middle_of_a_tilted_box_is_half_its_height_above_its_place(tmp_path):
+    track = writer.car(1, writer.frame_times(5.0))
+    track["rotation"][:, 1] = 0.1  # about the axis to the left: it leans ahead
+    recording = read_recording(open_site(_site(tmp_path, [track])), "r")
+    np.testing.assert_allclose(recording.xy[0], [20.0 + 0.75 * np.sin(0.1), -1.75], atol=1e-9)
+
+
 def test_missing_velocities_are_derived_and_counted(tmp_path):
     folder = _site(tmp_path)
     writer.write_annotations(

@@ -5,7 +5,12 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from shiftsim.data.readers.motion import contradiction, headings_of_motion, track_medians
+from shiftsim.data.readers.motion import (
+    contradiction,
+    fitted_velocities,
+    headings_of_motion,
+    track_medians,
+)
 
 
 def test_a_standing_object_keeps_its_heading_or_gets_the_next():
@@ -15,6 +20,16 @@ def test_a_standing_object_keeps_its_heading_or_gets_the_next():
     expected = np.pi * np.array([0.25, 0.25, 0.25, 0.0, 0.0, -0.5, -0.5, 0.0, 0.0])
     np.testing.assert_allclose(found, expected)
     assert warnings == {"tracks without heading that never move (heading 0)": 2}
+
+
+def test_velocities_are_exact_for_parabolas_and_for_two_rows():
+    time = np.array([0.0, 0.1, 0.2, 0.35, 0.4, 0.5, 0.6, 0.0, 0.1, 0.3])
+    track = np.array([0] * 7 + [1] * 2 + [2])
+    xy = np.column_stack([3.0 + 2.0 * time - 1.5 * time**2, 0.5 * time**2])
+    found = fitted_velocities(xy, time, track, 0.1)
+    expected = np.column_stack([2.0 - 3.0 * time, time])
+    expected[7:] = [1.85, 0.05], [1.85, 0.05], [0.0, 0.0]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(

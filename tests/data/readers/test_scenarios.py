@@ -197,6 +197,16 @@ def test_a_recording_becomes_scenarios_of_the_benchmark_s_form(tmp_path):
     assert scene.mission_goal[0] == pytest.approx(500_020 + 240 - 1.461, abs=1e-6)
 
 
+@pytest.mark.parametrize(("y", "rows"), [(203.4, 0), (203.6, 227), (-203.4, 0), (-203.6, 227)])
+def test_rows_more_than_two_hundred_metres_outside_of_the_map_are_counted(tmp_path, y, rows):
+    """The road reaches 3.5 m to either side."""
+    times = writer.frame_times(18.08)
+    tracks = [writer.car(1, times), writer.car(2, times, y=y, speed=0.9)]
+    folder = writer.write_site(tmp_path / "s", tracks, 18.08)
+    (summary,) = convert_dsc3d(folder, tmp_path / "store").recordings
+    assert summary.warnings.get("rows far outside the map", 0) == rows
+
+
 def test_a_car_far_from_any_lane_is_rejected_by_name(tmp_path):
     times = writer.frame_times(18.08)
     tracks = [writer.car(1, times), writer.car(2, times, y=-12.0, speed=0.9)]

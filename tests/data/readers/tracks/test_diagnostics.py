@@ -241,6 +241,11 @@ def test_a_right_table_raises_no_doubt(town, tmp_path):
     columns, road = town
     found = _diagnose(write_tracks(tmp_path / "t.csv", columns), road)
     assert (found.errors, found.warnings) == ([], [])
+    figures = {"fastest_vehicle_mps": 8.2, "walking_mps": 1.35, "acceleration_mps2": 0.43}
+    figures |= {"median_length_m": 4.5, "median_width_m": 1.85, "reference_share": 0.0}
+    figures |= dict.fromkeys(("drivable_share", "along_share"), 1.0)
+    nothing = ("jumps", "heading_error_rad", "backwards_share", "contradicting_share")
+    assert found.figures == pytest.approx(figures | dict.fromkeys(nothing, 0.0), abs=0.01)
 
 
 @pytest.mark.parametrize("name", SPOILT)
