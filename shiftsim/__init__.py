@@ -38,6 +38,7 @@ _PUBLIC = {
     "policy_planner": "shiftsim.env.policy:policy_planner",
     "run": "shiftsim.api:run",
     "score": "shiftsim.metrics:compute_metrics",
+    "score_files": "shiftsim.api:score_files",
     "score_rollout": "shiftsim.runs.rollouts.elsewhere:score_rollout",
     "show": "shiftsim.view.page:show",
     "simulate": "shiftsim.api:simulate",

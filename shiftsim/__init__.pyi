@@ -9,6 +9,7 @@ from shiftsim.api import merge as merge
 from shiftsim.api import open_run as open_run
 from shiftsim.api import open_store as open_store
 from shiftsim.api import run as run
+from shiftsim.api import score_files as score_files
 from shiftsim.api import simulate as simulate
 from shiftsim.api.finished import Run as Run
 from shiftsim.api.stores import convert_dataset as convert_dataset
@@ -62,6 +63,7 @@ __all__ = [
     "policy_planner",
     "run",
     "score",
+    "score_files",
     "score_rollout",
     "show",
     "simulate",
