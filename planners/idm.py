@@ -36,12 +36,13 @@ from shiftsim.planners.routes.graph import (
 from shiftsim.planners.routes.lead import (
     OVERLAPPING,
     UNKNOWN,
+    LightWatch,
     Objects,
+    RedLights,
     find_lead,
     keep_one_overlap,
     make_objects,
 )
-from shiftsim.planners.routes.lights import LightWatch, RedLights
 from shiftsim.sim.dynamics.idm import idm_acceleration
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.map import NONE, VectorMap

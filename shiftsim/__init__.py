@@ -86,6 +86,7 @@ _DEPRECATED = {
     "shiftsim.data.opendrive.reading": "shiftsim.data.maps.opendrive.reading",
     "shiftsim.data.tracks": "shiftsim.data.readers.tracks",
     "shiftsim.data.tracks.build": "shiftsim.data.readers.build",
+    "shiftsim.sim.traffic.constant_velocity": "shiftsim.sim.traffic.mixed",
     "shiftsim.data.tracks.scenarios": "shiftsim.data.readers.scenarios",
 }
 

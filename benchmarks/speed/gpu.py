@@ -19,7 +19,7 @@ import numpy as np
 from shiftsim.data.store.reading import open_store
 from shiftsim.metrics import compute_metrics
 from shiftsim.planners.learned.base import LearnedPlanner
-from shiftsim.planners.learned.device import resolve_device
+from shiftsim.planners.learned.checkpoint import resolve_device
 from shiftsim.planners.learned.owner import Address, InferenceClient, InferenceServer, new_address
 from shiftsim.planners.registry import load_planner, planner_factory
 from shiftsim.processes import in_background

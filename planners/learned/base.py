@@ -13,9 +13,10 @@ from typing import Any, Generic, Self, TypeAlias, TypeVar, cast
 from shiftsim.planners.learned.checkpoint import (
     checkpoint_fingerprint,
     load_network,
+    require_torch,
+    resolve_device,
     weights_note,
 )
-from shiftsim.planners.learned.device import require_torch, resolve_device
 from shiftsim.sim.planner import BatchPlanner, Observation, SceneInfo
 from shiftsim.world.state import Command, Trajectory
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from shiftsim.errors import CheckpointError
 from shiftsim.planners.learned import checkpoint
-from shiftsim.planners.learned.device import require_torch
+from shiftsim.planners.learned.checkpoint import require_torch
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,9 +12,8 @@ import shapely
 from shiftsim.geometry.boxes import turned
 from shiftsim.geometry.polylines import point_on_polyline
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.planners.per_map import PerMap
 from shiftsim.world.layers import Polylines, meeting, square_around
-from shiftsim.world.map import NONE, VectorMap
+from shiftsim.world.map import NONE, PerMap, VectorMap
 from shiftsim.world.state import LightStatus, TrafficLights
 
 POINTS = 20  # per polyline; their vectors lead to the next one

@@ -13,7 +13,7 @@ from shiftsim.planners.proposals.areas import index_ranks
 from shiftsim.planners.proposals.contacts import Obstacles, touches_boxes
 from shiftsim.planners.proposals.places import EgoBox, ego_corners
 from shiftsim.planners.proposals.tracker import STEPS
-from shiftsim.planners.routes.lights import RedLights
+from shiftsim.planners.routes.lead import RedLights
 from shiftsim.world.state import HEADING, LAST_AGENT_KIND, Tracks, X, Y
 
 LIGHT_TOKEN = "red_light_"

@@ -11,9 +11,8 @@ import shapely
 
 from shiftsim.geometry.polylines import RUN
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
-from shiftsim.planners.per_map import PerMap
 from shiftsim.world.layers import Polygons, join_polygons, meeting, square_around
-from shiftsim.world.map import VectorMap
+from shiftsim.world.map import PerMap, VectorMap
 
 NODE_CAPACITY = 10  # of nuPlan's spatial indices
 

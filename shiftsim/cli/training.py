@@ -9,7 +9,7 @@ from typer import Argument, Option, echo
 
 from shiftsim import cli
 from shiftsim.cli import Json, Quiet, new_app, print_result
-from shiftsim.planners.learned.device import require_torch
+from shiftsim.planners.learned.checkpoint import require_torch
 from shiftsim.train.folder import BEST, Settings, TrafficSettings
 
 app = new_app("Train networks.")

@@ -25,7 +25,7 @@ from shiftsim.env.episode import Observer
 from shiftsim.env.terms import Terms, compute_reward_terms, make_state
 from shiftsim.errors import ConfigError, MissingExtraError, ShiftsimError, one_of, readable
 from shiftsim.files import expand, make_table, read_toml
-from shiftsim.planners.learned.device import prepare_inference, require_torch
+from shiftsim.planners.learned.checkpoint import prepare_inference, require_torch
 from shiftsim.sim.loop import Rollout
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.state import Command, Trajectory

@@ -13,8 +13,8 @@ from shiftsim.planners.learned.carl.planner import draw, measure
 from shiftsim.planners.learned.carl.raster import Raster
 from shiftsim.planners.learned.carl.roads import make_roads
 from shiftsim.planners.learned.map_features import LightLookup
-from shiftsim.planners.per_map import PerMap
 from shiftsim.sim.planner import Observation, SceneInfo
+from shiftsim.world.map import PerMap
 from shiftsim.world.state import LightStatus
 
 LARGEST = 1e4  # of a measurement, in its unit; none comes near

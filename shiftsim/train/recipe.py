@@ -13,7 +13,7 @@ from time import monotonic
 from typing import Any
 
 from shiftsim.data import open_store
-from shiftsim.planners.learned.device import resolve_device
+from shiftsim.planners.learned.checkpoint import resolve_device
 from shiftsim.runs.filter import read_filter_results
 from shiftsim.runs.scenarios import find_split
 from shiftsim.train import folder

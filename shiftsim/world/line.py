@@ -280,10 +280,10 @@ def _make_line(
     """The line along lanes, and on from there; `progress` [m] on the first lane is the ego's."""
     lanes, beyond = list(chain), 0.0
     while beyond < BEYOND:
-        after = [lane for lane in road.outgoing.at(lanes[-1]).tolist() if lane not in lanes]
-        if not after:
+        ahead = [lane for lane in road.outgoing.at(lanes[-1]).tolist() if lane not in lanes]
+        if not ahead:
             break
-        lanes.append(min(after, key=lambda lane: _turn(road, lanes[-1], lane)))
+        lanes.append(min(ahead, key=lambda lane: _turn(road, lanes[-1], lane)))
         beyond += road.baselines.length(lanes[-1])
     pieces = [road.baselines.at(lane) for lane in lanes]
     xy = np.concatenate(pieces)

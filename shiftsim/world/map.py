@@ -5,8 +5,9 @@ order of the source tables), so that one integer names a piece of road everywher
 for roadblocks and roadblock connectors (*blocks*). Ids are strings at the boundary only.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields
+from typing import Generic, TypeVar
 
 import numpy as np
 import shapely
@@ -189,3 +190,22 @@ class VectorMap:
     def progress_on(self, edge: int, x: float, y: float) -> float:
         """Arc length of the projection of a point on the baseline of an edge [m]."""
         return float(project_on_line(self.baselines, edge, x, y))
+
+
+MAPS_KEPT = 4  # per kind of arrays; a run rarely visits more maps at a time
+Arrays = TypeVar("Arrays")
+
+
+class PerMap(Generic[Arrays]):
+    """Arrays that depend on the map only: built once per map, kept for the latest few maps."""
+
+    def __init__(self, build: Callable[[VectorMap], Arrays]) -> None:
+        self._build = build
+        self._kept: list[tuple[VectorMap, Arrays]] = []
+
+    def __call__(self, road: VectorMap) -> Arrays:
+        """The arrays of a map; maps are told apart by identity."""
+        found = [item for item in self._kept if item[0] is road] or [(road, self._build(road))]
+        others = [item for item in self._kept if item[0] is not road]
+        self._kept = [*found, *others][:MAPS_KEPT]
+        return found[0][1]

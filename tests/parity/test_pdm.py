@@ -40,16 +40,15 @@ from shiftsim.planners.pdm import forecast, rollout
 from shiftsim.planners.pdm import route as routes
 from shiftsim.planners.pdm import step as steps_module
 from shiftsim.planners.pdm.parameters import DEFAULT
-from shiftsim.planners.pdm.planner import PdmClosed, Seen
+from shiftsim.planners.pdm.planner import PdmClosed, Seen, Step, choose
 from shiftsim.planners.pdm.scorer import TTC_STEPS, Place, Scores, score, weighted_mean
-from shiftsim.planners.pdm.step import Step, choose
 from shiftsim.planners.proposals.areas import areas_of, select_areas
 from shiftsim.planners.proposals.comfort import SIGNALS, comfort
 from shiftsim.planners.proposals.contacts import Obstacles
 from shiftsim.planners.proposals.places import ego_box
 from shiftsim.planners.proposals.tracker import SCORED, STEP_US, STEPS, drive_proposals
 from shiftsim.planners.routes.graph import centerline, search_cheapest, search_levels
-from shiftsim.planners.routes.lights import red_lights
+from shiftsim.planners.routes.lead import red_lights
 from shiftsim.sim.planner import observe_log, scene_info
 from shiftsim.verify.rollouts import BOX_COLUMNS, RecordedRun, object_columns
 from shiftsim.verify.worlds import kind_of

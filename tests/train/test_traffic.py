@@ -12,8 +12,8 @@ from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import ConfigError
-from shiftsim.sim.traffic.constant_velocity import ConstantVelocity
 from shiftsim.sim.traffic.learned.model import LearnedTraffic, load_weights
+from shiftsim.sim.traffic.mixed import ConstantVelocity
 from shiftsim.train.folder import TrafficSettings
 from shiftsim.train.traffic.realism import compare
 from shiftsim.train.traffic.recipe import train_traffic

@@ -17,14 +17,12 @@ from shiftsim.planners.learned.base import LearnedPlanner
 from shiftsim.planners.learned.carl import view
 from shiftsim.planners.learned.carl.raster import Raster
 from shiftsim.planners.learned.carl.roads import MAX_SPEED, Roads, level, make_roads
-from shiftsim.planners.learned.checkpoint import load_network, split_ensemble
-from shiftsim.planners.learned.device import resolve_device
+from shiftsim.planners.learned.checkpoint import load_network, resolve_device, split_ensemble
 from shiftsim.planners.learned.map_features import LightLookup
-from shiftsim.planners.per_map import PerMap
 from shiftsim.planners.routes.correction import correct_route, find_start
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world import state
-from shiftsim.world.map import VectorMap
+from shiftsim.world.map import PerMap, VectorMap
 
 MAX_STEERING = 0.83775804096  # rad, 48 degrees: the target of a full steering action
 MAX_ACCELERATION, MAX_BRAKING = 2.4, 3.2  # m/s^2

@@ -24,9 +24,9 @@ from shiftsim.planners.learned.features import (
     short_history,
     stack_scenes,
 )
-from shiftsim.planners.per_map import PerMap
 from shiftsim.sim.noise import keyed_generator
 from shiftsim.sim.planner import Observation, SceneInfo
+from shiftsim.world.map import PerMap
 from shiftsim.world.state import Trajectory
 
 NOISE_SHAPE = (11, 80, 4)  # ego and neighbours, steps, x, y, cos, sin

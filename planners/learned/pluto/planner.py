@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.geometry.boxes import boxes_to_corners, turned
 from shiftsim.kernels import FloatArray
 from shiftsim.planners.learned.base import LearnedPlanner
 from shiftsim.planners.learned.features import (
@@ -22,7 +22,6 @@ from shiftsim.planners.learned.features import (
     plan_of_poses,
     short_history,
     stack_scenes,
-    turned,
 )
 from shiftsim.planners.learned.map_features import LightLookup, RoadFeatures, road_features
 from shiftsim.planners.learned.pluto import reference, world
@@ -34,10 +33,10 @@ from shiftsim.planners.learned.pluto.scoring import (
     nearest_line,
     score,
 )
-from shiftsim.planners.per_map import PerMap
 from shiftsim.planners.proposals.tracker import STEP_US, STEPS
 from shiftsim.planners.routes.correction import RouteCorrector
 from shiftsim.sim.planner import Observation, SceneInfo
+from shiftsim.world.map import PerMap
 from shiftsim.world.state import AX, STEERING, VX, VY, YAW_RATE, Trajectory
 
 RADIUS = 120.0  # m, of agents and map

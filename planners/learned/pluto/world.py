@@ -9,7 +9,7 @@ from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.planners.learned.pluto.reference import Drivable, RouteLanes
 from shiftsim.planners.proposals.contacts import Obstacles, touches_boxes
 from shiftsim.planners.proposals.tracker import SCORED
-from shiftsim.planners.routes.lights import red_lanes
+from shiftsim.planners.routes.lead import red_lanes
 from shiftsim.sim.planner import Observation
 from shiftsim.world.layers import meeting
 from shiftsim.world.map import VectorMap

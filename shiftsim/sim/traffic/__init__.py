@@ -19,7 +19,7 @@ from shiftsim.world.state import Tracks
 _MODELS = {
     "nonreactive": "shiftsim.sim.traffic:LogReplay",
     "reactive": "shiftsim.sim.traffic.idm.model:IdmTraffic",
-    "constant-velocity": "shiftsim.sim.traffic.constant_velocity:ConstantVelocity",
+    "constant-velocity": "shiftsim.sim.traffic.mixed:ConstantVelocity",
     "learned": "shiftsim.sim.traffic.learned.model:LearnedTraffic",
 }
 PLANNER = "planner:"  # begins the name of traffic whose vehicles a planner drives

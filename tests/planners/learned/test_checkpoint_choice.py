@@ -17,9 +17,9 @@ from shiftsim.planners.learned.checkpoint import (
     checkpoint_fingerprint,
     find_checkpoint,
     load_weights,
+    resolve_device,
     split_ensemble,
 )
-from shiftsim.planners.learned.device import resolve_device
 from shiftsim.planners.registry import PLANNERS, load_planner, planner_fingerprint, readiness
 
 pytestmark = [pytest.mark.learned, pytest.mark.usefixtures("checkpoints")]

@@ -29,11 +29,10 @@ from shiftsim.planners.learned.map_features import (
     road_features,
     road_objects,
 )
-from shiftsim.planners.per_map import PerMap
 from shiftsim.sim.planner import History
 from shiftsim.world.build import AreaSpec, build_map
 from shiftsim.world.layers import make_polylines
-from shiftsim.world.map import VectorMap
+from shiftsim.world.map import PerMap, VectorMap
 from shiftsim.world.state import AX, AY, VX, VY, LightStatus, Tracks, TrafficLights
 
 ORIGIN = np.zeros(3)

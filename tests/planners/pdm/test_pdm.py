@@ -24,7 +24,7 @@ from shiftsim.planners.pdm.forecast import make_forecast, ring_of, select_tracks
 from shiftsim.planners.pdm.parameters import DEFAULT, PdmParameters
 from shiftsim.planners.pdm.planner import PdmClosed
 from shiftsim.planners.registry import load_planner
-from shiftsim.planners.routes.lights import red_lights
+from shiftsim.planners.routes.lead import red_lights
 from shiftsim.sim.planner import observe_log, scene_info
 from shiftsim.world.state import AgentKind, LightStatus, TrafficLights
 

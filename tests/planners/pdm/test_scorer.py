@@ -11,7 +11,7 @@ from shiftsim.planners.pdm.scorer import Place, Scores, _follow_route, normalise
 from shiftsim.planners.proposals.areas import areas_of
 from shiftsim.planners.proposals.places import OFF_ROUTE, ego_box, find_places
 from shiftsim.planners.proposals.tracker import SCORED
-from shiftsim.planners.routes.lights import red_lights
+from shiftsim.planners.routes.lead import red_lights
 from shiftsim.world.layers import make_polygons
 from shiftsim.world.state import NUM_STATE, PACIFICA, VX, AgentKind, X
 

@@ -1,7 +1,7 @@
 import numpy as np
 from worlds import straight_road
 
-from shiftsim.planners.routes.lights import LightWatch
+from shiftsim.planners.routes.lead import LightWatch
 from shiftsim.world.state import LightStatus, TrafficLights
 
 

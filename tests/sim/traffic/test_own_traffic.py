@@ -10,9 +10,8 @@ from worlds import cruise_scenario, standing_tracks
 
 from shiftsim.errors import ConfigError
 from shiftsim.sim.traffic import LogReplay, Traffic, make_traffic
-from shiftsim.sim.traffic.constant_velocity import ConstantVelocity
 from shiftsim.sim.traffic.idm.model import IdmTraffic
-from shiftsim.sim.traffic.mixed import Mixed
+from shiftsim.sim.traffic.mixed import ConstantVelocity, Mixed
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AgentKind, Tracks
 

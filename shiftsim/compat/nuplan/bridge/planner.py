@@ -13,8 +13,8 @@ from nuplan.planning.simulation.planner.abstract_planner import PlannerInitializ
 from shiftsim.compat.nuplan.bridge.map import BridgeMap
 from shiftsim.compat.nuplan.bridge.world import HistoryKeeper, to_trajectory
 from shiftsim.errors import ConfigError, PlannerError
-from shiftsim.planners.per_map import PerMap
 from shiftsim.sim.planner import Observation, SceneInfo
+from shiftsim.world.map import PerMap
 from shiftsim.world.state import Trajectory
 
 _maps = PerMap(BridgeMap)
