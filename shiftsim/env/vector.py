@@ -93,7 +93,8 @@ class VectorBuilder:
 
     def __init__(self, scene: SceneInfo) -> None:
         """Find the route's lanes; the line along them begins at the first observation."""
-        self._scene, self._route = scene, None
+        self._scene = scene
+        self._route: Route | None = None
         on_route = np.zeros(len(scene.map.blocks) + 1, np.bool_)  # the last: edges without block
         on_route[scene.route_blocks] = True
         self._on_route: BoolArray = on_route[scene.map.block_of]
@@ -103,9 +104,11 @@ class VectorBuilder:
         """The parts of `Seen`, one after the other; `action` (2,) is the last one."""
         road, ego, tracks = self._scene.map, observation.history.ego[-1], observation.history.tracks
         route = self._route = self._route or self._start(ego)
-        arrays = (tracks.valid, tracks.poses, tracks.velocities, tracks.sizes)
         around = Around(
-            *(np.array(array[-1]) for array in arrays),
+            np.array(tracks.valid[-1]),  # copies: the kernel sees one type of array
+            np.array(tracks.poses[-1]),
+            np.array(tracks.velocities[-1]),
+            np.array(tracks.sizes[-1]),
             np.array(tracks.kinds),
             road.baselines,
             road.edges.polygons.bounds,

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.geometry.boxes import boxes_to_corners, turned
 from shiftsim.kernels import FloatArray
 from shiftsim.planners.learned.base import LearnedPlanner
 from shiftsim.planners.learned.features import (
@@ -22,7 +22,6 @@ from shiftsim.planners.learned.features import (
     plan_of_poses,
     short_history,
     stack_scenes,
-    turned,
 )
 from shiftsim.planners.learned.map_features import LightLookup, RoadFeatures, road_features
 from shiftsim.planners.learned.pluto import reference, world
