@@ -105,7 +105,7 @@ class VectorBuilder:
         road, ego, tracks = self._scene.map, observation.history.ego[-1], observation.history.tracks
         route = self._route = self._route or self._start(ego)
         around = Around(
-            np.array(tracks.valid[-1]),
+            np.array(tracks.valid[-1]),  # copies: the kernel sees one type of array
             np.array(tracks.poses[-1]),
             np.array(tracks.velocities[-1]),
             np.array(tracks.sizes[-1]),

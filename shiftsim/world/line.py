@@ -278,41 +278,21 @@ def _make_line(
     road: VectorMap, chain: list[int], progress: float, vehicle: VehicleParameters
 ) -> Line:
     """The line along lanes, and on from there; `progress` [m] on the first lane is the ego's."""
-    lanes, beyond = list(chain), 0.0
-    while beyond < BEYOND:
-        ahead = [lane for lane in road.outgoing.at(lanes[-1]).tolist() if lane not in lanes]
-        if not ahead:
-            break
-        lanes.append(min(ahead, key=lambda lane: _turn(road, lanes[-1], lane)))
-        beyond += road.baselines.length(lanes[-1])
-    pieces = [road.baselines.at(lane) for lane in lanes]
-    xy = np.concatenate(pieces)
-    firsts = np.cumsum([0, *map(len, pieces)])
-    lengths = np.cumsum([0.0, *(road.baselines.length(lane) for lane in lanes)])
-    along = arc_lengths(xy, firsts) + np.repeat(lengths[:-1], np.diff(firsts))
-    moved = xy.copy()
-    for place, (lane, after) in enumerate(pairwise(lanes), 1):
-        first = firsts[place]
-        jump = xy[first] - xy[first - 1]
-        if after not in road.outgoing.at(lane) and np.hypot(*jump) < MAX_CHANGE:
-            begin = max(progress, lengths[place] - 0.5 * CHANGE)
-            share = np.clip((along - begin) / CHANGE, 0.0, 1.0)
-            weight = share * share * (3.0 - 2.0 * share)
-            weight[first:] -= 1.0
-            moved += weight[:, None] * jump
-    arc = arc_lengths(moved, np.array([0, len(moved)]))
+    lanes = _with_those_beyond(road, chain)
+    firsts = np.cumsum([0, *(len(road.baselines.at(lane)) for lane in lanes)])
+    xy = _joined(road, lanes, firsts, progress)
+    arc = arc_lengths(xy, np.array([0, len(xy)]))
     even = np.linspace(0.0, arc[-1], max(int(np.ceil(arc[-1] / SPACING)), 1) + 1)
-    points = np.stack([np.interp(even, arc, moved[:, axis]) for axis in (0, 1)], axis=1)
-    slope = np.gradient(points, axis=0)
+    points = np.stack([np.interp(even, arc, xy[:, axis]) for axis in (0, 1)], axis=1)
+    slope, length = np.gradient(points, axis=0), arc_lengths(points, np.array([0, len(points)]))
+    place = np.searchsorted(arc[firsts[:-1]], even, side="right") - 1
     edges, ids = np.array(lanes), road.edges.ids
-    own = edges[np.searchsorted(arc[firsts[:-1]], even, side="right") - 1]
-    areas = {lane: road.edges.shape(lane).area / road.baselines.length(lane) for lane in lanes}
-    length = arc_lengths(points, np.array([0, len(points)]))
+    widths = [road.edges.shape(lane).area / road.baselines.length(lane) for lane in lanes]
     return Line(
         poses=np.column_stack([points, np.arctan2(slope[:, 1], slope[:, 0])]),
         arc=length,
-        speed_limits=road.speed_limits[own],
-        widths=np.array([areas[lane] for lane in own.tolist()]),
+        speed_limits=road.speed_limits[edges[place]],
+        widths=np.array(widths)[place],
         lanes=edges,
         lane_ids=tuple(ids[lane] for lane in lanes),
         starts=np.interp(arc[firsts[:-1]], even, length),
@@ -320,3 +300,36 @@ def _make_line(
         route_end=float(np.interp(arc[firsts[len(chain)] - 1], even, length)),
         vehicle=vehicle,
     )
+
+
+def _with_those_beyond(road: VectorMap, chain: list[int]) -> list[int]:
+    """Lanes, and those that lead on from the last one, as straight as they can."""
+    lanes, beyond = list(chain), 0.0
+    while beyond < BEYOND:
+        ahead = [lane for lane in road.outgoing.at(lanes[-1]).tolist() if lane not in lanes]
+        if not ahead:
+            break
+        lanes.append(min(ahead, key=lambda lane: _turn(road, lanes[-1], lane)))
+        beyond += road.baselines.length(lanes[-1])
+    return lanes
+
+
+def _joined(road: VectorMap, lanes: list[int], firsts: IntArray, progress: float) -> FloatArray:
+    """(V, 2) vertices of the baselines of lanes, moved where one does not lead to the next.
+
+    `firsts` (L + 1,) are the first vertices of each. No move begins before `progress` [m].
+    """
+    xy = np.concatenate([road.baselines.at(lane) for lane in lanes])
+    starts = np.cumsum([0.0, *(road.baselines.length(lane) for lane in lanes)])
+    along = arc_lengths(xy, firsts) + np.repeat(starts[:-1], np.diff(firsts))
+    moved = xy.copy()
+    for place, (lane, after) in enumerate(pairwise(lanes), 1):
+        jump = xy[firsts[place]] - xy[firsts[place] - 1]
+        if after in road.outgoing.at(lane) or np.hypot(*jump) >= MAX_CHANGE:
+            continue
+        begin = max(progress, starts[place] - 0.5 * CHANGE)
+        share = np.clip((along - begin) / CHANGE, 0.0, 1.0)
+        weight = share * share * (3.0 - 2.0 * share)
+        weight[firsts[place] :] -= 1.0
+        moved += weight[:, None] * jump
+    return moved

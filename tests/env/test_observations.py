@@ -8,10 +8,11 @@ import pytest
 from gymnasium.utils.env_checker import data_equivalence
 from worlds import cruise_scenario, moved, standing_tracks
 
+import shiftsim.env
 from shiftsim.env.driving import DrivingEnv
 from shiftsim.env.vector import LANE_STEP, METRES, ROUTE_STEP, SIZE, SPEED, parts_of, route_line
 from shiftsim.planners.learned.carl.planner import Carl
-from shiftsim.sim.planner import scene_info
+from shiftsim.sim.planner import observe_log, scene_info
 from shiftsim.world.state import AgentKind, LightStatus, TrafficLights
 
 ROWS = 60 + 2 * 150 + 1 + 160  # of `cruise_scenario`
@@ -151,3 +152,23 @@ def test_many_compact_observations_are_taken_apart_at_once(rng):
     for part, alone in zip(together, one, strict=True):
         np.testing.assert_array_equal(part[4, 1], alone)
     assert sum(alone.size for alone in one) == SIZE
+
+
+@pytest.mark.parametrize("observation", ["raster", "vector"])
+def test_a_planner_sees_what_a_policy_sees(observation, source_of):
+    action = np.array([0.5, 0.1], np.float32)
+    scenario = busy()
+    env = DrivingEnv(store=source_of(scenario), observation=observation)
+    first, _ = env.reset()
+    shown = {"raster": shiftsim.env.raster_observation, "vector": shiftsim.env.vector_observation}
+    scene = scene_info(scenario)
+    for seen, given in ((first, []), (env.step(action)[0], [action])):
+        found = shown[observation](
+            scene, env.episode.observe() if given else observe_log(scenario, 0), *given
+        )
+        if observation == "vector":
+            np.testing.assert_array_equal(found, seen)
+        else:
+            assert found.keys() == {"raster", "measurements"}
+            for name, part in found.items():
+                np.testing.assert_array_equal(part, seen[name])
