@@ -292,7 +292,7 @@ def test_a_file_obeys_the_contract_on_the_command_line(toy, tmp_path):
         (INTERFACE.format("vector", "trajectory"), r"has shape \(2,\); it must be \(10, 3\)"),
         (
             INTERFACE.format("none", "command"),
-            r"policy.pt' cannot act: RuntimeError: .*shapes cannot be multiplied",
+            r"policy.pt' cannot act: RuntimeError: ",
         ),
         ("observation", "is not TOML"),
     ],
