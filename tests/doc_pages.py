@@ -32,7 +32,7 @@ PAGES = (REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md")))
 _FENCE = re.compile(
     r"^(?:<!-- (?P<marks>.*?) -->\n)?```(?P<kind>\w*)\n(?P<text>.*?)^```$", re.M | re.S
 )
-_FILE = re.compile(r'^(?:# |""")(?P<name>[\w-]+\.(?:py|toml|yaml|csv|txt|sh))(?:""")?$')
+_FILE = re.compile(r'^(?:# |""")(?P<name>[\w.-]+\.(?:py|toml|yaml|csv|txt|sh))(?:""")?$')
 _SHELL = re.compile(r"[|<>&;$*]")  # what only a shell understands
 RUN, SHOWN = ("sh", "python"), ("text",)
 PLAIN = ("", "dockerfile", "toml", "yaml", "csv", "json", "bibtex")
