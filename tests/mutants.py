@@ -20,6 +20,7 @@ import sys
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
+from functools import cached_property
 from itertools import takewhile
 from pathlib import Path
 from types import ModuleType
@@ -31,6 +32,7 @@ from mutated import GROUPS, LEFT_OUT, ROOT, TESTS, modules, shared_sample, tests
 from mutations import Mutant, names_of
 
 CPU_SECONDS = 60  # of a child; one that takes longer hangs
+DESCRIPTORS = (property, cached_property, staticmethod, classmethod)
 MEMORY = 8 << 30  # bytes that a child may have mapped
 
 Name = tuple[str, str]  # a module and a top-level name of it
@@ -113,7 +115,7 @@ def _change_class(module: ModuleType, statement: ast.ClassDef) -> None:
     new = vars(module)[statement.name]
     setattr(module, statement.name, old)
     for name, value in vars(new).items():
-        is_code = callable(value) or isinstance(value, property | staticmethod | classmethod)
+        is_code = callable(value) or isinstance(value, DESCRIPTORS)
         if (is_code or name == "_field_defaults") and name not in ("__setattr__", "__delattr__"):
             with contextlib.suppress(TypeError, AttributeError):
                 setattr(old, name, value)
