@@ -302,7 +302,7 @@ def test_what_other_tools_call_otherwise_is_answered_with_the_name_here(run, sce
         assert meant in str(caught.value)
 
 
-NO_ATTRIBUTES = "iteration that for np shiftsim Trajectory store".split()
+NO_ATTRIBUTES = "iteration that those for np shiftsim Trajectory store".split()
 
 
 def test_what_is_asked_for_by_name_survives_copies(scenario):

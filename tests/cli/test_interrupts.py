@@ -8,7 +8,7 @@ from shiftsim.cli import main
 CASES = [
     (
         "filter {store}",
-        "shiftsim.runs.filter.filter_store",
+        "shiftsim.api.stores.filter_store",
         "start again, with: shiftsim filter",
     ),
     (
