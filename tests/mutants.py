@@ -43,6 +43,7 @@ class Definitions:
 
     def __init__(self) -> None:
         self.statements: dict[Name, ast.stmt] = {}
+        self.later: dict[Name, list[ast.stmt]] = defaultdict(list)  # what changes a value again
         self.origins: dict[Name, Name] = {}  # of imported names
         self.users: dict[Name, list[Name]] = defaultdict(list)
         for module, tree in _loaded():
@@ -53,8 +54,14 @@ class Definitions:
                 self.users[origin].append((module, name))
             for statement in tree.body:
                 used = {n.id for n in ast.walk(statement) if isinstance(n, ast.Name)}
+                if isinstance(statement, ast.AugAssign) and isinstance(statement.target, ast.Name):
+                    self.later[module, statement.target.id].append(statement)
                 for name in names_of(statement):
-                    self.statements[module, name] = statement
+                    is_value = isinstance(statement, ast.Assign | ast.AnnAssign)
+                    if is_value and (module, name) in self.statements:
+                        self.later[module, name].append(statement)
+                    else:
+                        self.statements[module, name] = statement
                     self.users[module, ""].append((module, name))  # of the module as a whole
                     for other in used & (own | imported.keys()):
                         self.users[module, other].append((module, name))
@@ -148,6 +155,9 @@ def apply(mutant: Mutant | None, definitions: Definitions, start: list[Name]) ->
                 old.cache_clear()
         elif statement is not None and (changed or module.__name__.startswith("shiftsim")):
             _execute(module, statement)
+            for later in definitions.later[name]:
+                if mutant is None or ast.dump(later) != ast.dump(mutant.original):
+                    _execute(module, later)
 
 
 def _has_defaults(statement: ast.ClassDef) -> bool:
