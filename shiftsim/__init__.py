@@ -15,7 +15,7 @@ _PUBLIC = {
     "NoiseModel": "shiftsim.sim.noise:NoiseModel",
     "Observation": "shiftsim.sim.planner:Observation",
     "Planner": "shiftsim.sim.planner:Planner",
-    "Run": "shiftsim.api:Run",
+    "Run": "shiftsim.api.finished:Run",
     "Scenario": "shiftsim.world.scenario:Scenario",
     "SceneInfo": "shiftsim.sim.planner:SceneInfo",
     "ShiftsimError": "shiftsim.errors:ShiftsimError",

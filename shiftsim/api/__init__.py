@@ -5,22 +5,23 @@ The other public names are where they are defined; `shiftsim/__init__.py` lists 
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import shiftsim.api.notebook  # pictures, and answers to other names
 import shiftsim.edits  # noqa: F401  # attaches Scenario.edited
-from shiftsim.api.finished import Run as Run
 from shiftsim.api.stores import demo_store as demo_store
 from shiftsim.data import open_store as open_store
 from shiftsim.errors import ConfigError
 from shiftsim.files import DEFAULT_STORE, store_path
 from shiftsim.planners import registry
-from shiftsim.runs import results
 from shiftsim.sim import loop
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
 from shiftsim.sim.planner import Planner
 from shiftsim.world.scenario import Scenario, require_scenario
+
+if TYPE_CHECKING:
+    from shiftsim.api.finished import Run
 
 # settings of the demo's run
 DEMO = {"planners": ("log-future", "idm", "constant-velocity"), "noise": ("none", "ou-high")}
@@ -33,7 +34,7 @@ def run(
     seeds: int | Iterable[int] = 0,
     on_progress: Any = None,
     **settings: Any,
-) -> Run:
+) -> "Run":
     """Simulate and score planners on scenarios, as `shiftsim run` does.
 
     Args:
@@ -80,10 +81,10 @@ def run(
     }
     plan = prepare(make_config(values), planners=planners, noises=models)
     finished = execute(plan, **{"on_progress": on_progress} if on_progress else {})
-    return Run(finished.path, finished.manifest)
+    return _with_methods(finished)
 
 
-def demo(store: str | Path = DEFAULT_STORE, **settings: Any) -> Run:
+def demo(store: str | Path = DEFAULT_STORE, **settings: Any) -> "Run":
     """Generate the demo's recordings where they are not there, and run three planners on them.
 
     Args:
@@ -108,7 +109,7 @@ def bench(
     val14: str = "",
     on_progress: Any = None,
     **settings: Any,
-) -> list[Run]:
+) -> "list[Run]":
     """Run a benchmark track with all its traffic modes, noises and seeds, as `shiftsim bench` does.
 
     Args:
@@ -129,10 +130,10 @@ def bench(
         settings["planners"] = [planner] if isinstance(planner, str) else list(planner)
     plan = plan_bench(load_track(track), settings, reference=val14, out=str(out))
     done = run_bench(plan, **{"on_progress": on_progress} if on_progress else {})
-    return [Run(finished.path, finished.manifest) for finished in done]
+    return [_with_methods(finished) for finished in done]
 
 
-def merge(runs: Iterable[Any], *, out: str | None = None, allow_partial: bool = False) -> Run:
+def merge(runs: Iterable[Any], *, out: str | None = None, allow_partial: bool = False) -> "Run":
     """Join the shards of one run, as runs or folders: the same bytes as without shards.
 
     Raises:
@@ -140,9 +141,9 @@ def merge(runs: Iterable[Any], *, out: str | None = None, allow_partial: bool = 
     """
     from shiftsim.runs.derive import merge_runs
 
-    shards = [each if isinstance(each, results.Run) else open_run(each) for each in runs]
+    shards = [each if hasattr(each, "manifest") else open_run(each) for each in runs]
     merged = merge_runs(shards, out=out, allow_partial=allow_partial)
-    return Run(merged.path, merged.manifest)
+    return _with_methods(merged)
 
 
 def score_files(
@@ -152,7 +153,7 @@ def score_files(
     tracks: str = "",
     partial: bool = False,
     **settings: Any,
-) -> Run:
+) -> "Run":
     """Score what was driven elsewhere, as `shiftsim score FILE` does: tables of poses, or logs.
 
     Args:
@@ -175,10 +176,10 @@ def score_files(
     found = logs or read_source(Path(source), tracks)
     settings |= {"recorded": tracks == RECORDED, "partial_rollouts": partial}
     made = score_elsewhere(found, store=store, **settings)
-    return Run(made.path, made.manifest)
+    return _with_methods(made)
 
 
-def open_run(path: str | Path) -> Run:
+def open_run(path: str | Path) -> "Run":
     """A run folder.
 
     Raises:
@@ -190,8 +191,10 @@ def open_run(path: str | Path) -> Run:
         run = shiftsim.open_run("two")
         ```
     """
-    found = results.open_run(path)
-    return Run(found.path, found.manifest)
+    from shiftsim.runs.results import open_run
+
+    found = open_run(path)
+    return _with_methods(found)
 
 
 def load_planner(name: str, **arguments: Any) -> Planner:
@@ -242,6 +245,13 @@ def simulate(
     require_scenario("simulate", scenario)
     driver = load_planner(planner) if isinstance(planner, str) else planner
     return loop.simulate(scenario, driver, setting, **changes)
+
+
+def _with_methods(found: Any) -> "Run":
+    """A run on disk with all that can be made of it."""
+    from shiftsim.api.finished import Run
+
+    return Run(found.path, found.manifest)
 
 
 def __getattr__(name: str) -> Any:

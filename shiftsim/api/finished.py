@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from shiftsim.api.notebook import answer
 from shiftsim.errors import ConfigError, listed, one_of
-from shiftsim.report.tables import FORMATS
 from shiftsim.runs import results
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.scenario import Scenario
@@ -80,12 +80,12 @@ class Run(results.Run):
         self,
         folder: str | Path,
         *others: results.Run,
-        formats: Sequence[str] = FORMATS,
+        formats: Sequence[str] = (),
         tables: Sequence[str] = (),
         by: str | None = None,
         **settings: Any,
     ) -> list[Path]:
-        """Write tables (all of them by default) and pictures of runs to a folder; the files.
+        """Write tables and pictures of runs to a folder, all of them by default; the files.
 
         There is a file per format. `pictures=False` leaves pictures out, `pages=True` writes HTML
         pages with a replay of every scenario, `allow_partial=True` labels means over what finished.
@@ -95,11 +95,14 @@ class Run(results.Run):
             MissingExtraError: matplotlib is missing.
         """
         from shiftsim.report.build import TABLES, Options
+        from shiftsim.report.tables import FORMATS
 
         for name in formats:
             one_of("format", name, FORMATS)
         options = Options(tuple(tables or TABLES), by)
-        return list(self._opened(*others).report(Path(folder), options, formats, **settings))
+        return list(
+            self._opened(*others).report(Path(folder), options, formats or FORMATS, **settings)
+        )
 
     def worst(self, count: int = 10) -> list[dict[str, Any]]:
         """The worst of each recording and cause: key, `cls`, `reason`, how many `others`."""
@@ -268,3 +271,18 @@ class Run(results.Run):
 
     def _repr_html_(self) -> str:
         return str(self.table(format="html", allow_partial=True))
+
+
+answer(
+    Run,
+    """results: scores, metrics and tasks
+        summary: table()
+        failures: tasks, where `status` is not ok
+        planners: manifest["config"]["planners"]
+        scenarios, tokens: scores["token"]; shiftsim.open_store(…)[token] is a scenario
+        rollouts, log: rollout(token)
+        show: view(token)
+        score: scores
+        to_pandas: table(format="pandas"), or scores.to_pandas()
+        save, folder: path; it is on disk already""",
+)

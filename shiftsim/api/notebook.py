@@ -10,7 +10,6 @@ from typing import Any
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import MissingExtraError, nearest
 from shiftsim.metrics import MetricResult
-from shiftsim.runs.results import Run
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.map import VectorMap
@@ -73,16 +72,6 @@ for _kind in (Scenario, VectorMap):
 
 # what is asked for by names of other tools: what it is called here
 _SYNONYMS: dict[type, str] = {
-    Run: """results: scores, metrics and tasks
-        summary: table()
-        failures: tasks, where `status` is not ok
-        planners: manifest["config"]["planners"]
-        scenarios, tokens: scores["token"]; shiftsim.open_store(…)[token] is a scenario
-        rollouts, log: rollout(token)
-        show: view(token)
-        score: scores
-        to_pandas: table(format="pandas"), or scores.to_pandas()
-        save, folder: path; it is on disk already""",
     Scenario: """agents, objects, boxes: tracks
         id, name: token
         type: scenario_type
@@ -150,7 +139,7 @@ def _words(text: str) -> dict[str, str]:
     return {name: meant for names, _, meant in lines for name in names.split(", ")}
 
 
-WORDS = {kind: _words(text) for kind, text in _SYNONYMS.items()}
+WORDS: dict[type, dict[str, str]] = {}
 
 
 def _answer(words: Mapping[str, str]) -> Callable[[Any, str], Any]:
@@ -166,5 +155,11 @@ def _answer(words: Mapping[str, str]) -> Callable[[Any, str], Any]:
     return __getattr__
 
 
-for _asked, _meant in WORDS.items():
-    setattr(_asked, "__getattr__", _answer(_meant))  # noqa: B010
+def answer(kind: type, text: str) -> None:
+    """Let objects of a class answer to names of other tools, each with the name here."""
+    WORDS[kind] = _words(text)
+    setattr(kind, "__getattr__", _answer(WORDS[kind]))  # noqa: B010
+
+
+for _kind, _text in _SYNONYMS.items():
+    answer(_kind, _text)

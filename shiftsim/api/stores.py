@@ -12,9 +12,6 @@ from shiftsim.data import open_store
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import one_of
 from shiftsim.files import DEFAULT_STORE, store_path
-from shiftsim.runs.config import default_workers
-from shiftsim.runs.filter import FilterConfig, FilterResults, filter_store
-from shiftsim.runs.workers import map_unordered
 
 if TYPE_CHECKING:
     from shiftsim.data.nuplan.convert import ConversionReport as NuplanReport
@@ -22,6 +19,7 @@ if TYPE_CHECKING:
     from shiftsim.data.readers.reader import Reader
     from shiftsim.data.store.check import CheckReport
     from shiftsim.data.store.statistics import StoreStats
+    from shiftsim.runs.filter import FilterResults
 
 OnProgress = Callable[..., None]  # done, total and the name of the last one
 
@@ -176,6 +174,8 @@ def convert_reader(
         ConversionError: None of the recordings can be converted.
     """
     from shiftsim.data.readers.convert import convert
+    from shiftsim.runs.config import default_workers
+    from shiftsim.runs.workers import map_unordered
 
     executor = partial(map_unordered, workers=workers or default_workers())
     return convert(reader, store_path(store), progress=on_progress, executor=executor)
@@ -209,6 +209,8 @@ def make_towns(
         ConfigError: The folder holds something else.
     """
     from shiftsim.data.synthetic.store import write_towns
+    from shiftsim.runs.config import default_workers
+    from shiftsim.runs.workers import map_unordered
 
     count = min(workers or default_workers(), towns)
     spread = partial(map_unordered, workers=count, alone=1)
@@ -219,13 +221,15 @@ def make_towns(
 
 def _filter(
     self: ScenarioStore, *, workers: int = 0, on_progress: OnProgress = _silent, **limits: Any
-) -> FilterResults:
+) -> "FilterResults":
     """Drive every scenario as recorded; those that cannot be driven so are left out of runs.
 
     `workers` processes share them, as many as the machine suggests where 0; `on_progress` is called
     with scenarios done and scenarios in all; `limits` are fields of `FilterConfig`: `thresholds`,
     `min_path_m`, `min_progress_share`.
     """
+    from shiftsim.runs.filter import FilterConfig, filter_store
+
     config = FilterConfig(**limits)
     return filter_store(self.path, config, workers=workers, on_progress=on_progress)
 

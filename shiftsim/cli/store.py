@@ -16,7 +16,7 @@ from shiftsim.files import store_path
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from shiftsim.api import Run
+    from shiftsim.api.finished import Run
     from shiftsim.compat.nuplan.results import ResultsExport
     from shiftsim.data.nuplan.export import ExportReport
     from shiftsim.data.store.check import CheckReport

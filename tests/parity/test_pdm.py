@@ -37,8 +37,8 @@ from shiftsim.planners.idm import STEP_US as IDM_STEP_US
 from shiftsim.planners.idm import STEPS as IDM_STEPS
 from shiftsim.planners.idm import Idm
 from shiftsim.planners.pdm import forecast, rollout
+from shiftsim.planners.pdm import planner as steps_module
 from shiftsim.planners.pdm import route as routes
-from shiftsim.planners.pdm import step as steps_module
 from shiftsim.planners.pdm.parameters import DEFAULT
 from shiftsim.planners.pdm.planner import PdmClosed, Seen, Step, choose
 from shiftsim.planners.pdm.scorer import TTC_STEPS, Place, Scores, score, weighted_mean

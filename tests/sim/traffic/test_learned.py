@@ -7,7 +7,7 @@ import pytest
 from worlds import cruise_scenario, moved, standing_tracks, straight_road
 
 from shiftsim.errors import CheckpointError, ConfigError, TrafficError
-from shiftsim.planners.basic.constant_velocity import ConstantVelocity
+from shiftsim.planners.basic import ConstantVelocity
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.traffic import lanes as following
