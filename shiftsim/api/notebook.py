@@ -161,5 +161,5 @@ def answer(kind: type, text: str) -> None:
     setattr(kind, "__getattr__", _answer(WORDS[kind]))  # noqa: B010
 
 
-for _kind, _text in _SYNONYMS.items():
-    answer(_kind, _text)
+for _asked, _text in _SYNONYMS.items():
+    answer(_asked, _text)

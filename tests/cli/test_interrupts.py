@@ -8,7 +8,7 @@ from shiftsim.cli import main
 CASES = [
     (
         "filter {store}",
-        "shiftsim.api.stores.filter_store",
+        "shiftsim.runs.filter.filter_store",
         "start again, with: shiftsim filter",
     ),
     (
