@@ -58,6 +58,7 @@ _WORDS = {
     "convert": "convert_nuplan, convert_dsc3d, convert_tracks, convert_dataset",
     "diff": "open_run(…).diff(other)",
     "evaluate": "run, or score for one rollout",
+    "frenet": "line.to_frenet(poses), of line = scene.route_line()",
     "list_planners": "shiftsim.planners.table.PLANNERS",
     "load_run": "open_run",
     "load_scenario": "open_store(…)[token]",
