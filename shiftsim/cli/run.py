@@ -27,7 +27,6 @@ from shiftsim.cli import (
 from shiftsim.cli.report import print_worst
 from shiftsim.errors import ConfigError
 from shiftsim.files import DEFAULT_STORE, read_toml, store_path
-from shiftsim.planners.registry import planner_name
 from shiftsim.runs.config import make_config
 
 if TYPE_CHECKING:
@@ -207,6 +206,8 @@ def announce(
 
 def _plan_lines(plan: "RunPlan") -> Iterator[str]:
     """Every setting, defaults included."""
+    from shiftsim.planners.registry import planner_name
+
     config, scenarios = plan.config, plan.selection
     found = len({task.token for task in plan.tasks})
     missing = len({task.token for task in plan.missing})

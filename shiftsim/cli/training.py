@@ -9,7 +9,6 @@ from typer import Argument, Option, echo
 
 from shiftsim import cli
 from shiftsim.cli import Json, Quiet, new_app, print_result
-from shiftsim.planners.learned.checkpoint import require_torch
 from shiftsim.train.folder import BEST, Settings, TrafficSettings
 
 app = new_app("Train networks.")
@@ -23,6 +22,8 @@ def carl(
     quiet: Quiet = False,
 ) -> None:
     """Train CaRL's network to drive as PDM-Closed does."""
+    from shiftsim.planners.learned.checkpoint import require_torch
+
     require_torch("training")
     from shiftsim.train.recipe import Training
 
@@ -37,6 +38,8 @@ def carl(
 @cli.with_settings(of=TrafficSettings)
 def traffic(settings: cli.Settings, quiet: Quiet = False) -> None:
     """Train traffic to move as recorded agents do."""
+    from shiftsim.planners.learned.checkpoint import require_torch
+
     require_torch("training")
     from shiftsim.train.traffic.recipe import train_traffic
 
