@@ -228,9 +228,9 @@ def command_line(folder, *words):
     ("kind", "observation", "action"),
     [
         ("script", "vector", "command"),
-        ("script", "raster", "trajectory"),
-        ("export", "vector", "trajectory"),
-        ("export", "raster", "command"),
+        pytest.param("script", "raster", "trajectory", marks=pytest.mark.thorough),
+        pytest.param("export", "vector", "trajectory", marks=pytest.mark.thorough),
+        pytest.param("export", "raster", "command", marks=pytest.mark.thorough),
     ],
 )
 def test_a_network_in_a_file_drives(toy, tmp_path, kind, observation, action):
