@@ -5,15 +5,17 @@ import pytest
 from scipy.signal import savgol_filter
 
 from shiftsim.errors import DataError
+from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.metrics.comfort import (
     BOUNDED_SIGNALS,
     ComfortSignals,
     comfort_signals,
+    derived_states,
     evaluate,
     within_bounds,
 )
 from shiftsim.metrics.result import DEEPPLAN, NUPLAN, Violation
-from shiftsim.world.state import AX, AY, HEADING, NUM_STATE, YAW_ACCEL, YAW_RATE
+from shiftsim.world.state import AX, AY, HEADING, NUM_STATE, VX, VY, YAW_ACCEL, YAW_RATE
 
 
 def times(count: int) -> np.ndarray:
@@ -150,3 +152,28 @@ def test_the_step_of_the_signals_is_the_mean_of_the_time_stamps() -> None:
     np.testing.assert_allclose(signals.yaw_rate, 1.0, rtol=0, atol=1e-8)
     curved = comfort_signals(times(20) // 2, states_with(HEADING, heading**2))
     np.testing.assert_allclose(curved.yaw_accel, 2.0, rtol=0, atol=1e-7)
+
+
+def test_states_derived_from_poses_are_those_of_the_motion() -> None:
+    time_us = times(60)
+    seconds = time_us * 1e-6
+    heading = 3.0 + 0.2 * seconds + 0.01 * seconds**2  # leaves pi on the way
+    turn, speed = 0.2 + 0.02 * seconds, 5.0 + 0.5 * seconds
+    fine = np.linspace(0.0, seconds[-1], 59 * 200 + 1)
+    along = (5.0 + 0.5 * fine) * np.exp(1j * (3.0 + 0.2 * fine + 0.01 * fine**2))
+    way = np.concatenate([[0.0], np.cumsum(0.5 * (along[1:] + along[:-1]) * np.diff(fine))])[::200]
+    poses = np.column_stack([4e5 + way.real, 5e6 + way.imag, wrap_angles(heading)])
+
+    states = derived_states(time_us, poses)[3:-3]
+
+    np.testing.assert_array_equal(states[:, :3], poses[3:-3])
+    inner = slice(3, -3)
+    for column, values, tolerance in (
+        (VX, speed, 5e-3),
+        (VY, 0.0 * speed, 5e-3),
+        (AX, 0.5 + 0.0 * speed, 2e-2),
+        (AY, speed * turn, 2e-2),
+        (YAW_RATE, turn, 1e-6),
+        (YAW_ACCEL, 0.02 + 0.0 * turn, 1e-6),
+    ):
+        np.testing.assert_allclose(states[:, column], values[inner], atol=tolerance)

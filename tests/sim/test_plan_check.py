@@ -3,7 +3,7 @@ import re
 import numpy as np
 import pytest
 
-from shiftsim.sim.plan_check import find_fault
+from shiftsim.sim.plan_check import find_fault, is_short
 from shiftsim.world.state import NUM_STATE, Command, Trajectory
 
 NOW, NEXT = 1_600_000_000_000_000, 1_600_000_000_100_000
@@ -56,3 +56,9 @@ def test_a_value_that_is_not_finite_is_named_with_its_column_and_row():
     plan = trajectory([0, 100_000, 200_000])
     plan.states[1, 2] = np.nan
     assert "heading of state 1 is nan" in find_fault(plan, NOW, NEXT).message
+
+
+def test_a_plan_is_short_that_ends_before_what_the_tracker_reads():
+    assert is_short(trajectory([0, 500_000, 999_999]))
+    assert not is_short(trajectory([0, 500_000, 1_000_000]))
+    assert not is_short(Command(0.0, 0.0))

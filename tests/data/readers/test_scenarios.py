@@ -1,4 +1,5 @@
 import dataclasses
+import re
 
 import dsc3d_writer as writer
 import numpy as np
@@ -17,6 +18,7 @@ from shiftsim.data.readers.windows import (
     ConversionConfig,
     Span,
     evaluate_windows,
+    make_config,
     overlap_partners,
     window_spans,
 )
@@ -274,3 +276,20 @@ def test_two_conversions_give_the_same_bytes(tmp_path):
 def test_settings_that_cannot_work_are_refused(setting):
     with pytest.raises(ConfigError):
         ConversionConfig(**setting)
+
+
+@pytest.mark.parametrize(
+    ("name", "good", "bad"),
+    [
+        ("route_extension_blocks", (0, 2), (-1, 1.5, True)),
+        ("max_per_window", (None, 1), (0, -1, 2.0)),
+        ("country", ("DE",), (49,)),
+        ("max_overlap", (0, 0.0), (-0.1, float("inf"), "1")),
+    ],
+)
+def test_settings_of_a_conversion_are_of_their_type(name, good, bad):
+    for value in good:
+        assert getattr(make_config({name: value}), name) == value
+    for value in bad:
+        with pytest.raises(ConfigError, match=f"{name} is {re.escape(repr(value))}; it must be"):
+            make_config({name: value})

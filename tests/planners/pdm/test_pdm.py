@@ -156,6 +156,9 @@ def test_errors_name_what_to_mend():
         load_planner("pdm-closed", {"speed_fractions": "fast"})
     with pytest.raises(ConfigError, match="map_radius"):
         PdmParameters(map_radius=0.0)
+    for wrong in ((), (0.5, np.nan), (np.inf,)):
+        with pytest.raises(ConfigError, match="speed_fractions"):
+            PdmParameters(speed_fractions=wrong)
 
 
 def test_parameters_are_plain_data():
