@@ -266,9 +266,13 @@ class OpenedRuns(NamedTuple):
         self, options: build.Options, *, with_coverage: bool = False, allow_partial: bool = False
     ) -> list[Table]:
         """The tables that are asked for, also those that only a benchmark has if wanted."""
-        found = self.groups(allow_partial=allow_partial)
-        tables = build.make_tables(found, published_figures(), options)
-        return [*(self.coverage(found) if with_coverage else []), *tables]
+        return self._tables(self.groups(allow_partial=allow_partial), options, with_coverage)
+
+    def _tables(
+        self, groups: Sequence[Group], options: build.Options, with_coverage: bool
+    ) -> list[Table]:
+        own = self.coverage(groups) if with_coverage else []
+        return [*own, *build.make_tables(groups, published_figures(), options)]
 
     def report(
         self,
@@ -291,8 +295,9 @@ class OpenedRuns(NamedTuple):
             MissingExtraError: Pictures are asked for, and matplotlib is missing.
         """
         is_whole = options.tables == tuple(build.TABLES)
-        tables = self.tables(options, with_coverage=is_whole, allow_partial=allow_partial)
-        drawn = figures(self.groups(allow_partial=allow_partial)) if pictures or pages else []
+        groups = self.groups(allow_partial=allow_partial)
+        tables = self._tables(groups, options, is_whole)
+        drawn = figures(groups) if pictures or pages else []
         title = title or f"Report on {', '.join(run.path.name for run in self.runs)}"
         if not pages:
             return build.write_report(folder, title, self.runs, tables, drawn, formats)

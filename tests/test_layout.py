@@ -31,7 +31,7 @@ BUDGETS = {
     "data/nuplan": 2_840,  # goal 2_400
     "data/store": 2_350,  # goal 2_200
     "data/synthetic": 2_590,  # goal 2_100
-    "shiftsim/report": 3_060,  # goal 2_200
+    "shiftsim/report": 3_050,  # goal 2_200
     "shiftsim/view": 2_110,  # goal 1_800
     "shiftsim/env": 1_420,
     "shiftsim/train": 1_900,  # goal 1_600

@@ -103,7 +103,7 @@ def demo(store: str | Path = DEFAULT_STORE, **settings: Any) -> "Run":
 
 def bench(
     track: str,
-    planner: Any = (),
+    planner: str | Sequence[str],
     *,
     out: str | Path = "",
     val14: str = "",
@@ -114,7 +114,7 @@ def bench(
 
     Args:
         track: `semantic-shift`, `state-drift` or `edits`.
-        planner: A name or `package.module:Class`, or a list of those; those of the track if empty.
+        planner: A name, `package.module:Class` or `LABEL=` one of those, or a list of them.
         out: Folder; that of an earlier call goes on.
         val14: Store, or STORE:SPLIT, with Val14.
         on_progress: Called with a `Progress` after every task.
@@ -126,8 +126,7 @@ def bench(
     from shiftsim.benchmarks import load_track
     from shiftsim.benchmarks.bench import plan_bench, run_bench
 
-    if planner:
-        settings["planners"] = [planner] if isinstance(planner, str) else list(planner)
+    settings["planners"] = [planner] if isinstance(planner, str) else list(planner)
     plan = plan_bench(load_track(track), settings, reference=val14, out=str(out))
     done = run_bench(plan, **{"on_progress": on_progress} if on_progress else {})
     return [_with_methods(finished) for finished in done]

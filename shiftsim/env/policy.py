@@ -33,7 +33,7 @@ from shiftsim.world.state import Command, Trajectory
 CRITIC = "value_measurements"  # part of the raster's that is made from the recording
 
 
-class Sight:
+class PlannerEpisode:
     """Stands where an `Episode` stands for those who make observations: what a planner knows.
 
     `terms` are there where the planner is shown the recording.
@@ -52,7 +52,7 @@ class Sight:
         """What the planner sees now."""
         return self._now
 
-    def go_on(self, observation: Observation) -> None:
+    def advance(self, observation: Observation) -> None:
         """Note the next observation of the scenario."""
         self._now, row = observation, observation.iteration
         expert, history = self.scene.expert, observation.history
@@ -84,16 +84,16 @@ class PolicyPlanner:
 
     def reset(self, scene: SceneInfo) -> None:
         """Forget the scenario before."""
-        self._sight, self._memory = Sight(scene, np.zeros_like(self._high)), None
+        self._episode, self._memory = PlannerEpisode(scene, np.zeros_like(self._high)), None
 
     def plan(self, observation: Observation) -> Trajectory | Command:
         """The plan that the policy's action stands for."""
-        sight: Any = self._sight
-        sight.go_on(observation)
+        episode: Any = self._episode
+        episode.advance(observation)
         if observation.iteration == 0:
-            self.observer.start(sight)
-        sight.action = self.act(self.observer.look(sight))
-        return plan_of(sight.action, observation.history.ego[-1])
+            self.observer.start(episode)
+        episode.action = self.act(self.observer.look(episode))
+        return plan_of(episode.action, observation.history.ego[-1])
 
     def act(self, seen: Any) -> NDArray[np.float32]:
         """The action at an observation, within its bounds.

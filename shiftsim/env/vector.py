@@ -124,7 +124,7 @@ class VectorBuilder:
 
     def _start(self, ego: FloatArray) -> Route:
         scene = self._scene
-        line = route_line(scene, scene.route_blocks, center_poses(ego[:3]))
+        line = greedy_line(scene, scene.route_blocks, center_poses(ego[:3]))
         arc, most = arc_lengths(line, np.array([0, len(line)])), max(TRACKS, LANES)
         return Route(line, arc, np.zeros(most), np.zeros(most, np.int64))
 
@@ -149,10 +149,11 @@ class VectorObserver:
         return vector_observation(episode.scene, episode.observe(), as_command(episode.action))
 
 
-def route_line(scene: SceneInfo, blocks: list[int], center: FloatArray) -> FloatArray:
+def greedy_line(scene: SceneInfo, blocks: list[int], center: FloatArray) -> FloatArray:
     """(V, 2) a line along the lanes of the route from the ego on, V >= 2 [m].
 
-    It goes on in the lane of the next block that begins nearest to its end.
+    It goes on in the lane of the next block that begins nearest to its end. Policies have learned
+    from this one; `SceneInfo.route_line` looks further and ends elsewhere.
     """
     road, size = scene.map, scene.vehicle
     lanes = road.lanes_of(blocks)

@@ -6,12 +6,11 @@ import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from importlib import import_module
 from pathlib import Path
 from string import Template
 from typing import Any
 
-from shiftsim.errors import ConfigError, MissingExtraError, one_of
+from shiftsim.errors import ConfigError, import_extra, one_of
 from shiftsim.files import write_text
 from shiftsim.report import dataset, details, paper
 from shiftsim.report.figures import Figure
@@ -175,12 +174,7 @@ def to_pandas(tables: Sequence[Table]) -> Any:
     Raises:
         MissingExtraError: pandas is not installed.
     """
-    try:
-        pandas = import_module("pandas")
-    except ImportError as error:
-        raise MissingExtraError(
-            "data frames need pandas", hint="pip install 'shiftsim[plots]'"
-        ) from error
+    pandas: Any = import_extra("pandas", "plots")
     frames = {}
     for table in tables:
         whole = replace(table.full or table, notes=())

@@ -117,9 +117,9 @@ def rank_correlation(first: FloatArray, second: FloatArray) -> float | None:
     """Spearman's correlation of (S,) values; None for fewer than three, or constant ones."""
     if len(first) < 3 or np.ptp(first) == 0.0 or np.ptp(second) == 0.0:
         return None
-    from scipy.stats import rankdata
+    from scipy.stats import spearmanr
 
-    return float(np.corrcoef(rankdata(first), rankdata(second))[0, 1])
+    return float(spearmanr(first, second).statistic)
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

@@ -5,7 +5,7 @@ line. Headings turn evenly between its vertices, so that poses come back from th
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -61,6 +61,8 @@ class Line:
         successors: For each of them, the ids of those that it leads to.
         route_end: Arc length at which the route ends [m]; the line goes on straight ahead.
         vehicle: Dimensions of the ego.
+        curvature: (K,) positive to the left [1/m].
+        ahead: (K, 2) unit vectors along the headings.
     """
 
     poses: FloatArray
@@ -73,23 +75,19 @@ class Line:
     successors: tuple[tuple[str, ...], ...]
     route_end: float
     vehicle: VehicleParameters
+    curvature: FloatArray = field(init=False)
+    ahead: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
+        headings = self.poses[:, 2]
+        object.__setattr__(self, "curvature", np.gradient(np.unwrap(headings), self.arc))
+        object.__setattr__(self, "ahead", np.stack([np.cos(headings), np.sin(headings)], axis=1))
         for item in fields(self):
             if isinstance(value := getattr(self, item.name), np.ndarray):
                 object.__setattr__(self, item.name, readonly(value))
 
     def __repr__(self) -> str:
         return f"<Line: {self.arc[-1]:.0f} m along {len(self.lanes)} lanes and connectors>"
-
-    @property
-    def curvature(self) -> FloatArray:
-        """(K,) curvature, positive to the left [1/m]."""
-        return np.gradient(np.unwrap(self.poses[:, 2]), self.arc)
-
-    @property
-    def _ahead(self) -> FloatArray:
-        return np.stack([np.cos(self.poses[:, 2]), np.sin(self.poses[:, 2])], axis=1)
 
     def to_frenet(self, poses: ArrayLike) -> FloatArray:
         """Frenet coordinates (..., 3) of poses (..., 3), or (..., 2) of points (..., 2).
@@ -99,7 +97,7 @@ class Line:
         given = _rows(poses)
         flat = np.array(given.reshape(-1, given.shape[-1])[:, :2])
         found = np.empty((len(flat), 3))
-        write_frenet(self.poses, self._ahead, self.arc, flat, found)
+        write_frenet(self.poses, self.ahead, self.arc, flat, found)
         found = found.reshape(*given.shape[:-1], 3)
         if given.shape[-1] == 2:
             return found[..., :2]
@@ -113,7 +111,7 @@ class Line:
         step = arc[at + 1] - arc[at]
         share = np.clip((given[..., 0] - arc[at]) / step, 0.0, 1.0)
         blend = share[..., None]
-        ahead = (1.0 - blend) * self._ahead[at] + blend * self._ahead[at + 1]
+        ahead = (1.0 - blend) * self.ahead[at] + blend * self.ahead[at + 1]
         heading = np.arctan2(ahead[..., 1], ahead[..., 0])
         cos, sin, left = np.cos(heading), np.sin(heading), given[..., 1]
         beyond = given[..., 0] - arc[at] - share * step

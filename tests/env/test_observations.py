@@ -10,7 +10,7 @@ from worlds import cruise_scenario, moved, standing_tracks
 
 import shiftsim.env
 from shiftsim.env.driving import DrivingEnv
-from shiftsim.env.vector import LANE_STEP, METRES, ROUTE_STEP, SIZE, SPEED, parts_of, route_line
+from shiftsim.env.vector import LANE_STEP, METRES, ROUTE_STEP, SIZE, SPEED, greedy_line, parts_of
 from shiftsim.planners.learned.carl.planner import Carl
 from shiftsim.sim.planner import observe_log, scene_info
 from shiftsim.world.state import AgentKind, LightStatus, TrafficLights
@@ -139,10 +139,10 @@ def test_a_route_goes_on_where_lanes_do_not(source_of):
     scenario = cruise_scenario()
     road, center = scenario.map, np.array([11.0, 3.4, 0.0])
     scene = scene_info(scenario)
-    line = route_line(scene, [0, 1], center)  # block 1 lies beyond the connectors
+    line = greedy_line(scene, [0, 1], center)  # block 1 lies beyond the connectors
     np.testing.assert_allclose(line[[0, -1]], [[0.0, 3.5], [420.0, 3.5]])
     assert [road.blocks.ids[0], road.blocks.ids[1]] == ["1", "3"]
-    nowhere = route_line(scene, [], center)
+    nowhere = greedy_line(scene, [], center)
     np.testing.assert_allclose(nowhere, [[11.0, 3.4], [1011.0, 3.4]])
 
 

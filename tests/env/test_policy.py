@@ -125,7 +125,7 @@ def test_observations_of_ones_own_know_no_recording(toy, tmp_path):
     planner = shiftsim.policy_planner(lambda gap: seen.append(gap) or [0, 0], observation=Gap())
     shiftsim.simulate(scenario, planner)
     assert 0 < seen[-1] < seen[0]
-    with pytest.raises(AttributeError, match="'Sight' object has no attribute 'log'"):
+    with pytest.raises(AttributeError, match="'PlannerEpisode' object has no attribute 'log'"):
         shiftsim.simulate(scenario, shiftsim.policy_planner(len, observation=Recorded()))
 
 
