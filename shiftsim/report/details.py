@@ -196,14 +196,15 @@ def open_loop_scores(groups: Sequence[Group]) -> Table | None:
         "rollouts",
         "plans",
     )
+    rows = [_open_loop_row(group) for group in reversed(each.values())]
+    counts = dict.fromkeys(str(row[-1]) for row in rows if row[-1])
     notes = (
         "CLS: closed loop under that noise; open loop: nuPlan's score of the plans along the "
         "recording; errors: means over plans and horizons of 3, 5 and 8 s; missed: largest share "
         "of plans that are too far away; where plans were not compared, as the recording ends, "
         "the score is not nuPlan's",
-        "plans: compared ones of all",
+        f"plans compared: {', '.join(counts)}",
     )
-    rows = [_open_loop_row(group) for group in reversed(each.values())]
     title = "Open loop beside closed loop, scores × 100"
     best = dict.fromkeys(("CLS", "open loop"), max) | dict.fromkeys((*errors, "missed"), min)
     return Table("open-loop", title, header, rows, 4, notes, best=best)
