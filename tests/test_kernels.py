@@ -28,13 +28,14 @@ from shiftsim.data.readers.tracks.reader import TracksReader, convert_tracks
 from shiftsim.data.recording import visible_columns
 from shiftsim.data.store.check import survey_store
 from shiftsim.data.store.reading import ScenarioStore
+from shiftsim.edits import edited
 from shiftsim.files import PACKAGE
 from shiftsim.kernels import _is_trusted
 from shiftsim.metrics import compute_metrics
 from shiftsim.planners.registry import load_planner
 from shiftsim.planners.table import PLANNERS
 from shiftsim.sim.loop import simulate
-from shiftsim.sim.planner import Planner
+from shiftsim.sim.planner import Planner, scene_info
 from shiftsim.sim.traffic import _MODELS
 from shiftsim.train.traffic.realism import compare
 from shiftsim.train.traffic.states import compute_labels
@@ -109,8 +110,8 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
         # agents that look where the ego will be: one of them is beside it, another one far ahead
         places = [{"pose": [x, y, 0.0]} for x, y in ((230.0, 3.5), (190.0, 3.5), (260.0, 0.0))]
         van = {"at": {"ahead_m": 60.0, "left_m": 3.5}, "behavior": "stopped"}
-        edited = scenario.edited(agents="mixed", spawn=[*places, van])
-        simulate(edited, load("idm"), traffic="reactive")
+        crowded = edited(scenario, agents="mixed", spawn=[*places, van])
+        simulate(crowded, load("idm"), traffic="reactive")
 
     # a scripted planner needs a file, and has no kernels
     names = [name for name in PLANNERS if name != "scripted"]
@@ -131,6 +132,7 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
             ["a", "b", "c"],
             without="",
         ),
+        "lines": lambda: look_along(scenario),
         "nearest": lambda: nearest(scenario.map.edges.polygons, 0.0, 0.0, np.inf),
     }
 
@@ -141,6 +143,11 @@ def measure_realism(scenario: Scenario) -> None:
     poses = np.zeros((scenario.tracks.num_tracks, 3))
     away = np.zeros((len(poses), 2))
     compute_labels(scenario.tracks, 30, poses, np.zeros(len(poses)), away)
+
+
+def look_along(scenario: Scenario) -> None:
+    """Poses as seen from the line of a route."""
+    scene_info(scenario).route_line(scenario.ego[0, :3]).to_frenet(scenario.ego[:, :3])
 
 
 def num_kept() -> int:
