@@ -122,11 +122,19 @@ def bench(
 
     Raises:
         ShiftsimError: A setting is wrong, or something it names is missing.
+
+    Example:
+        ```python
+        runs = shiftsim.bench("state-drift", "idm", limit=1, noise="ou-high", seeds=0)
+        ```
     """
     from shiftsim.benchmarks import load_track
     from shiftsim.benchmarks.bench import plan_bench, run_bench
 
-    settings["planners"] = [planner] if isinstance(planner, str) else list(planner)
+    settings["planners"] = planner
+    for name in ("planners", "noise", "seeds"):
+        if isinstance(settings.get(name), (str, int)):
+            settings[name] = [settings[name]]
     plan = plan_bench(load_track(track), settings, reference=val14, out=str(out))
     done = run_bench(plan, **{"on_progress": on_progress} if on_progress else {})
     return [_with_methods(finished) for finished in done]
@@ -137,6 +145,12 @@ def merge(runs: Iterable[Any], *, out: str | None = None, allow_partial: bool = 
 
     Raises:
         ConfigError: Something is no shard, of another run, given twice or missing.
+
+    Example:
+        ```python
+        halves = [shiftsim.run("idm", shard=f"{part}/2", limit=2) for part in (1, 2)]
+        run = shiftsim.merge(halves)
+        ```
     """
     from shiftsim.runs.derive import merge_runs
 
@@ -164,6 +178,11 @@ def score_files(
 
     Raises:
         DataError: Something cannot be right; the message names row and number.
+
+    Example:
+        ```python
+        run = shiftsim.score_files("two/rollouts", tracks="recorded")
+        ```
     """
     from shiftsim.runs.derive import score_elsewhere
     from shiftsim.runs.rollouts.elsewhere import RECORDED, read_source

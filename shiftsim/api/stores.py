@@ -46,6 +46,11 @@ def convert_nuplan(
     Raises:
         DataError: There are no logs or no maps, or the store cannot be written.
         ConfigError: The filter asks for something that is not supported.
+
+    Example:
+        ```python
+        report = shiftsim.convert_nuplan("nuplan/logs", "nuplan/maps", "logs")
+        ```
     """
     from shiftsim.data.nuplan.convert import convert_nuplan
 
@@ -79,6 +84,11 @@ def convert_dsc3d(
     Raises:
         ConfigError: A threshold is unknown or out of range.
         ConversionError: None of the recordings can be converted.
+
+    Example:
+        ```python
+        report = shiftsim.convert_dsc3d("dsc3d/sindelfingen", "site", workers=1)
+        ```
     """
     from shiftsim.data.readers.dsc3d import Dsc3dReader
     from shiftsim.data.readers.windows import make_config
@@ -114,6 +124,11 @@ def convert_tracks(
     Raises:
         ConfigError: A column or a threshold is wrong.
         ConversionError: The tracks cannot be right, or give no scenario.
+
+    Example:
+        ```python
+        report = shiftsim.convert_tracks("tracks.csv", "map.xodr", "own")
+        ```
     """
     from shiftsim.data.readers.scenarios import EGO_CATEGORIES
     from shiftsim.data.readers.tracks.reader import TracksReader, convert_tracks
@@ -150,6 +165,11 @@ def convert_dataset(
     Raises:
         ConfigError: The data set, or what becomes the ego, is unknown.
         ConversionError: None of the scenes can be converted.
+
+    Example:
+        ```python
+        report = shiftsim.convert_dataset("commonroad", "commonroad", "scenes", workers=1)
+        ```
     """
     from shiftsim.data.readers.av2 import Av2Reader
     from shiftsim.data.readers.commonroad import CommonRoadReader
@@ -182,7 +202,13 @@ def convert_reader(
 
 
 def demo_store(store: str | Path = DEFAULT_STORE) -> ScenarioStore:
-    """The store of the demo; generated where it is not there yet."""
+    """The store of the demo; generated where it is not there yet.
+
+    Example:
+        ```python
+        store = shiftsim.demo_store()
+        ```
+    """
     from shiftsim.data.synthetic.store import demo_store
 
     return open_store(demo_store(store_path(store)))
@@ -207,6 +233,11 @@ def make_towns(
 
     Raises:
         ConfigError: The folder holds something else.
+
+    Example:
+        ```python
+        store = shiftsim.make_towns("towns", 1, seed=1)
+        ```
     """
     from shiftsim.data.synthetic.store import write_towns
     from shiftsim.runs.config import default_workers

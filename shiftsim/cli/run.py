@@ -402,7 +402,7 @@ def demo(
         raise ConfigError("--seed is of random towns only", hint="say how many with --towns")
     from shiftsim.api import DEMO
 
-    folder = out or store_path(DEFAULT_STORE)
+    folder = out.absolute() if out else store_path(DEFAULT_STORE)
     if not folder.exists():
         echo(f"generating and converting recordings, compiling kernels → {folder}")
         shiftsim.demo_store(folder)
@@ -414,7 +414,7 @@ def demo(
     try:
         run_settings(values, "demo", quiet=quiet)
     finally:
-        named = f" --store {folder}" if out else ""
+        named = f" --store {out}" if out else ""
         echo("\nnext:")
         echo(f"  shiftsim run --planner idm --noise awgn-mid --seeds 0,1,2{named}")
         echo(f"  shiftsim run --planner my_package.my_module:MyPlanner{named}")
@@ -429,14 +429,14 @@ def _make_towns(
     """Generate, convert and filter random towns."""
     if "limit" in settings:
         raise ConfigError("--limit is of runs, --towns runs nothing", hint="leave one of them out")
-    folder = out or store_path(f"towns-{seed}")
-    workers = settings.get("workers", 0)
-    echo(f"generating and converting {plural(towns, 'town')} of seed {seed} → {folder}")
+    folder = out.absolute() if out else store_path(f"towns-{seed}")
+    shown, workers = out or folder, settings.get("workers", 0)
+    echo(f"generating and converting {plural(towns, 'town')} of seed {seed} → {shown}")
     with progress_bar(quiet=quiet) as advance:
         store = shiftsim.make_towns(folder, towns, seed=seed, workers=workers, on_progress=advance)
     echo("driving every scenario as recorded, to leave out those that cannot be driven so")
     with progress_bar(quiet=quiet) as advance:
         found = store.filter(workers=workers, on_progress=advance)
     counts = found.counts()
-    echo(f" {counts['accepted']} of {plural(len(found.rows), 'scenario')} accepted → {folder}")
-    echo(f" next: shiftsim run --planner log-future --store {folder} --limit 20")
+    echo(f" {counts['accepted']} of {plural(len(found.rows), 'scenario')} accepted → {shown}")
+    echo(f" next: shiftsim run --planner log-future --store {shown} --limit 20")

@@ -33,6 +33,7 @@ from doc_pages import (
     shiftsim_calls,
     table_below,
 )
+from open_data_files import write_commonroad
 from track_files import table_of, write_tracks
 
 import shiftsim
@@ -99,6 +100,7 @@ def material(tmp_path_factory: pytest.TempPathFactory) -> Path:
     golden = REPOSITORY / "tests" / "golden" / "nuplan_format"
     for name in ("logs", "maps"):
         shutil.copytree(golden / name, folder / "nuplan" / name)
+    write_commonroad(folder / "commonroad")
     _write_results(folder, golden.parent)
     if importlib.util.find_spec("torch"):
         from checkpoint_files import state_of, write_published
