@@ -54,7 +54,7 @@ def save_picture(figure: Any, path: Path) -> None:
 RECORDED = "#1f1f1f"  # the recorded driver
 ALARM = "#b00020"  # violations
 AGENTS = {
-    AgentKind.VEHICLE: "#8797a8",
+    AgentKind.VEHICLE: "#566b80",
     AgentKind.PEDESTRIAN: "#a8791e",
     AgentKind.BICYCLE: "#8a5f9e",
 }

@@ -28,6 +28,11 @@ REASONS = NAMES | {  # what went wrong
 }
 # what the headings of columns are short for, in the order of the columns
 LONG = {"CLS": "closed-loop score"} | {SHORT_NAMES[name]: words for name, words in NAMES.items()}
+_HOW_FAR = {  # what the first value of a violation measures
+    "drivable_area_compliance": ("outside",),
+    "driving_direction_compliance": ("against traffic",),
+    "speed_limit_compliance": ("over the limit",),
+}
 UNITS = {  # nuPlan's names, shortened
     "meters": "m",
     "seconds": "s",
@@ -82,7 +87,9 @@ def violation_words(row: Mapping[str, Any], tracks: Tracks) -> str:
         if row["metric"] == COLLISIONS:  # the speed by which it changes is kept here
             words.append(f"Δv {value:.1f} m/s")
         elif unit:
-            words.append(f"{value:.3g} {unit}" if abs(value) >= 0.01 else f"under 0.01 {unit}")
+            number = f"{value:.2f}" if abs(value) < 1.0 else f"{float(f'{value:.2g}'):g}"
+            number = number if abs(value) >= 0.01 else "under 0.01"
+            words.append(" ".join([number, unit, *_HOW_FAR.get(row["metric"], ())]))
     return ", ".join(words)
 
 

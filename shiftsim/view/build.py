@@ -172,6 +172,16 @@ class Gallery:
             out.append(ShownRollout(task.planner, task.noise, task.seed, log, cls, one.metrics))
         return out
 
+    def settings_words(self, token: str, part: int = 0) -> str:
+        """How the rollouts of a page were driven and scored."""
+        manifests = [self._rollouts[task].run.manifest for task in self.tasks(token, part)]
+        words = (
+            f"traffic {made['config']['traffic']} · controller {made['config']['controller']} · "
+            f"thresholds {made['config']['thresholds']} · shiftsim {made['versions']['shiftsim']}"
+            for made in manifests
+        )
+        return "; ".join(dict.fromkeys(words))
+
     def pages(self, token: str, *, back: str = "") -> dict[str, Page]:
         """The replays of one scenario as HTML by file name, all rollouts that can be drawn.
 
@@ -186,7 +196,10 @@ class Gallery:
         out = {}
         for part, (_, name) in enumerate(links):
             more = {"parts": links if len(links) > 1 else [], "part": part}
-            more |= {"shown": self.shown_words(token, part)}
+            more |= {
+                "shown": self.shown_words(token, part),
+                "settings": self.settings_words(token, part),
+            }
             out[name] = replay_page(
                 scenario, self.shown(token, scenario, part), back=back, more=more
             )
@@ -196,7 +209,8 @@ class Gallery:
         """The first replay of one scenario as HTML, alone."""
         scenario = self.store.read(token)
         shown = self.shown(token, scenario)
-        return replay_page(scenario, shown, more={"shown": self.shown_words(token)})
+        more = {"shown": self.shown_words(token), "settings": self.settings_words(token)}
+        return replay_page(scenario, shown, more=more)
 
     def rows(self, token: str, *, with_pages: bool = True) -> list[dict[str, Any]]:
         """Rows of the scenario list: labels, scores and violated metrics of every rollout."""

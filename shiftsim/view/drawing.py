@@ -21,12 +21,12 @@ from shiftsim.world.state import PACIFICA, AgentKind, center_poses
 
 SMALL = 8  # points, of most words
 _AREAS = {  # what is drawn first lies below
-    "walkway": "#ece6d8",
-    "drivable": "#dcdcd8",
-    "route": "#b9d2be",
+    "walkway": "#e8e0cc",
+    "drivable": "#c9cbca",
+    "route": "#98b8a2",
     "crosswalk": "#f7f4ea",
 }
-_LINES = {"boundary": "#a9a9a3"}
+_LINES = {"boundary": "#8d908d"}
 BURST = (8, 1, 0)  # where something went wrong: no planner has this mark
 _EVERY = 50  # samples from mark to mark
 _EDGE = "#30363c"

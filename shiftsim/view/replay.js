@@ -8,6 +8,7 @@ const CLEAN = [];
 const NOISY = [7, 5];
 const EXPERT = "#1f1f1f";
 const CLOSE = 14; // pixels per metre at least where a violation is looked at
+const AROUND = 15; // m around the path that the page opens with
 const LENGTH_CLEAR = 4.2; // m that no ego reaches from its rear axle
 const TOLD = 2; // s that the words of a violation stay
 const FADE = 500; // ms in which whole plans appear once a moment is chosen
@@ -28,7 +29,9 @@ const state = {
   scale: 6,
   centre: null,
   told: [], // the words of violations on the canvas
+  pins: [], // [x, y, words] of every violation there
 };
+let chosen = null; // the violation that was jumped to
 let zoomed = false; // whether the link said how near
 let planned = 0; // how much of the plans beyond their first second is seen, 0 to 1
 const rollouts = meta.rollouts.map(() => null); // fields, once decoded
@@ -56,6 +59,7 @@ function sampleAt(t) {
 function seek(t) {
   state.t = Math.min(Math.max(t, 0), duration());
   byId("time").value = state.t;
+  byId("time").setAttribute("aria-valuetext", `${state.t.toFixed(1)} seconds`);
   if (state.playing) return draw();
   saveState();
   fadePlans();
@@ -123,9 +127,10 @@ function nextViolation() {
 
 function jumpTo(violation) {
   pause();
+  say(`${violation.t.toFixed(1)} s, ${labelOf(meta.rollouts[violation.index])}: ${violation.words}`);
   setFocus(violation.index);
   highlight(violation);
-  state.follow = true;
+  [state.follow, state.centre] = [true, null];
   state.scale = Math.max(state.scale, CLOSE);
   syncOptions();
   seek(violation.t);
@@ -133,6 +138,7 @@ function jumpTo(violation) {
 
 function highlight(violation) {
   const names = tracksOf(violation.index).names;
+  chosen = violation;
   highlighted = violation.partner ? names.indexOf(violation.partner) : -1;
 }
 
@@ -213,7 +219,7 @@ function egoPose(index, at) {
 function draw() {
   if (!panels) return;
   const at = sampleAt(state.t);
-  state.told = [];
+  [state.told, state.pins] = [[], []];
   const ratio = window.devicePixelRatio || 1;
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   context.fillStyle = "#ffffff";
@@ -258,12 +264,19 @@ function drawPanel(panel, members, leading, at) {
     drawEgo(context, pose, meta.vehicle, panel, rollout.colour, index === leading, isNoisy(rollout) ? [4, 3] : []);
     const reach = meta.vehicle[2];
     const where = [pose[0] + reach * Math.cos(pose[2]), pose[1] + reach * Math.sin(pose[2])];
-    drawMarker(context, rollout.marker, ...panel.toScreen(...where), 5, rollout.colour, isNoisy(rollout));
+    const place = panel.toScreen(...where);
+    drawDisc(context, ...place, 7.5); // so that the marker looks as in the list
+    drawMarker(context, rollout.marker, ...place, 5, rollout.colour, isNoisy(rollout));
   }
-  const told = order.reverse().flatMap((index) => violatedNow(panel, index));
+  const violated = order.reverse().flatMap((index) => violatedNow(panel, index));
   // what words may not cover: [left, top, right, bottom]
-  const taken = told.map(({ x, y }) => [x - 10, y - 10, x + 10, y + 10]);
-  for (const one of told) tellViolation(panel, one, taken);
+  const taken = violated.map(({ x, y }) => [x - 10, y - 10, x + 10, y + 10]);
+  const told = toldOf(violated.filter(({ index }) => index === leading));
+  for (const one of violated.filter((item) => item !== told)) {
+    drawMarker(context, "burst", one.x, one.y, 6, ALARM);
+  }
+  if (told) tellViolation(panel, told, taken);
+  state.pins.push(...violated.map(({ item, index, x, y }) => [x, y, `${labelOf(meta.rollouts[index])}: ${item.words}`]));
   if (state.side) captionPanel(panel, meta.rollouts[leading], rollouts[leading], at);
 }
 
@@ -275,6 +288,13 @@ function violatedNow(panel, index) {
       const [x, y] = panel.toScreen(...egoPose(index, sampleAt(item.t)).slice(0, 2));
       return { item, index, x, y };
     });
+}
+
+// the one of them that is told in words: that which was jumped to, else the latest
+function toldOf(violated) {
+  const latest = Math.max(...violated.map(({ item }) => item.t));
+  const isChosen = ({ item }) => chosen && item.t === chosen.t && item.metric === chosen.metric;
+  return violated.find(isChosen) || violated.find(({ item }) => item.t === latest);
 }
 
 // the mark of a violation, and its words beside it in a place of their own
@@ -471,7 +491,7 @@ function listLegend() {
   for (const kind of fields.get("tracks.kind").data) used.add(kind);
   const entries = [...used].sort().map((kind) => [AGENT_COLOURS[kind], KIND_NAMES[kind]]);
   if (meta.edited.length) entries.push([EDITED, "edited"]);
-  entries.push(["#cfe0d2", "route"], [MAP_COLOURS.crosswalk, "crosswalk"]);
+  entries.push(["#98b8a2", "route"], [MAP_COLOURS.crosswalk, "crosswalk"]);
   for (const [colour, text] of entries) {
     const item = document.createElement("span");
     const sample = document.createElement("i");
@@ -489,7 +509,7 @@ function syncOptions() {
 }
 
 function setOption(name, on) {
-  if (name === "follow" && !on) state.centre = [...panels[0].panel.centre];
+  if (name === "follow") state.centre = on ? null : [...panels[0].panel.centre];
   if (OPTIONS.includes(name)) state[name] = on;
   else {
     map.layers[name] = on;
@@ -500,10 +520,31 @@ function setOption(name, on) {
   saveState();
 }
 
+// a scale within its bounds, as the link has it
+function rounded(scale) {
+  return Number(Math.min(Math.max(scale, MIN_SCALE), MAX_SCALE).toFixed(2));
+}
+
+// the view of the whole path in focus, and 15 m around it
+function fit() {
+  const xy = [...rollouts[state.focus].get("ego.xy").data];
+  const ends = [0, 1].map((axis) => {
+    const values = xy.filter((value, i) => i % 2 === axis && Number.isFinite(value));
+    return [Math.min(...values) - AROUND, Math.max(...values) + AROUND];
+  });
+  const { width, height } = panels[0].panel;
+  const scale = Math.min(width / (ends[0][1] - ends[0][0]), height / (ends[1][1] - ends[1][0]));
+  state.scale = rounded(scale);
+  state.centre = ends.map(([low, high]) => Number(((low + high) / 2).toFixed(1)));
+  state.follow = false;
+  syncOptions();
+  draw();
+}
+
 function zoom(factor, px, py) {
   const { panel } = panels.find(({ panel: p }) => inside(p, px, py)) || panels[0];
   const [x, y] = panel.toWorld(px, py);
-  state.scale = Math.min(Math.max(state.scale * factor, MIN_SCALE), MAX_SCALE);
+  state.scale = rounded(state.scale * factor);
   if (!state.follow) {
     panel.scale = state.scale;
     const [after, aside] = panel.toWorld(px, py);
@@ -552,6 +593,8 @@ function hover(event) {
 }
 
 function describeAt({ panel, members }, px, py) {
+  const pins = state.pins.filter(([x, y]) => Math.hypot(x - px, y - py) < 10);
+  if (pins.length) return pins.map((pin) => pin[2]).join("; ");
   const leading = members.includes(state.focus) ? state.focus : members[0];
   const { fields, names } = tracksOf(leading);
   const [x, y] = panel.toWorld(px, py);
@@ -592,7 +635,10 @@ const KEYS = {
   p: () => setOption("plans", !state.plans),
   r: () => setOption("route", !map.layers.route),
   l: () => setOption("lanes", !map.layers.lanes),
-  "?": () => byId("keys").toggleAttribute("open"),
+  "?": () => (byId("keys").open ? byId("keys").close() : byId("keys").showModal()),
+  0: fit,
+  c: copyLink,
+  s: savePicture,
   a: () => setFocus((state.focus + 1) % rollouts.length),
   "+": () => zoom(1.25, canvas.clientWidth / 2, canvas.clientHeight / 2),
   "=": () => zoom(1.25, canvas.clientWidth / 2, canvas.clientHeight / 2),
@@ -615,6 +661,9 @@ function connect() {
   byId("back1").addEventListener("click", () => stepBy(-1));
   byId("next1").addEventListener("click", () => stepBy(1));
   byId("violation").addEventListener("click", nextViolation);
+  byId("help").addEventListener("click", KEYS["?"]);
+  byId("copy").addEventListener("click", copyLink);
+  byId("save").addEventListener("click", savePicture);
   byId("time").max = duration();
   byId("time").addEventListener("input", (e) => seek(Number(e.target.value)));
   byId("time").addEventListener("pointerdown", pause);
@@ -658,9 +707,34 @@ function connect() {
   });
 }
 
+// for those who hear the page
+function say(words) {
+  byId("said").textContent = words;
+}
+
 // ---- the link carries the state ----
 
+async function copyLink() {
+  saveState();
+  try {
+    await navigator.clipboard.writeText(location.href);
+    say("link copied");
+  } catch {
+    return window.prompt("the link to this moment", location.href); // no clipboard here
+  }
+  byId("copy").textContent = "copied";
+  setTimeout(() => (byId("copy").textContent = "copy link"), 1500);
+}
+
+function savePicture() {
+  const link = document.createElement("a");
+  link.download = `${meta.token}-${state.t.toFixed(2)}s.png`;
+  link.href = canvas.toDataURL("image/png");
+  link.click();
+}
+
 let written = "";
+let linked = false; // whether the address says what to show
 function saveState() {
   const shown = state.shown.map((on, i) => (on ? i + 1 : 0)).filter(Boolean);
   const parts = [`t=${state.t.toFixed(2)}`, `on=${shown}`, `focus=${state.focus + 1}`];
@@ -677,6 +751,7 @@ function saveState() {
 
 async function loadState() {
   const given = new URLSearchParams(location.hash.slice(1));
+  linked = ["t", "zoom", "at"].some((name) => given.has(name));
   const number = (name, fallback) => {
     const value = Number.parseFloat(given.get(name));
     return Number.isFinite(value) ? value : fallback;
@@ -701,6 +776,7 @@ async function loadState() {
 async function start() {
   byId("token").textContent = meta.token;
   byId("about").textContent = [meta.type, meta.city, meta.log].filter(Boolean).join(" · ");
+  byId("settings").textContent = meta.settings || "";
   for (const line of meta.edits) {
     const item = document.createElement("li");
     item.textContent = line;
@@ -730,6 +806,7 @@ async function start() {
   byId("time").value = state.t;
   highlightNow();
   changed();
+  if (!linked) fit();
   fadePlans();
   window.firstFrame = performance.now(); // ms since the page was opened
   document.documentElement.dataset.ready = "1";

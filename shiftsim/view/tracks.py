@@ -78,7 +78,7 @@ def _words(inspection: TracksReader, egos: Egos) -> list[str]:
 def _draw_panel(axes: Any, inspection: TracksReader, egos: Egos, extent: FloatArray) -> None:
     pad = _MARGIN * max(float((extent[2:] - extent[:2]).max()), 10.0)
     box = box_around([extent.reshape(2, 2)], pad)
-    draw_map(axes, inspection.road, (), box, {"drivable": "#dcdcd8"}, {"centre": "#b8b8b2"})
+    draw_map(axes, inspection.road, (), box, {"drivable": "#c9cbca"}, {"centre": "#b8b8b2"})
     _draw_directions(axes, inspection.road, box)
     _draw_tracks(axes, inspection.table)
     _draw_egos(axes, egos)

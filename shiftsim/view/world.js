@@ -4,15 +4,15 @@
 
 const MAP_COLOURS = {
   ground: "#f6f5f1",
-  walkway: "#ece6d8",
-  drivable: "#dcdcd8",
-  route: "rgba(94, 160, 110, 0.30)",
+  walkway: "#e8e0cc",
+  drivable: "#c9cbca",
+  route: "rgba(64, 150, 90, 0.36)",
   crosswalk: "#f7f4ea",
   stop: "rgba(196, 80, 70, 0.25)",
-  boundary: "#a9a9a3",
-  centre: "#c3c3bd",
+  boundary: "#8d908d",
+  centre: "#f4f4f1",
 };
-const AGENT_COLOURS = ["#8797a8", "#a8791e", "#8a5f9e", "#8f8f8f", "#8f8f8f", "#8f8f8f", "#8f8f8f"];
+const AGENT_COLOURS = ["#566b80", "#a8791e", "#8a5f9e", "#8f8f8f", "#8f8f8f", "#8f8f8f", "#8f8f8f"];
 const EDITED = "#7b2fbf"; // what an edit made or moved
 const ALARM = "#b00020"; // violations
 const AGENT_EDGE = "#3d4650";
@@ -330,6 +330,13 @@ function star(r, points = 5) {
     const reach = k % 2 ? r * 0.45 : r;
     return [reach * Math.sin((k * Math.PI) / points), -reach * Math.cos((k * Math.PI) / points)];
   });
+}
+
+function drawDisc(context, x, y, radius) {
+  context.beginPath();
+  context.arc(x, y, radius, 0, 2 * Math.PI);
+  context.fillStyle = "#ffffff";
+  context.fill();
 }
 
 // full for a clean rollout, hollow for a disturbed one
