@@ -22,11 +22,7 @@ _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 
 
 class Database:
-    """An open file. Made by `open_database`.
-
-    Attributes:
-        path: The file.
-    """
+    """An open file. Made by `open_database`."""
 
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
         self.path = path

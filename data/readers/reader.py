@@ -34,19 +34,12 @@ class SourceRecording:
 
 
 class Reader(ABC):
-    """A source of recordings. It must pickle.
+    """A source of recordings. It must pickle."""
 
-    Attributes:
-        name: Name of the site or of the data set.
-        source: Where it is.
-        site: The map that all recordings share, whose report the store gets; None without one.
-        settings: What the result depends on beside the files, JSON values only.
-    """
-
-    name: str
-    source: Path
-    site: BuiltMap | None
-    settings: Mapping[str, Any]
+    name: str  # of the site or of the data set
+    source: Path  # where it is
+    site: BuiltMap | None  # the map that all recordings share, whose report the store gets
+    settings: Mapping[str, Any]  # what the result depends on beside the files, JSON values only
 
     @abstractmethod
     def recordings(self) -> Sequence[str]:

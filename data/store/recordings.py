@@ -137,20 +137,10 @@ def _as_type(values: np.ndarray, kind: pa.DataType) -> np.ndarray:
 
 
 class StoredRecording:
-    """Open files of one recording; its rows are read when asked for.
-
-    Attributes:
-        log_name: Its name.
-        city: Map it was recorded on.
-        tracks: Rows of `schema.TRACKS`.
-    """
+    """Open files of one recording; its rows are read when asked for."""
 
     def __init__(self, folder: Path, log_name: str, city: str) -> None:
-        """Open the files.
-
-        Raises:
-            DataError: A file or a column is missing, or is damaged.
-        """
+        """Open the files; a DataError where one is missing or damaged."""
         self.log_name, self.city = log_name, city
         self.frames = Table(folder / FRAMES, schema.FRAMES)
         self.lights = Table(folder / LIGHTS, schema.LIGHTS)

@@ -162,12 +162,7 @@ def write_json(path: Path, content: object) -> None:
 
 
 class Table:
-    """An open Parquet file of a store.
-
-    Attributes:
-        path: The file.
-        footer: Content of the footer; empty where there is none.
-    """
+    """An open Parquet file of a store, and its `footer`, empty where there is none."""
 
     def __init__(self, path: Path, expected: pa.Schema) -> None:
         self.path = path
