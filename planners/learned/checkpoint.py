@@ -21,14 +21,8 @@ from typing import Any, NamedTuple, TypeAlias
 from shiftsim.errors import CheckpointError, ConfigError, MissingExtraError, nearest
 from shiftsim.files import checkpoint_folder, expand
 from shiftsim.planners import table
+from shiftsim.planners.learned import reader
 from shiftsim.planners.learned.deterministic import network_weights
-from shiftsim.planners.learned.reader import (
-    ARGS_HINT,
-    Contents,
-    read_contents,
-    read_json_object,
-    unreadable,
-)
 from shiftsim.planners.table import OFFICIAL, PUBLISHED, SHIPPED, SHIPPED_NOTE
 from shiftsim.world.ranges import CHECKPOINT
 
@@ -177,7 +171,7 @@ def how_to_get(planner: str) -> str:
 
 def open_checkpoint(path: Path) -> Checkpoint:
     """The weights in a file, whatever planner they are of; else a CheckpointError."""
-    contents = read_contents(path)
+    contents = reader.read_contents(path)
     entry = next((e for e in _ENTRIES if isinstance(contents.entries.get(e), dict)), "")
     holder = contents.entries[entry] if entry else contents.entries
     tensors = {str(name): value for name, value in holder.items() if hasattr(value, "as_strided")}
@@ -217,17 +211,17 @@ def _without_prefixes(tensors: dict[str, Any]) -> dict[str, Any]:
     return state
 
 
-def _args_of(path: Path, contents: Contents) -> dict[str, Any] | None:
+def _args_of(path: Path, contents: reader.Contents) -> dict[str, Any] | None:
     """Settings in the file's own metadata, or in `args.json` beside it."""
     if "args" in contents.metadata:
         try:
             value = json.loads(contents.metadata["args"])
         except (ValueError, RecursionError) as error:
             what = f"checkpoint {str(path)!r}: args in it are not JSON"
-            raise CheckpointError(what, ARGS_HINT) from error
+            raise CheckpointError(what, reader.ARGS_HINT) from error
         return value if isinstance(value, dict) else None
     beside = path.parent / "args.json"
-    return read_json_object(beside) if beside.is_file() else None
+    return reader.read_json_object(beside) if beside.is_file() else None
 
 
 def needed_args(found: Checkpoint, planner: str) -> dict[str, Any] | None:
@@ -352,7 +346,7 @@ def file_hash(path: Path) -> str:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise unreadable(path, error) from error
+        raise reader.unreadable(path, error) from error
 
 
 def _fingerprint(spec: str, planner: str) -> str:

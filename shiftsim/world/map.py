@@ -14,12 +14,7 @@ import shapely
 
 from shiftsim.errors import MapError, one_of
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, readonly
-from shiftsim.world.layers import (
-    Layer,
-    Lists,
-    Polylines,
-    project_on_line,
-)
+from shiftsim.world import layers
 
 NONE = -1  # "no such object" in index arrays
 LAYERS = (
@@ -84,37 +79,37 @@ class VectorMap:
 
     name: str
     epsg: int
-    edges: Layer
+    edges: layers.Layer
     num_lanes: int
-    baselines: Polylines
-    left_boundaries: Polylines
-    right_boundaries: Polylines
+    baselines: layers.Polylines
+    left_boundaries: layers.Polylines
+    right_boundaries: layers.Polylines
     boundary_ids: tuple[tuple[str, str], ...]
     speed_limits: FloatArray
     lane_index: IntArray
     left_lane: IntArray
     right_lane: IntArray
-    incoming: Lists
-    outgoing: Lists
+    incoming: layers.Lists
+    outgoing: layers.Lists
     block_of: IntArray
     has_traffic_lights: BoolArray
-    stop_lines: Lists
+    stop_lines: layers.Lists
     intersection_of: IntArray
     turn_type: IntArray
     is_bike: BoolArray
-    blocks: Layer
+    blocks: layers.Layer
     num_roadblocks: int
-    block_edges: Lists
-    block_incoming: Lists
-    block_outgoing: Lists
-    intersections: Layer
+    block_edges: layers.Lists
+    block_incoming: layers.Lists
+    block_outgoing: layers.Lists
+    intersections: layers.Layer
     intersection_kinds: IntArray
-    stop_polygons: Layer
+    stop_polygons: layers.Layer
     stop_kinds: IntArray
-    crosswalks: Layer
-    walkways: Layer
-    car_parks: Layer
-    drivable_areas: Layer
+    crosswalks: layers.Layer
+    walkways: layers.Layer
+    car_parks: layers.Layer
+    drivable_areas: layers.Layer
     flaws: dict[str, int] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
@@ -183,13 +178,13 @@ class VectorMap:
         """
         return self._layer(layer).meeting(area)
 
-    def _layer(self, name: str) -> Layer:
-        found: Layer = getattr(self, one_of("map layer", name, LAYERS))
+    def _layer(self, name: str) -> layers.Layer:
+        found: layers.Layer = getattr(self, one_of("map layer", name, LAYERS))
         return found
 
     def progress_on(self, edge: int, x: float, y: float) -> float:
         """Arc length of the projection of a point on the baseline of an edge [m]."""
-        return float(project_on_line(self.baselines, edge, x, y))
+        return float(layers.project_on_line(self.baselines, edge, x, y))
 
 
 MAPS_KEPT = 4  # per kind of arrays; a run rarely visits more maps at a time
