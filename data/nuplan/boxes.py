@@ -29,11 +29,7 @@ class Boxes:
 
 
 def read_boxes(log: Log, first: int, last: int, flaws: Counter[str] | None = None) -> Boxes:
-    """Objects of the rows first … last - 1.
-
-    Raises:
-        ConversionError: A category is unknown, or a pose or a size is no finite number.
-    """
+    """Objects of the rows first … last - 1; else a ConversionError."""
     row, rows = read_rows(
         log,
         first,

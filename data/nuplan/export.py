@@ -112,10 +112,7 @@ def read_with_surroundings(store: ScenarioStore, token: str) -> Scenario:
     """A scenario with as many rows before and after its iterations as a conversion keeps.
 
     These are rows of its recording, as far as the ego was recorded there: those that its window
-    leaves out, too.
-
-    Raises:
-        DataError: The store is damaged.
+    leaves out, too. Raises DataError: the store is damaged.
     """
     shown, window = store.read(token), store.window(token)
     stored, trace = store.recording(window.log_name), store.ego(window.log_name, window.ego)

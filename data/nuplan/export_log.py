@@ -108,11 +108,7 @@ def log_token(text: str) -> bytes:
 
 
 def connector_number(scenario: Scenario, name: str) -> int:
-    """The id of a lane connector that a traffic light of a scenario names.
-
-    Raises:
-        ConversionError: It is no integer.
-    """
+    """The id of a lane connector that a light names; a ConversionError where it is no integer."""
     try:
         return int(name)
     except ValueError as error:
@@ -125,11 +121,9 @@ def connector_number(scenario: Scenario, name: str) -> int:
 def write_nuplan_log(path: Path, scenario: Scenario, *, epsg: int) -> Mapping:
     """Write one scenario as a log: five scenes, of which the middle one holds all rows.
 
-    The file's name is the log's. Returns the mapping that cuts the scenario out again.
-
-    Raises:
-        ConversionError: A light belongs to a connector without an integer id, or the iterations
-            are not evenly spaced rows.
+    The file's name is the log's. Returns the mapping that cuts the scenario out again. Raises
+    ConversionError: a light belongs to a connector without an integer id, or the iterations are not
+    evenly spaced rows.
     """
     log = _Log(path.stem, scenario, epsg)
     place = (pickle.dumps(values, _PICKLE) for values in ([0.0] * 3, [1.0, 0.0, 0.0, 0.0]))

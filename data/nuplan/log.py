@@ -75,11 +75,7 @@ class Log:
 
 @contextmanager
 def open_log(path: Path) -> Iterator[Log]:
-    """Open a log and read its clock.
-
-    Raises:
-        DataError: The file is broken, or a table, column or the merged point cloud is missing.
-    """
+    """Open a log and read its clock; a DataError where it is broken or lacks something."""
     with open_database(Path(path)) as database:
         for table, columns in _TABLES.items():
             database.require(table, columns.split())

@@ -145,10 +145,8 @@ def cut_window(
     """The rows of a scenario; the window counts rows from the start of the log.
 
     `token` names the anchor row; where `mapping` is None, it is nuPlan's for the type. That is the
-    anchor's own where `scenario_type` is None.
-
-    Raises:
-        ConversionError: The log does not have the token, or too few rows there.
+    anchor's own where `scenario_type` is None. Raises ConversionError: the log does not have the
+    token, or too few rows there.
     """
     if token not in log.row_of:
         raise ConversionError(f"{log.path}: there is no lidar_pc {token!r}", hint="check the token")
@@ -206,11 +204,7 @@ def read_span(
 
 
 def find_maps(folder: Path) -> dict[str, Path]:
-    """Files `map.gpkg` of a folder of nuPlan maps, by map name.
-
-    Raises:
-        DataError: There is no index file, or it is broken or names a missing map.
-    """
+    """Files `map.gpkg` by map name; a DataError where the index is missing or broken."""
     indexes = sorted(folder.glob("*maps*.json"))
     if not indexes:
         raise DataError(
@@ -230,11 +224,7 @@ def find_maps(folder: Path) -> dict[str, Path]:
 
 
 def load_map(maps: dict[str, Path], name: str) -> VectorMap:
-    """Read one of the maps found by `find_maps`.
-
-    Raises:
-        DataError: There is no such map.
-    """
+    """One of the maps found by `find_maps`, or a DataError."""
     if name not in maps:
         raise DataError(
             f"there is no map {name!r} in the map folder", hint=f"found: {', '.join(sorted(maps))}"

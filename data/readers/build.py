@@ -253,8 +253,7 @@ def _track_categories(
 ) -> tuple[str, ...]:
     """N most frequent category of every track; `category` (A,) are indices of `names`.
 
-    Raises:
-        ConversionError: One is not among the `known`.
+    Raises ConversionError: one is not among the `known`.
     """
     pairs, votes = np.unique(track * len(names) + category, return_counts=True)
     voted_track, voted = np.divmod(pairs, len(names))

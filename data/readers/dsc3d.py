@@ -195,11 +195,7 @@ def open_site(src: Path) -> Site:
 
 
 def find_map(site: Site, given: Path | None = None) -> Path:
-    """The OpenDRIVE file of a site: `map/map.xodr`, any file in `map/`, or `map.xodr` at the top.
-
-    Raises:
-        ConversionError: There is none.
-    """
+    """The map of a site, or a ConversionError: `map/map.xodr`, any in `map/`, or `map.xodr`."""
     if given is not None:
         if not given.is_file():
             raise ConversionError(f"map {given} does not exist", "check the path")

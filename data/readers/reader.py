@@ -43,11 +43,7 @@ class Reader(ABC):
 
     @abstractmethod
     def recordings(self) -> Sequence[str]:
-        """Names of the recordings, in the order in which they are reported.
-
-        Raises:
-            ConversionError: There is none.
-        """
+        """Names of the recordings, in the order of the report; a ConversionError without any."""
 
     @abstractmethod
     def files(self, recording: str) -> Sequence[Path]:
@@ -55,27 +51,18 @@ class Reader(ABC):
 
     @abstractmethod
     def read(self, recording: str) -> SourceRecording:
-        """One recording.
-
-        Raises:
-            DataError: A file is missing or broken, or contradicts itself.
-        """
+        """One recording; a DataError where a file is missing or broken, or contradicts itself."""
 
     def summarise(self, entries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         """What the report says of all recordings, from the entry of each, details included.
 
-        Raises:
-            ConversionError: They and the map contradict each other; nothing is written then.
+        Raises ConversionError: they and the map contradict each other; nothing is written then.
         """
         return {}
 
 
 def opendrive_site(drive: OpenDrive, *, name: str, **how: Any) -> BuiltMap:
-    """The map of a site from OpenDRIVE; `how` as for `build_road_map`.
-
-    Raises:
-        ConversionError: It has no lane that cars may use.
-    """
+    """The map of a site from OpenDRIVE, as `build_road_map`; else a ConversionError."""
     road, report = build_road_map(drive, name=name, **how)
     require_lanes(drive, report)
     return site_map(road, report.warnings)

@@ -145,11 +145,7 @@ _REMEDIES = {
 
 
 def require_scenarios(summary: RecordingSummary, source: Path) -> None:
-    """Raise an error if a recording has no scenario.
-
-    Raises:
-        ConversionError: It has none; the rule that dropped most of the egos, and a remedy.
-    """
+    """A ConversionError if a recording has no scenario, with the rule that dropped most egos."""
     if summary.accepted:
         return
     if not summary.seen:

@@ -183,11 +183,7 @@ class ScenarioStore:
         return self._maps[city]
 
     def failed_checks(self) -> Iterator[tuple[Path, dict[str, int]]]:
-        """Reports of maps that failed checks when they were made, and which: count by kind.
-
-        Raises:
-            DataError: A report is damaged.
-        """
+        """Reports of maps that failed checks when they were made, and which: count by kind."""
         for name in tables.read_manifest(self.path)["files"]:
             if not name.startswith(f"{tables.REPORTS}/"):
                 continue

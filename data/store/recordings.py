@@ -20,11 +20,7 @@ _Choice: TypeAlias = Callable[[BoolArray, IntArray, Sequence[str]], IntArray]
 
 
 def write_recording(folder: Path, recording: Recording) -> None:
-    """Write frames, lights and tracks of a recording.
-
-    Raises:
-        DataError: Its arrays do not fit together, or hold a number outside of its range.
-    """
+    """Write frames, lights and tracks of a recording; a DataError where numbers do not fit."""
     count, tracks = len(recording.time_us), recording.tracks
     shape = (count, len(tracks.tokens))
     _require(
@@ -52,11 +48,7 @@ def write_recording(folder: Path, recording: Recording) -> None:
 
 
 def write_ego(folder: Path, ego: EgoTrace) -> None:
-    """Write the states of one ego.
-
-    Raises:
-        DataError: A number is outside of its range.
-    """
+    """Write the states of one ego; a DataError where a number is outside of its range."""
     path = tables.ego_file(folder, ego.name)
     _require(ego.states.ndim == 2 and ego.states.shape[1] == NUM_STATE, path)
     table = ego_table(ego.states, ego.first_row)
@@ -145,20 +137,11 @@ class StoredRecording:
         return self.frames.num_rows
 
     def read(self, first: int, last: int) -> Recording:
-        """The rows first … last - 1, as a recording of its own.
-
-        Raises:
-            DataError: A file is damaged or does not have the rows.
-        """
+        """The rows first … last - 1 as a recording of its own, or a DataError."""
         return self._read(first, last, lambda valid, *_: np.flatnonzero(valid.any(axis=0)), False)
 
     def read_window(self, window: Window, *, validate: bool) -> Recording:
-        """The rows of a window, and the tracks that it shows.
-
-        Raises:
-            DataError: A file is damaged or does not have the rows, or, where `validate` is asked
-                for, a box holds a number outside of its range.
-        """
+        """The rows of a window, and the tracks that it shows, or a DataError."""
         choose = partial(visible_columns, without=window.ego)
         return self._read(window.first_row, window.last_row, choose, validate)
 
@@ -226,11 +209,7 @@ def _columns(found: pa.Table, name: str) -> tuple[IntArray, pa.Array]:
 
 
 def _rows(table: tables.Table, first: int, last: int, validate: bool) -> pa.Table:
-    """The rows first … last - 1 of a recording, of a table that has one row for each.
-
-    Raises:
-        DataError: It is damaged or does not have them.
-    """
+    """The rows first … last - 1 of a table with one row for each, or a DataError."""
     found = table.read(table.blocks(first, last), validate=validate)
     row = tables.column(found, "row")
     start = int(np.searchsorted(row, first))
@@ -246,11 +225,7 @@ def open_ego(folder: Path, name: str) -> tables.Table:
 
 
 def ego_span(table: tables.Table) -> tuple[int, int]:
-    """Row of the recording of an ego's first state, and one past that of its last.
-
-    Raises:
-        DataError: The file is damaged.
-    """
+    """Rows of an ego's first state and behind its last one, or a DataError."""
     rows = tables.column(table.read(columns=["row"]), "row")
     if not len(rows):
         raise DataError(f"{table.path}: there are no states", hint=tables.REPAIR)
@@ -258,10 +233,6 @@ def ego_span(table: tables.Table) -> tuple[int, int]:
 
 
 def ego_states(table: tables.Table, first: int, last: int, *, validate: bool = True) -> FloatArray:
-    """(R, 11) states of an ego over the rows first … last - 1 of the recording.
-
-    Raises:
-        DataError: The file is damaged or does not have the rows.
-    """
+    """(R, 11) states of an ego over the rows first … last - 1 of the recording, or a DataError."""
     found = _rows(table, first, last, validate)
     return np.column_stack([tables.column(found, name) for name in schema.EGO_COLUMNS])

@@ -54,11 +54,7 @@ class RemoteFiles:
         self._mirror_overlays()
 
     def need(self, name: str) -> None:
-        """Copy a file of the store, or all of a folder, as far as they are not here, and whole.
-
-        Raises:
-            DataError: A file cannot be read, or is not what the store was written with.
-        """
+        """Copy a file, or all of a folder, unless it is here and whole; or a DataError."""
         for file in self._files:
             if (file == name or file.startswith(f"{name}/")) and file not in self._checked:
                 place = safe_join(self.path, file)

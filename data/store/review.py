@@ -89,11 +89,7 @@ def _digest(rows: list[Any]) -> str:
 
 
 def read_reviews(store: Path) -> Reviews:
-    """The reviews of a store; none where nobody reviewed it.
-
-    Raises:
-        DataError: The file is damaged.
-    """
+    """The reviews of a store, none where nobody reviewed it; a DataError if damaged."""
     path = store / REVIEW
     if not path.is_file():
         return Reviews()
@@ -108,11 +104,7 @@ def read_reviews(store: Path) -> Reviews:
 
 
 def parse_review(values: Any, where: str) -> Review:
-    """A review from JSON values, which are somewhere.
-
-    Raises:
-        DataError: They are none.
-    """
+    """A review from JSON values, which are at `where`; a DataError if they are none."""
     try:
         review = make_table(Review, values, where)
         one_of(f"{where}: decision", review.decision, _DECISIONS)
@@ -138,11 +130,7 @@ def write_reviews(store: Path, reviews: Reviews) -> Path:
 
 
 def require_blocks(road: VectorMap, review: Review, where: str) -> None:
-    """Every roadblock of a corrected route must be on the map.
-
-    Raises:
-        DataError: One is not.
-    """
+    """Every roadblock of a corrected route must be on the map, else a DataError."""
     unknown = [name for name in review.route or () if name not in road.blocks.index]
     if unknown:
         raise DataError(

@@ -69,11 +69,7 @@ def ego_file(folder: Path, name: str) -> Path:
 
 
 def read_manifest(store: Path) -> dict[str, Any]:
-    """Content of `store.json`.
-
-    Raises:
-        DataError: It is missing or broken, or of another version.
-    """
+    """Content of `store.json`, or a DataError."""
     path = store / MANIFEST
     if not path.is_file():
         if (store / PARTIAL).is_dir():
@@ -237,9 +233,8 @@ class Table:
     ) -> pa.Table:
         """Rows of some row groups and columns; of all where None.
 
-        Raises:
-            DataError: The file is damaged or, where `validate` is asked for, holds a number
-                outside of its range.
+        Raises DataError: the file is damaged or, where `validate` is asked for, holds a number
+        outside of its range.
         """
         groups = list(range(self._file.num_row_groups)) if blocks is None else blocks
         wanted = self._names if columns is None else columns

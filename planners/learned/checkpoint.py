@@ -394,8 +394,7 @@ def require_torch(who: str) -> None:
 def resolve_device(name: str) -> str:
     """The device, `cpu` or `cuda:N`, of such a name, `cuda`, or `auto` (a GPU, else the CPU).
 
-    Raises:
-        ConfigError: The name is unknown, or this machine has no such device.
+    Raises ConfigError: the name is unknown, or this machine has no such device.
     """
     import torch
 

@@ -106,11 +106,7 @@ class ScenarioBuilder:
         self.change(ego=ego)
 
     def which(self, kinds: Iterable[str], tokens: Iterable[str]) -> IntArray:
-        """Indices of the tracks of these kinds and of these tokens; of all where empty.
-
-        Raises:
-            ConfigError: There is no such track.
-        """
+        """Indices of the tracks of these kinds and tokens, or a ConfigError; of all where empty."""
         wanted, codes = list(tokens), [AgentKind[kind.upper()] for kind in kinds]
         if lost := [token for token in wanted if token not in self.tracks.tokens]:
             there = self.tracks.valid[self.now]
@@ -176,11 +172,7 @@ class ScenarioBuilder:
         self.touched += tokens
 
     def require_free(self, poses: FloatArray, size: FloatArray, what: str) -> None:
-        """Refuse boxes at poses (N, 3) that touch the ego or a track at the first iteration.
-
-        Raises:
-            ConfigError: One does.
-        """
+        """A ConfigError where boxes at poses (N, 3) touch the ego or a track at the start."""
         now, tracks = self.now, self.tracks
         there = np.flatnonzero(tracks.valid[now])
         others = np.concatenate([self.center[None], tracks.poses[now, there]])
@@ -205,8 +197,7 @@ class ScenarioBuilder:
     ) -> None:
         """Add a vehicle that drives from the first iteration on; until then it came along its lane.
 
-        Raises:
-            ConfigError: It is on no lane, or on something.
+        Raises ConfigError: it is on no lane, or on something.
         """
         road = self.scenario.map
         start = find_start(road, pose)

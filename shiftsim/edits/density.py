@@ -40,8 +40,7 @@ class Slot(NamedTuple):
 def fill_lanes(builder: ScenarioBuilder, density: Density) -> None:
     """Add vehicles that drive; those for which there is no space are left out.
 
-    Raises:
-        ConfigError: The ego is on no lane.
+    Raises ConfigError: the ego is on no lane.
     """
     road, center = builder.scenario.map, builder.center
     start = find_start(road, center)
@@ -168,11 +167,7 @@ def extended(road: VectorMap, lane: int, center: FloatArray, reach: float) -> li
 
 
 def lane_line(road: VectorMap, edges: list[int]) -> shapely.LineString:
-    """The centre lines of edges as one line.
-
-    Raises:
-        ConfigError: They do not meet.
-    """
+    """The centre lines of edges as one line; a ConfigError where they do not meet."""
     lines = [shapely.LineString(road.baselines.at(edge)) for edge in edges]
     line = shapely.line_merge(shapely.MultiLineString(lines))
     if not isinstance(line, shapely.LineString):

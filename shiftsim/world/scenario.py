@@ -156,11 +156,7 @@ def scenario_of_rows(
 
 
 def require_scenario(what: str, given: object) -> None:
-    """Refuse what is no scenario, with how to get one.
-
-    Raises:
-        ConfigError: It is none.
-    """
+    """Refuse what is no scenario, with a ConfigError that says how to get one."""
     if not isinstance(given, Scenario):
         raise ConfigError(
             f"{what}() needs a scenario first, not {type(given).__name__}",

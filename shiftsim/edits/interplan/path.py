@@ -52,8 +52,7 @@ def make_plan(
 ) -> Plan:
     """Route, lanes, goal and expert; the ego starts in the state `initial` (11,).
 
-    Raises:
-        ConfigError: interPlan finds none.
+    Raises ConfigError: interPlan finds none.
     """
     road, center = scenario.map, center_poses(initial[None, :3])[0]
     expert = center_poses(scenario.expert[:, :3])
