@@ -23,7 +23,7 @@ from shiftsim.data.nuplan.sampling import is_taken, thin_out
 from shiftsim.data.recording import Window
 from shiftsim.data.store.tables import MANIFEST, SCENARIOS
 from shiftsim.data.store.writing import StoreWriter
-from shiftsim.errors import ConversionError, DataError
+from shiftsim.errors import ConversionError, DataError, listed
 from shiftsim.world.map import VectorMap
 from shiftsim.world.ranges import STORE
 
@@ -189,17 +189,13 @@ def _asked_for(log: Log, chosen: ScenarioFilter) -> list[scenarios.ScenarioEntry
 
 def _missing(names: Sequence[str], unread: Sequence[str]) -> str:
     """Why there is no such scenario in logs, some of which could not be read."""
-    listed = _few(unread or names)
+    few = listed(unread or names, 5)
     if not unread:
-        return f"not offered by any of {len(names)} logs searched ({listed})"
+        return f"not offered by any of {len(names)} logs searched ({few})"
     if len(unread) == len(names):
-        return f"none of {len(names)} logs could be read ({listed})"
+        return f"none of {len(names)} logs could be read ({few})"
     rest = len(names) - len(unread)
-    return f"not offered by the {rest} of {len(names)} logs that could be read; not read: {listed}"
-
-
-def _few(names: Sequence[str]) -> str:
-    return ", ".join(names[:5]) + (", …" if len(names) > 5 else "")
+    return f"not offered by the {rest} of {len(names)} logs that could be read; not read: {few}"
 
 
 def _choice(

@@ -189,15 +189,10 @@ class StoredRecording:
 
 
 def _columns(found: pa.Table, name: str) -> tuple[IntArray, pa.Array]:
-    """Columns in dense arrays of what the rows of a table are about.
+    """Columns in dense arrays of what A rows of a table are about, the track or light of a column.
 
-    Args:
-        found: The table, of A rows; it has few runs of equal numbers, as files are written.
-        name: Column with the number of a track or light.
-
-    Returns:
-        Column (A,) of each row, in the order of the numbers; and the index (N,) of a row of the
-        table for each column.
+    Returns the column (A,) of each row, in the order of the numbers, and the index (N,) of a row of
+    the table for each column. There are few runs of equal numbers, as files are written.
     """
     numbers = tables.column(found, name)
     begins = np.ones(len(numbers), np.bool_)

@@ -24,11 +24,9 @@ _OVERLAYS = ("filter", Path(REVIEW).parent.name, "splits")  # may change, and ar
 
 
 class RemoteFiles:
-    """Local copies of the files of a store behind a URL.
+    """Local copies, below `path`, of the files of a store behind a URL.
 
-    Attributes:
-        url: Of the store.
-        path: Folder of the copies; the list of scenarios and what lies beside it are there.
+    The list of scenarios and what lies beside it are always there.
     """
 
     def __init__(self, url: str) -> None:

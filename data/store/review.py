@@ -8,7 +8,7 @@
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -41,20 +41,12 @@ class Review:
         return self.decision == UNDECIDED and not self.comment and self.route is None
 
 
-class Reviews(Mapping[str, Review]):
-    """The reviews of a store, by scenario."""
+class Reviews(dict[str, Review]):
+    """The reviews of a store, by scenario, sorted."""
 
     def __init__(self, reviews: Iterable[Review] = ()) -> None:
-        self._by_token = {review.token: review for review in reviews if not review.is_empty}
-
-    def __getitem__(self, token: str) -> Review:
-        return self._by_token[token]
-
-    def __iter__(self) -> Any:
-        return iter(sorted(self._by_token))
-
-    def __len__(self) -> int:
-        return len(self._by_token)
+        said = {review.token: review for review in reviews if not review.is_empty}
+        super().__init__(sorted(said.items()))
 
     @property
     def hash(self) -> str:

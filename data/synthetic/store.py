@@ -62,13 +62,6 @@ def _made_in_place(path: Path) -> Iterator[tuple[Path, Path]]:
         store.rename(path)
 
 
-def write_demo(folder: Path, only: str = "") -> None:
-    """Write the recordings of the demo, one DSC3D folder per town: all, or the one named."""
-    for town in DEMO_TOWNS:
-        if only in ("", town.name):
-            recordings.write_recordings(folder / town.name, town, *recordings.generate_town(town))
-
-
 def town_specs(towns: int, seed: int) -> list[recordings.TownSpec]:
     """The random towns of a seed, of every kind in turn."""
     kinds = list(KINDS)

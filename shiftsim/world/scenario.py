@@ -128,15 +128,7 @@ class Scenario:
 def scenario_of_rows(
     token: str, road: VectorMap, time_us: IntArray, ego: FloatArray, tracks: Tracks
 ) -> Scenario:
-    """A scenario whose iterations are all rows, without lights, route and goal.
-
-    Args:
-        token: Id of the scenario.
-        road: The map.
-        time_us: (R,) time stamps [us].
-        ego: (R, 11) ego states, columns of `state.STATE_COLUMNS`.
-        tracks: Tracks over the rows.
-    """
+    """A scenario whose iterations are all R rows, without lights, route and goal."""
     return Scenario(
         token=token,
         scenario_type="unknown",

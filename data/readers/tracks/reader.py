@@ -144,14 +144,8 @@ def convert_tracks(
 ) -> ConversionReport:
     """Add tracks to a store, made if needed; what it held of the recording is replaced.
 
-    Args:
-        reader: Tracks and map.
-        store: Folder of the store.
-        egos: Ids of the egos; every vehicle that can be one by default.
-
-    Raises:
-        ConversionError: Something cannot be right, or no scenario is left.
-        DataError: The store has another map of that name.
+    `egos` are the ids of the egos; every vehicle that can be one by default. It is a DataError if
+    something cannot be right, no scenario is left, or the store has another map of that name.
     """
     errors, road = reader.diagnostics.errors, reader.road
     if errors:

@@ -68,15 +68,7 @@ class Vehicle:
 
 
 class InterplanEditor:
-    """What a code makes of a recorded scenario.
-
-    Attributes:
-        changes: What the code asks for.
-        ego_edge: Lane or connector of the ego.
-        ego_speed: Where it takes a place in its lane, of that place [m/s].
-        vehicles: At iteration 0.
-        plan: Route, lanes, goal and expert.
-    """
+    """What a code makes of a recorded scenario; `vehicles` are those at iteration 0."""
 
     def __init__(self, scenario: Scenario, edit: Edit, driven_lanes: DrivenLanes) -> None:
         self.builder = builder = ScenarioBuilder(scenario, edit, scenario.token)
