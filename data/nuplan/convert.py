@@ -236,21 +236,17 @@ def _parts(windows: Sequence[Window]) -> list[list[Window]]:
     return parts
 
 
+@dataclass
 class _Conversion:
     """Scenarios on their way into a store, and what became of them so far."""
 
-    def __init__(
-        self,
-        chosen: ScenarioFilter,
-        mapping: scenarios.Mapping | None,
-        known_maps: dict[str, Path],
-        writer: StoreWriter,
-    ) -> None:
-        self.chosen, self.mapping, self.known_maps = chosen, mapping, known_maps
-        self.writer = writer
-        self.report = ConversionReport()
-        self.maps: dict[str, VectorMap] = {}
-        self.found: set[str] = set()  # tokens
+    chosen: ScenarioFilter
+    mapping: scenarios.Mapping | None
+    known_maps: dict[str, Path]
+    writer: StoreWriter
+    report: ConversionReport = field(default_factory=ConversionReport)
+    maps: dict[str, VectorMap] = field(default_factory=dict)
+    found: set[str] = field(default_factory=set)  # tokens
 
     def offered(self, log: Log) -> list[scenarios.ScenarioEntry]:
         """The scenarios of a log that are asked for."""

@@ -33,41 +33,7 @@ LAYERS = (
 class VectorMap:
     """A semantic map. E edges, B blocks; objects are numbered, and `Layer.index` has their ids.
 
-    Attributes:
-        name: Map (city) name.
-        epsg: Code of the metric coordinate system; 0 for a local frame.
-        edges: Lanes, then lane connectors: ids and polygons.
-        num_lanes: How many of the edges are lanes.
-        baselines: E centre lines in the direction of travel.
-        left_boundaries: E lines; empty where unknown.
-        right_boundaries: E lines; empty where unknown.
-        boundary_ids: E pairs of boundary ids, left and right.
-        speed_limits: (E,) [m/s], NaN where the map has none.
-        lane_index: (E,) position in the roadblock, 0 leftmost, NONE for connectors.
-        left_lane: (E,) neighbour lane on the left, or NONE.
-        right_lane: (E,) neighbour lane on the right, or NONE.
-        incoming: Edges that lead into an edge.
-        outgoing: Edges an edge leads to.
-        block_of: (E,) block of an edge, NONE where the source names an unknown one.
-        has_traffic_lights: (E,) whether lights govern the edge.
-        stop_lines: Stop polygons of an edge.
-        intersection_of: (E,) intersection of a connector, or NONE.
-        turn_type: (E,) 0 straight, 1 left, 2 right, 3 u-turn, 4 unknown.
-        is_bike: (E,) whether the edge is a bicycle lane.
-        blocks: Roadblocks, then roadblock connectors: ids and polygons.
-        num_roadblocks: How many of the blocks are roadblocks.
-        block_edges: Edges of a block, in the order of the edges.
-        block_incoming: Blocks that lead into a block.
-        block_outgoing: Blocks a block leads to.
-        intersections: Ids and polygons.
-        intersection_kinds: Type number of each intersection.
-        stop_polygons: Ids and polygons.
-        stop_kinds: Type number of each stop polygon.
-        crosswalks: Ids and polygons.
-        walkways: Ids and polygons.
-        car_parks: Ids and polygons.
-        drivable_areas: Road segments, intersections, generic drivable areas, car parks.
-        flaws: Count by kind of what the source got wrong and nuPlan tolerates.
+    docs/vector_map.md shows what its arrays are good for.
 
     Example:
         ```python
@@ -77,39 +43,40 @@ class VectorMap:
         ```
     """
 
-    name: str
-    epsg: int
-    edges: layers.Layer
-    num_lanes: int
-    baselines: layers.Polylines
-    left_boundaries: layers.Polylines
-    right_boundaries: layers.Polylines
-    boundary_ids: tuple[tuple[str, str], ...]
-    speed_limits: FloatArray
-    lane_index: IntArray
-    left_lane: IntArray
-    right_lane: IntArray
-    incoming: layers.Lists
-    outgoing: layers.Lists
-    block_of: IntArray
-    has_traffic_lights: BoolArray
-    stop_lines: layers.Lists
-    intersection_of: IntArray
-    turn_type: IntArray
-    is_bike: BoolArray
-    blocks: layers.Layer
-    num_roadblocks: int
-    block_edges: layers.Lists
-    block_incoming: layers.Lists
-    block_outgoing: layers.Lists
-    intersections: layers.Layer
-    intersection_kinds: IntArray
-    stop_polygons: layers.Layer
-    stop_kinds: IntArray
-    crosswalks: layers.Layer
-    walkways: layers.Layer
-    car_parks: layers.Layer
-    drivable_areas: layers.Layer
+    name: str  # map (city) name
+    epsg: int  # code of the metric coordinate system; 0 for a local frame
+    edges: layers.Layer  # lanes, then lane connectors: ids and polygons
+    num_lanes: int  # how many of the edges are lanes
+    baselines: layers.Polylines  # E centre lines in the direction of travel
+    left_boundaries: layers.Polylines  # E lines; empty where unknown
+    right_boundaries: layers.Polylines  # E lines; empty where unknown
+    boundary_ids: tuple[tuple[str, str], ...]  # E pairs of boundary ids, left and right
+    speed_limits: FloatArray  # (E,) [m/s], NaN where the map has none
+    lane_index: IntArray  # (E,) position in the roadblock, 0 leftmost, NONE for connectors
+    left_lane: IntArray  # (E,) neighbour lane on the left, or NONE
+    right_lane: IntArray  # (E,) neighbour lane on the right, or NONE
+    incoming: layers.Lists  # edges that lead into an edge
+    outgoing: layers.Lists  # edges an edge leads to
+    block_of: IntArray  # (E,) block of an edge, NONE where the source names an unknown one
+    has_traffic_lights: BoolArray  # (E,) whether lights govern the edge
+    stop_lines: layers.Lists  # stop polygons of an edge
+    intersection_of: IntArray  # (E,) intersection of a connector, or NONE
+    turn_type: IntArray  # (E,) 0 straight, 1 left, 2 right, 3 u-turn, 4 unknown
+    is_bike: BoolArray  # (E,) whether the edge is a bicycle lane
+    blocks: layers.Layer  # roadblocks, then roadblock connectors: ids and polygons
+    num_roadblocks: int  # how many of the blocks are roadblocks
+    block_edges: layers.Lists  # edges of a block, in the order of the edges
+    block_incoming: layers.Lists  # blocks that lead into a block
+    block_outgoing: layers.Lists  # blocks a block leads to
+    intersections: layers.Layer  # ids and polygons
+    intersection_kinds: IntArray  # type number of each intersection
+    stop_polygons: layers.Layer  # ids and polygons
+    stop_kinds: IntArray  # type number of each stop polygon
+    crosswalks: layers.Layer  # ids and polygons
+    walkways: layers.Layer  # ids and polygons
+    car_parks: layers.Layer  # ids and polygons
+    drivable_areas: layers.Layer  # road segments, intersections, generic drivable areas, car parks
+    # count by kind of what the source got wrong and nuPlan tolerates
     flaws: dict[str, int] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
