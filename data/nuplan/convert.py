@@ -10,14 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from shiftsim.data.nuplan import scenarios
-from shiftsim.data.nuplan.filter import (
-    JUDGED,
-    KEY_OF,
-    LISTED,
-    THINNED,
-    ScenarioFilter,
-    read_filter,
-)
+from shiftsim.data.nuplan.filter import JUDGED, KEY_OF, LISTED, THINNED, ScenarioFilter, read_filter
 from shiftsim.data.nuplan.log import Log, open_log
 from shiftsim.data.nuplan.sampling import is_taken, thin_out
 from shiftsim.data.recording import Window

@@ -15,13 +15,7 @@ from numpy.typing import NDArray
 
 from shiftsim.data.readers import motion
 from shiftsim.data.readers.codes import CATEGORIES, KIND_NAMES, LARGE, SIZES
-from shiftsim.data.readers.samples import (
-    ROW_S,
-    ROW_US,
-    TrackSamples,
-    rows_between,
-    sample_run,
-)
+from shiftsim.data.readers.samples import ROW_S, ROW_US, TrackSamples, rows_between, sample_run
 from shiftsim.errors import ConversionError
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.world.state import AgentKind

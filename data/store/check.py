@@ -155,10 +155,7 @@ def _noted(
 
 
 def _check_recording(
-    store: ScenarioStore,
-    name: str,
-    scenarios: list[dict[str, str]],
-    overlaps: dict[str, _Overlaps],
+    store: ScenarioStore, name: str, scenarios: list[dict[str, str]], overlaps: dict[str, _Overlaps]
 ) -> tuple[RecordingRow, list[Problem]]:
     """One recording with its egos and scenarios."""
     problems: list[Problem] = []

@@ -9,14 +9,7 @@ import shapely
 
 from shiftsim.edits.builder import EGO_SIZE
 from shiftsim.edits.interplan.codes import COMMANDS
-from shiftsim.edits.route import (
-    TOLERANCE,
-    by_command,
-    cut_by_time,
-    edge_at,
-    plan_lanes,
-    plan_line,
-)
+from shiftsim.edits.route import TOLERANCE, by_command, cut_by_time, edge_at, plan_lanes, plan_line
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.polylines import vertex_headings
