@@ -18,14 +18,8 @@ from shiftsim.world import layers
 
 NONE = -1  # "no such object" in index arrays
 LAYERS = (
-    "edges",
-    "blocks",
-    "intersections",
-    "stop_polygons",
-    "crosswalks",
-    "walkways",
-    "car_parks",
-    "drivable_areas",
+    *("edges", "blocks", "intersections", "stop_polygons"),
+    *("crosswalks", "walkways", "car_parks", "drivable_areas"),
 )
 
 

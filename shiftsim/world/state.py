@@ -21,17 +21,8 @@ STEERING, STEERING_RATE = 7, 8  # rad, rad/s
 YAW_RATE, YAW_ACCEL = 9, 10  # rad/s, rad/s^2
 NUM_STATE = 11
 STATE_COLUMNS = (
-    "x",
-    "y",
-    "heading",
-    "vx",
-    "vy",
-    "ax",
-    "ay",
-    "steering_angle",
-    "steering_rate",
-    "yaw_rate",
-    "yaw_accel",
+    *("x", "y", "heading", "vx", "vy", "ax", "ay"),
+    *("steering_angle", "steering_rate", "yaw_rate", "yaw_accel"),
 )
 
 
