@@ -11,6 +11,7 @@ import pyarrow as pa
 
 from shiftsim.data.recording import EgoTrace, Recording, Window, visible_columns
 from shiftsim.data.store import schema, tables
+from shiftsim.data.store.tables import require_ranges
 from shiftsim.errors import DataError
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.world.state import NUM_STATE, LightStatus, Tracks, TrafficLights
@@ -37,7 +38,7 @@ def write_recording(folder: Path, recording: Recording) -> None:
     }
     for name, blocks in blocks_of.items():
         for block in blocks:
-            tables.require_ranges(block, str(folder / name))
+            require_ranges(block, str(folder / name))
     if (np.diff(recording.time_us) < 0).any():  # they may repeat, nuPlan rule 431
         raise DataError(
             f"{folder / tables.FRAMES}: column 'time_us' does not increase", tables.REPAIR
@@ -52,7 +53,7 @@ def write_ego(folder: Path, ego: EgoTrace) -> None:
     path = tables.ego_file(folder, ego.name)
     _require(ego.states.ndim == 2 and ego.states.shape[1] == NUM_STATE, path)
     table = ego_table(ego.states, ego.first_row)
-    tables.require_ranges(table, str(path))
+    require_ranges(table, str(path))
     tables.write_blocks(path, _split(table))
 
 

@@ -5,9 +5,9 @@ order of the source tables), so that one integer names a piece of road everywher
 for roadblocks and roadblock connectors (*blocks*). Ids are strings at the boundary only.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Generic, TypeVar
+from functools import lru_cache
 
 import numpy as np
 import shapely
@@ -23,11 +23,11 @@ LAYERS = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class VectorMap:
     """A semantic map. E edges, B blocks; objects are numbered, and `Layer.index` has their ids.
 
-    docs/vector_map.md shows what its arrays are good for.
+    docs/vector_map.md shows what its arrays are good for. Maps are told apart by identity.
 
     Example:
         ```python
@@ -71,7 +71,7 @@ class VectorMap:
     car_parks: layers.Layer  # ids and polygons
     drivable_areas: layers.Layer  # road segments, intersections, generic drivable areas, car parks
     # count by kind of what the source got wrong and nuPlan tolerates
-    flaws: dict[str, int] = field(default_factory=dict, compare=False)
+    flaws: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -148,20 +148,6 @@ class VectorMap:
         return float(layers.project_on_line(self.baselines, edge, x, y))
 
 
-MAPS_KEPT = 4  # per kind of arrays; a run rarely visits more maps at a time
-Arrays = TypeVar("Arrays")
-
-
-class PerMap(Generic[Arrays]):
-    """Arrays that depend on the map only: built once per map, kept for the latest few maps."""
-
-    def __init__(self, build: Callable[[VectorMap], Arrays]) -> None:
-        self._build = build
-        self._kept: list[tuple[VectorMap, Arrays]] = []
-
-    def __call__(self, road: VectorMap) -> Arrays:
-        """The arrays of a map; maps are told apart by identity."""
-        found = [item for item in self._kept if item[0] is road] or [(road, self._build(road))]
-        others = [item for item in self._kept if item[0] is not road]
-        self._kept = [*found, *others][:MAPS_KEPT]
-        return found[0][1]
+# makes a function of arrays that depend on the map only: they are built once per map, and kept for
+# the latest few, as a run rarely visits more maps at a time
+PerMap = lru_cache(maxsize=4)
