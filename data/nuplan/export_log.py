@@ -112,10 +112,8 @@ def connector_number(scenario: Scenario, name: str) -> int:
     try:
         return int(name)
     except ValueError as error:
-        raise ConversionError(
-            f"scenario {scenario.token!r}: a traffic light names connector {name!r}",
-            hint="nuPlan's format has integer ids",
-        ) from error
+        what = f"scenario {scenario.token!r}: a traffic light names connector {name!r}"
+        raise ConversionError(what, "nuPlan's format has integer ids") from error
 
 
 def write_nuplan_log(path: Path, scenario: Scenario, *, epsg: int) -> Mapping:

@@ -200,10 +200,8 @@ def find_maps(folder: Path) -> dict[str, Path]:
     """Files `map.gpkg` by map name; a DataError where the index is missing or broken."""
     indexes = sorted(folder.glob("*maps*.json"))
     if not indexes:
-        raise DataError(
-            f"{folder}: no index such as nuplan-maps-v1.0.json",
-            hint="give the folder that holds it, in nuPlan $NUPLAN_MAPS_ROOT",
-        )
+        what = f"{folder}: no index such as nuplan-maps-v1.0.json"
+        raise DataError(what, "give the folder that holds it, in nuPlan $NUPLAN_MAPS_ROOT")
     out = {}
     for index in indexes:
         try:

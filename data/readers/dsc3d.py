@@ -204,10 +204,8 @@ def find_map(site: Site, given: Path | None = None) -> Path:
     for path in (site.folder / "map/map.xodr", *others, site.folder / "map.xodr"):
         if path.is_file():
             return path
-    raise ConversionError(
-        f"{site.folder}: this download has no OpenDRIVE map (map/map.xodr)",
-        "ask DeepScenario support for the map, or give one with --map",
-    )
+    what = f"{site.folder}: this download has no OpenDRIVE map (map/map.xodr)"
+    raise ConversionError(what, "ask DeepScenario support for the map, or give one with --map")
 
 
 def _check_georeference(drive: OpenDrive, site: Site) -> None:

@@ -103,10 +103,8 @@ class RemoteFiles:
                 ):
                     shutil.copyfileobj(source, copy, 1 << 20)
                 if name in self._files and digest(partial) != self._files[name]:
-                    raise DataError(
-                        f"{self.url}/{name}: damaged, or changed since the store was written",
-                        hint="upload the store again",
-                    )
+                    what = f"{self.url}/{name}: damaged, or changed since the store was written"
+                    raise DataError(what, "upload the store again")
                 partial.replace(target)
         except (OSError, pa.ArrowException) as error:
             text = " ".join(str(error).split())

@@ -73,14 +73,10 @@ def read_manifest(store: Path) -> dict[str, Any]:
     path = store / MANIFEST
     if not path.is_file():
         if (store / PARTIAL).is_dir():
-            raise DataError(
-                f"{store}: the conversion of this store was interrupted",
-                hint="start the same shiftsim convert again, it goes on",
-            )
-        raise DataError(
-            f"{store}: not a scenario store: {MANIFEST} is missing",
-            hint="give the folder that `shiftsim convert` wrote",
-        )
+            what = f"{store}: the conversion of this store was interrupted"
+            raise DataError(what, "start the same shiftsim convert again, it goes on")
+        what = f"{store}: not a scenario store: {MANIFEST} is missing"
+        raise DataError(what, "give the folder that `shiftsim convert` wrote")
     try:
         manifest = json.loads(path.read_text("utf-8"))
         kind, version = manifest["format"], manifest["version"]

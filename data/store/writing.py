@@ -72,10 +72,8 @@ class StoreWriter:
         is_partial = (self.path / tables.PARTIAL).is_dir()
         others = {path.name for path in self.path.iterdir()} - {tables.REPORTS}
         if not self._files and not is_partial and others:
-            raise DataError(
-                f"{self.path}: the folder is not empty and not a store",
-                hint="give a new folder, or a store to add to",
-            )
+            what = f"{self.path}: the folder is not empty and not a store"
+            raise DataError(what, "give a new folder, or a store to add to")
 
     def __enter__(self) -> "StoreWriter":
         return self
@@ -121,10 +119,8 @@ class StoreWriter:
         folder = tables.recording_folder(self.path, window.log_name)
         for path in (folder / tables.FRAMES, tables.ego_file(folder, window.ego)):
             if self._name(path) not in self._files:
-                raise DataError(
-                    f"scenario {window.token!r}: the store does not have {self._name(path)}",
-                    hint="add the recording and the ego before the window",
-                )
+                what = f"scenario {window.token!r}: the store does not have {self._name(path)}"
+                raise DataError(what, "add the recording and the ego before the window")
         row, file = window_row(window, self._cities[window.log_name]), self.path / tables.SCENARIOS
         table = pa.Table.from_pylist([row], schema=schema.SCENARIOS)
         with _to_be_written():

@@ -133,10 +133,8 @@ def find_checkpoint(spec: str, planner: str = "") -> Path:
             return _inside(path)
     near = nearest(Path(spec).name, sorted(path.name for path in checkpoint_folder().glob("*")))
     whose = f" of planner {planner!r}" if planner else ""
-    raise CheckpointError(
-        f"checkpoint {spec!r}{whose} does not exist, nor in {str(checkpoint_folder())!r}",
-        hint=f"did you mean {near!r}?" if near else how_to_get(planner),
-    )
+    what = f"checkpoint {spec!r}{whose} does not exist, nor in {str(checkpoint_folder())!r}"
+    raise CheckpointError(what, f"did you mean {near!r}?" if near else how_to_get(planner))
 
 
 def _meant_by(spec: str, planner: str) -> Path | None:
@@ -368,10 +366,8 @@ def _inside(folder: Path) -> Path:
     if len(found) == 1:
         return found[0]
     names = ", ".join(path.name for path in found)
-    raise CheckpointError(
-        f"folder {str(folder)!r} holds {len(found) or 'no'} checkpoints",
-        hint=f"name one of them: {names}" if found else "give the file itself",
-    )
+    what = f"folder {str(folder)!r} holds {len(found) or 'no'} checkpoints"
+    raise CheckpointError(what, f"name one of them: {names}" if found else "give the file itself")
 
 
 def _known_deterministic(spec: str) -> str:
@@ -406,10 +402,8 @@ def resolve_device(name: str) -> str:
         return "cpu"
     index = int(number or 0)
     if index >= count:
-        raise ConfigError(
-            f"device {name!r}: torch {torch.__version__} sees {count or 'no'} CUDA devices",
-            hint="use --device cpu, or install a torch that fits the driver",
-        )
+        what = f"device {name!r}: torch {torch.__version__} sees {count or 'no'} CUDA devices"
+        raise ConfigError(what, "use --device cpu, or install a torch that fits the driver")
     return f"cuda:{index}"
 
 

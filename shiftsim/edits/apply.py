@@ -47,10 +47,8 @@ def apply_edit(
         if not edit.code:
             return _apply_tables(scenario, edit)
         if driven_lanes is None:
-            raise ConfigError(
-                f"the code {edit.code!r} is applied in runs only",
-                hint='write it into a file with profile = "interplan", and run that',
-            )
+            what = f"the code {edit.code!r} is applied in runs only"
+            raise ConfigError(what, 'write it into a file with profile = "interplan", and run that')
         return InterplanEditor(scenario, edit, driven_lanes).result()
     except ShiftsimError as error:
         text = f"edit {edit.name!r} of scenario {scenario.token!r}: {error.message}"

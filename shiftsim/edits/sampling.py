@@ -57,10 +57,8 @@ def sample_edits(
                 yield table | {"type": f"{kind}_{hardness}"}
                 break
         else:
-            raise ConfigError(
-                f"no plausible {kind} was found in {_MOST_DRAWS} draws",
-                hint="choose scenarios in which the ego drives, with --split",
-            )
+            what = f"no plausible {kind} was found in {_MOST_DRAWS} draws"
+            raise ConfigError(what, "choose scenarios in which the ego drives, with --split")
 
 
 def graded(scenario_type: str) -> tuple[str, str]:

@@ -149,10 +149,8 @@ def recognise(names: Sequence[str], overrides: Mapping[str, Any], where: str) ->
     _require_columns(found, names, where)
     for column in found.values():
         if names.count(column.name) > 1:
-            raise ConversionError(
-                f"{where} has {names.count(column.name)} columns {column.name!r}",
-                "give each a name of its own",
-            )
+            what = f"{where} has {names.count(column.name)} columns {column.name!r}"
+            raise ConversionError(what, "give each a name of its own")
     shift = overrides.get("shift_m", (0.0, 0.0))
     if not isinstance(shift, list | tuple) or [_within(v, 1e9) for v in shift] != [True, True]:
         raise ConfigError(f"shift_m is {shift!r}", "shift_m = [x, y] in metres")

@@ -308,10 +308,8 @@ class _TableFile(SourceFile):
         role = "frame" if is_frame else "time"
         column = found[role]
         if is_frame and not rate:
-            raise self.fault(
-                f"time is given in frames ({column.name!r}) only",
-                "say how many there are per second: --hz 25",
-            )
+            what = f"time is given in frames ({column.name!r}) only"
+            raise self.fault(what, "say how many there are per second: --hz 25")
         if not column.name:
             raise ConfigError(f"{role} is the same for all rows", f"name a column: {role} = 'NAME'")
         values = self.table[column.name]

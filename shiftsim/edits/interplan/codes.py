@@ -70,10 +70,8 @@ def special_of(changes: Mapping[str, Any], details: Mapping[str, Any]) -> Mappin
         return {}
     known = details.get("special_scenario") or {}
     if number not in known:
-        raise ConfigError(
-            f"special scenario {number!r} is not described in the modifications",
-            hint=f"there are: {', '.join(known) or 'none'}",
-        )
+        what = f"special scenario {number!r} is not described in the modifications"
+        raise ConfigError(what, f"there are: {', '.join(known) or 'none'}")
     found: Mapping[str, Any] = known[number]
     return found
 
