@@ -4,6 +4,7 @@ import json
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -202,16 +203,19 @@ def find_maps(folder: Path) -> dict[str, Path]:
     if not indexes:
         what = f"{folder}: no index such as nuplan-maps-v1.0.json"
         raise DataError(what, "give the folder that holds it, in nuPlan $NUPLAN_MAPS_ROOT")
-    out = {}
-    for index in indexes:
-        try:
-            for name, entry in json.loads(index.read_text("utf-8")).items():
-                out[name] = folder / name / str(entry["version"]) / "map.gpkg"
-        except (TypeError, KeyError, AttributeError) as error:
-            raise DataError(f"{index}: a map has no version", hint="get it again") from error
-        except (OSError, ValueError, RecursionError) as error:
-            raise DataError(f"{index}: not readable JSON: {error}", hint="get it again") from error
-    return out
+    listed = [item for index in indexes for item in read_index(index).items()]
+    return {name: folder / name / str(it["version"]) / "map.gpkg" for name, it in listed}
+
+
+def read_index(path: Path) -> dict[str, Any]:
+    """What an index lists of each map, its version at least, or a DataError."""
+    try:
+        listed: dict[str, Any] = json.loads(path.read_text("utf-8"))
+        [entry["version"] for entry in listed.values()]
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        what = f"{path}: not an index of maps: {error!r}"
+        raise DataError(what, hint="get it again, or choose another folder") from error
+    return listed
 
 
 def load_map(maps: dict[str, Path], name: str) -> VectorMap:

@@ -72,25 +72,16 @@ def town_specs(towns: int, seed: int) -> list[recordings.TownSpec]:
 
 
 def write_towns(
-    path: Path,
+    path: Path,  # its folder, which must not exist, or hold that store already
     *,
-    towns: int,
+    towns: int,  # how many; a store of more holds those of fewer
     seed: int,
-    spread: Callable[[Any, Sequence[recordings.TownSpec]], Iterable[Any]],
+    spread: Callable[[Any, Sequence[recordings.TownSpec]], Iterable[Any]],  # over processes
     progress: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> ScenarioStore:
     """A store of random towns, the same bytes for the same number and seed.
 
-    Args:
-        path: Its folder, which must not exist, or hold that store already.
-        towns: How many towns; a store of more holds those of fewer.
-        seed: Of everything that is random.
-        spread: How towns are spread over processes.
-        progress: Called with towns done, towns in all and the name of the last one.
-
-    Raises:
-        ConfigError: The folder holds something else.
-        DataError: A process died.
+    It is a ConfigError if the folder holds something else, a DataError if a process dies.
     """
     provenance = {"name": "towns", "seed": seed, "towns": towns}
     if path.exists():

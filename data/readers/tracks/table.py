@@ -102,19 +102,13 @@ class TrackTable:
 def read_tracks(
     path: Path | Sequence[Path],
     *,
-    overrides: Mapping[str, Any] | None = None,
-    hz: float | None = None,
+    overrides: Mapping[str, Any] | None = None,  # as of `columns.recognise`
+    hz: float | None = None,  # frames per second, for time given in frames
 ) -> TrackTable:
     """The rows of a CSV or Parquet file, or of several that are one recording.
 
-    Args:
-        path: The file; `*Meta.csv` files of levelXdata beside it are read too.
-        overrides: Names, units and kinds that the user gives (`columns.recognise`).
-        hz: Frames per second, for time given in frames.
-
-    Raises:
-        ConversionError: The file cannot be read, a column is missing or holds something else.
-        ConfigError: An override does not fit the file.
+    `*Meta.csv` files of levelXdata beside it are read too. It is a ConversionError if a file cannot
+    be read, a column is missing or holds something else, a ConfigError if an override does not fit.
     """
     paths = [path] if isinstance(path, Path) else path
     file = _TableFile(paths, {**(overrides or {}), **({"hz": hz} if hz is not None else {})})
