@@ -13,15 +13,9 @@ def xml_elements(
 ) -> list[Any]:
     """The children of the root that have one of some names, or the root itself. No comments.
 
-    Args:
-        data: The file.
-        root: Name of the root, in any namespace.
-        fault: Makes an error of what is wrong and a remedy, which may be empty.
-        names: Names of the children, in any namespace; none: the root itself is given.
-
-    Raises:
-        ConversionError: It is not XML, has another root, or a document type: entities and external
-            references are refused.
+    Names are those in any namespace. It is an error, made by `fault` of what is wrong and a remedy,
+    if `data` are no XML, have another root, or a document type: entities and external references
+    are refused.
     """
     parser = etree.XMLParser(
         remove_comments=True,

@@ -8,7 +8,15 @@ import pyarrow.csv as pc
 
 from shiftsim.data.readers.annotations import read_recording
 from shiftsim.data.readers.dsc3d import find_map, open_site
-from shiftsim.data.synthetic.store import write_demo
+from shiftsim.data.synthetic.recordings import generate_town, write_recordings
+from shiftsim.data.synthetic.store import DEMO_TOWNS
+
+
+def write_demo(folder: Path, only: str = "") -> None:
+    """Write the recordings of the demo, one DSC3D folder per town: all, or the one named."""
+    for town in DEMO_TOWNS:
+        if only in ("", town.name):
+            write_recordings(folder / town.name, town, *generate_town(town))
 
 
 def export_town(folder: Path, town: str):

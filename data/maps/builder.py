@@ -8,7 +8,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count, pairwise
-from typing import Any, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 import shapely
@@ -25,7 +25,6 @@ from shiftsim.world.map import VectorMap
 
 LIGHT_KIND, STOP_SIGN_KIND, PASS_THROUGH = 1, 2, 5  # kinds of intersections
 T = TypeVar("T")
-_Segment = TypeVar("_Segment", contravariant=True)
 _Spec = TypeVar("_Spec", EdgeSpec, BlockSpec, AreaSpec)
 Pairs: TypeAlias = set[tuple[int, int]]
 _CLOSING = 0.5  # m
@@ -65,21 +64,6 @@ class _Shape(NamedTuple):
     polygon: shapely.Polygon  # its area
 
 
-class Shaper(Protocol[_Segment]):
-    """Shapes segments that follow each other, in the direction of travel."""
-
-    def joined_borders(self, segments: Sequence[_Segment]) -> tuple[FloatArray, FloatArray]:
-        """Left and right border (K, 2), (K', 2) [m]."""
-
-    def baseline(
-        self,
-        segments: Sequence[_Segment],
-        start: FloatArray | None = None,
-        end: FloatArray | None = None,
-    ) -> FloatArray:
-        """Centre line (K, 2), from `start` (2,) to `end` (2,) where given [m]."""
-
-
 class MapBuilder(ABC, Generic[S]):
     """Makes the map of a lane graph, with one series of ids for all of its parts."""
 
@@ -87,8 +71,11 @@ class MapBuilder(ABC, Generic[S]):
     lights: Sequence[str | None]  # light of each connector: its name, empty where unknown; or None
     stop_signs: Sequence[bool]  # whether a stop sign governs each connector
 
-    def __init__(self, graph: LaneGraph[S], shaper: Shaper[S], warnings: Counter[str]) -> None:
-        """Counts in `warnings` what is repaired."""
+    def __init__(self, graph: LaneGraph[S], shaper: Any, warnings: Counter[str]) -> None:
+        """Counts in `warnings` what is repaired.
+
+        `shaper` has `joined_borders` and `baseline`, as `segments` and `opendrive.shapes.Shapes`.
+        """
         self.graph, self.shaper, self.warnings = graph, shaper, warnings
         lanes = graph.lanes
         # roadblocks that each connector comes from and leads to
@@ -99,7 +86,8 @@ class MapBuilder(ABC, Generic[S]):
 
     def connector_borders(self, connector: Connector[S]) -> tuple[FloatArray, FloatArray]:
         """Left and right border (K, 2), (K', 2) of a connector [m]."""
-        return self.shaper.joined_borders(connector.segments)
+        left, right = self.shaper.joined_borders(connector.segments)
+        return left, right
 
     @abstractmethod
     def speed_limits(self, segment: S) -> Iterable[tuple[float | None, float]]:
@@ -186,6 +174,7 @@ class MapBuilder(ABC, Generic[S]):
         return [next(self._next_id) for _ in range(number)]
 
     def _shape_lanes(self) -> None:
+        borders: list[tuple[FloatArray, FloatArray]]
         borders = [self.shaper.joined_borders(lane.segments) for lane in self.graph.lanes]
         polygons = [lane_polygon(*pair) for pair in borders]
         borders = [unfold_borders(*b, area) for b, area in zip(borders, polygons, strict=True)]

@@ -46,21 +46,13 @@ def states_of_cycles(
 
 
 def states_of_lists(
-    time_us: IntArray,
-    row: IntArray,
-    lights: IntArray,
-    codes: IntArray,
-    meaning: Mapping[int, LightStatus],
+    time_us: IntArray,  # (G,) times [us]
+    row: IntArray,  # (A,) for each listed light, the index of its time
+    lights: IntArray,  # (A,) numbers of the listed lights
+    codes: IntArray,  # (A,) what they show
+    meaning: Mapping[int, LightStatus],  # that of codes; others are unknown
 ) -> LightStates:
-    """States of lights that are listed anew at each time.
-
-    Args:
-        time_us: (G,) times [us].
-        row: (A,) for each listed light, the index of its time.
-        lights: (A,) numbers of the listed lights.
-        codes: (A,) what they show.
-        meaning: That of codes; others are unknown.
-    """
+    """States of lights that are listed anew at each time."""
     names, column = np.unique(lights, return_inverse=True)
     table = np.full((len(time_us), len(names)), LightStatus.ABSENT, np.int64)
     table[row, column] = [meaning.get(code, LightStatus.UNKNOWN) for code in codes.tolist()]

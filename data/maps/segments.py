@@ -12,15 +12,8 @@ import numpy as np
 import shapely
 
 from shiftsim.data.maps.builder import StopArea as StopArea
+from shiftsim.data.maps.opendrive import shapes
 from shiftsim.data.maps.opendrive.control import STOP_LINE_DEPTH
-from shiftsim.data.maps.opendrive.shapes import (
-    BASELINE_STEP,
-    arc_lengths,
-    divide,
-    join_lines,
-    lane_polygon,
-    points_at,
-)
 from shiftsim.kernels import FloatArray
 
 _APART = 1e-3  # m, closer vertices of a source are one
@@ -51,7 +44,8 @@ class LanePiece:
         shares = [_shares(line) for line in (self.left, self.right)]
         at = np.unique(np.concatenate(shares))
         left, right = (
-            points_at(line, s, at) for line, s in zip((self.left, self.right), shares, strict=True)
+            shapes.points_at(line, s, at)
+            for line, s in zip((self.left, self.right), shares, strict=True)
         )
         return 0.5 * (left + right)
 
@@ -63,7 +57,7 @@ class LanePiece:
     @cached_property
     def polygon(self) -> shapely.Polygon:
         """Its area; empty where the borders enclose none."""
-        return lane_polygon(self.left, self.right)
+        return shapes.lane_polygon(self.left, self.right)
 
     @property
     def ends(self) -> tuple[FloatArray, FloatArray]:
@@ -128,13 +122,13 @@ class Part:
             return line
         shares = _shares(line)
         inside = shares[(shares > self.begin) & (shares < self.end)]
-        return points_at(line, shares, np.concatenate([[self.begin], inside, [self.end]]))
+        return shapes.points_at(line, shares, np.concatenate([[self.begin], inside, [self.end]]))
 
 
 def joined_borders(segments: Sequence[Part]) -> tuple[FloatArray, FloatArray]:
     """Borders (K, 2), (K', 2) of segments that follow each other [m]."""
-    left = join_lines([part.cut(part.piece.left) for part in segments])
-    return left, join_lines([part.cut(part.piece.right) for part in segments])
+    left = shapes.join_lines([part.cut(part.piece.left) for part in segments])
+    return left, shapes.join_lines([part.cut(part.piece.right) for part in segments])
 
 
 def baseline(
@@ -144,12 +138,12 @@ def baseline(
 
     `start` and `end` (2,) are where it must begin and end, near its own ends [m].
     """
-    line = join_lines([part.cut(part.piece.middle) for part in segments])
+    line = shapes.join_lines([part.cut(part.piece.middle) for part in segments])
     if start is not None and end is not None:
-        line = points_at(line, _shares(line), _dense(line))
+        line = shapes.points_at(line, _shares(line), _dense(line))
         share = _shares(line)[:, None]
         line = line + (1.0 - share) * (start - line[0]) + share * (end - line[-1])
-    return divide(line)
+    return shapes.divide(line)
 
 
 def clean_line(points: FloatArray) -> FloatArray:
@@ -162,11 +156,11 @@ def _dense(line: FloatArray) -> FloatArray:
     """Shares of the vertices of a line and of points between them, a metre or less apart."""
     shares = _shares(line)
     length = float(np.hypot(*np.diff(line, axis=0).T).sum())
-    count = int(np.ceil(length / (4 * BASELINE_STEP))) + 1
+    count = int(np.ceil(length / (4 * shapes.BASELINE_STEP))) + 1
     return np.unique(np.concatenate([shares, np.linspace(0.0, 1.0, count)]))
 
 
 def _shares(line: FloatArray) -> FloatArray:
     """(K,) how far along a line (K, 2) its vertices are, 0 to 1."""
-    along = arc_lengths(line)
+    along = shapes.arc_lengths(line)
     return along / max(along[-1], 1e-9)

@@ -143,12 +143,9 @@ class Topology(Generic[N, S]):
     def build_connectors(
         self, max_chain: int, label: Callable[[Sequence[N]], frozenset[str]], what: str
     ) -> None:
-        """One connector per way from a lane over nodes of intersections to a lane.
+        """One connector per way from a lane over `max_chain` nodes of intersections to a lane.
 
-        Args:
-            max_chain: How many of them a connector may have.
-            label: The intersections of some nodes.
-            what: How nodes without both ends are called in the warnings.
+        `label` gives the intersections of nodes; those without both ends are counted as `what`.
         """
         used: set[N] = set()
         for source, last in enumerate(self._last):

@@ -29,11 +29,7 @@ class Boxes:
 
 
 def read_boxes(log: Log, first: int, last: int, flaws: Counter[str] | None = None) -> Boxes:
-    """Objects of the rows first … last - 1.
-
-    Raises:
-        ConversionError: A category is unknown, or a pose or a size is no finite number.
-    """
+    """Objects of the rows first … last - 1; else a ConversionError."""
     row, rows = read_rows(
         log,
         first,
@@ -46,10 +42,8 @@ def read_boxes(log: Log, first: int, last: int, flaws: Counter[str] | None = Non
     )
     unknown = sorted({str(r[1]) for r in rows} - set(_KINDS))
     if unknown:
-        raise ConversionError(
-            f"{log.path}: table 'category': unknown category {unknown[0]!r}",
-            hint=f"known are {', '.join(_KINDS)}",
-        )
+        what = f"{log.path}: table 'category': unknown category {unknown[0]!r}"
+        raise ConversionError(what, f"known are {', '.join(_KINDS)}")
     kind = np.array([_KINDS[r[1]] for r in rows], np.int64)
     values = as_numbers(log.path, "lidar_box", [r[2:] for r in rows]).reshape(-1, 8)
     order = np.lexsort((np.arange(len(rows)), kind, row))

@@ -9,30 +9,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from shiftsim.data.nuplan.filter import (
-    JUDGED,
-    KEY_OF,
-    LISTED,
-    THINNED,
-    ScenarioFilter,
-    read_filter,
-)
+from shiftsim.data.nuplan import scenarios
+from shiftsim.data.nuplan.filter import JUDGED, KEY_OF, LISTED, THINNED, ScenarioFilter, read_filter
 from shiftsim.data.nuplan.log import Log, open_log
 from shiftsim.data.nuplan.sampling import is_taken, thin_out
-from shiftsim.data.nuplan.scenarios import (
-    EGO,
-    Mapping,
-    ScenarioEntry,
-    cut_window,
-    find_maps,
-    load_map,
-    offered,
-    read_span,
-)
 from shiftsim.data.recording import Window
 from shiftsim.data.store.tables import MANIFEST, SCENARIOS
 from shiftsim.data.store.writing import StoreWriter
-from shiftsim.errors import ConversionError, DataError
+from shiftsim.errors import ConversionError, DataError, listed
 from shiftsim.world.map import VectorMap
 from shiftsim.world.ranges import STORE
 
@@ -72,7 +56,7 @@ def convert_nuplan(
     tokens: Iterable[str] | None = None,
     types: Iterable[str] | None = None,
     filter_file: Path | None = None,
-    mapping: Mapping | None = None,
+    mapping: scenarios.Mapping | None = None,
     progress: Progress | None = None,
 ) -> ConversionReport:
     """Convert scenarios of nuPlan logs into a store, or add them to one.
@@ -100,7 +84,7 @@ def convert_nuplan(
     files = [path for path in every if chosen.logs is None or path.stem in chosen.logs]
     is_new, was_there = not (Path(store) / MANIFEST).exists(), Path(store).exists()
     with StoreWriter(store) as writer:
-        conversion = _Conversion(chosen, mapping, find_maps(Path(maps)), writer)
+        conversion = _Conversion(chosen, mapping, scenarios.find_maps(Path(maps)), writer)
         report = conversion.report
         show = progress or (lambda done, total, name: None)
         is_all = chosen == ScenarioFilter()
@@ -137,7 +121,7 @@ def _thinned(
     files: Sequence[Path], conversion: "_Conversion", show: Progress
 ) -> set[tuple[str, str]]:
     """Log and token of what is left of the scenarios of all logs; logs that fail are noted."""
-    entries: list[ScenarioEntry] = []
+    entries: list[scenarios.ScenarioEntry] = []
     for done, path in enumerate(files):
         show(done, len(files), f"{path.stem}: scenarios")
         try:
@@ -154,7 +138,7 @@ def _explain(files: Sequence[Path], conversion: "_Conversion") -> None:
     fields = [name for name in KEY_OF if getattr(chosen, name) != getattr(empty, name)]
     counts = Counter({"offered": 0, **{name: 0 for name in fields}})
     offers = {what: Counter[str]() for what in ("types", "maps", "logs")}
-    entries: list[ScenarioEntry] = []
+    entries: list[scenarios.ScenarioEntry] = []
     for path in files:
         with open_log(path) as log:
             found, so_far = _asked_for(log, empty), empty
@@ -178,35 +162,33 @@ def _explain(files: Sequence[Path], conversion: "_Conversion") -> None:
         with open_log(path) as log:
             for entry in _asked_for(log, chosen):
                 if (log.name, entry.token) in tokens:
-                    window = cut_window(log, entry.token, conversion.mapping, entry.scenario_type)
+                    window = scenarios.cut_window(
+                        log, entry.token, conversion.mapping, entry.scenario_type
+                    )
                     conversion.judge(log, window, counts)
     unused = {"shuffle", "speed_noise"}
     report.left = {KEY_OF.get(name, name): n for name, n in counts.items() if name not in unused}
     report.offers = offers
 
 
-def _asked_for(log: Log, chosen: ScenarioFilter) -> list[ScenarioEntry]:
+def _asked_for(log: Log, chosen: ScenarioFilter) -> list[scenarios.ScenarioEntry]:
     """The scenarios of a log that the lists of a filter name."""
     for wanted, name in ((chosen.logs, log.name), (chosen.maps, log.map_name)):
         if wanted is not None and name not in wanted:
             return []
     with_goals = chosen.remove_invalid_goals
-    return offered(log, chosen.tokens, chosen.types, remove_invalid_goals=with_goals)
+    return scenarios.offered(log, chosen.tokens, chosen.types, remove_invalid_goals=with_goals)
 
 
 def _missing(names: Sequence[str], unread: Sequence[str]) -> str:
     """Why there is no such scenario in logs, some of which could not be read."""
-    listed = _few(unread or names)
+    few = listed(unread or names, 5)
     if not unread:
-        return f"not offered by any of {len(names)} logs searched ({listed})"
+        return f"not offered by any of {len(names)} logs searched ({few})"
     if len(unread) == len(names):
-        return f"none of {len(names)} logs could be read ({listed})"
+        return f"none of {len(names)} logs could be read ({few})"
     rest = len(names) - len(unread)
-    return f"not offered by the {rest} of {len(names)} logs that could be read; not read: {listed}"
-
-
-def _few(names: Sequence[str]) -> str:
-    return ", ".join(names[:5]) + (", …" if len(names) > 5 else "")
+    return f"not offered by the {rest} of {len(names)} logs that could be read; not read: {few}"
 
 
 def _choice(
@@ -247,23 +229,19 @@ def _parts(windows: Sequence[Window]) -> list[list[Window]]:
     return parts
 
 
+@dataclass
 class _Conversion:
     """Scenarios on their way into a store, and what became of them so far."""
 
-    def __init__(
-        self,
-        chosen: ScenarioFilter,
-        mapping: Mapping | None,
-        known_maps: dict[str, Path],
-        writer: StoreWriter,
-    ) -> None:
-        self.chosen, self.mapping, self.known_maps = chosen, mapping, known_maps
-        self.writer = writer
-        self.report = ConversionReport()
-        self.maps: dict[str, VectorMap] = {}
-        self.found: set[str] = set()  # tokens
+    chosen: ScenarioFilter
+    mapping: scenarios.Mapping | None
+    known_maps: dict[str, Path]
+    writer: StoreWriter
+    report: ConversionReport = field(default_factory=ConversionReport)
+    maps: dict[str, VectorMap] = field(default_factory=dict)
+    found: set[str] = field(default_factory=set)  # tokens
 
-    def offered(self, log: Log) -> list[ScenarioEntry]:
+    def offered(self, log: Log) -> list[scenarios.ScenarioEntry]:
         """The scenarios of a log that are asked for."""
         found = _asked_for(log, self.chosen)
         self.found.update(entry.token for entry in found)
@@ -277,7 +255,7 @@ class _Conversion:
             if taken is not None and (log.name, entry.token) not in taken:
                 continue
             try:
-                window = cut_window(log, entry.token, self.mapping, entry.scenario_type)
+                window = scenarios.cut_window(log, entry.token, self.mapping, entry.scenario_type)
                 if not is_taken(log, window, partial(self._map, log.map_name), self.chosen):
                     continue
             except ConversionError as error:
@@ -308,7 +286,7 @@ class _Conversion:
 
     def _map(self, name: str) -> VectorMap:
         if name not in self.maps:
-            self.maps[name] = load_map(self.known_maps, name)
+            self.maps[name] = scenarios.load_map(self.known_maps, name)
             self.writer.add_map(self.maps[name])
             flaws = self.maps[name].flaws
             self.report.flaws.update({f"map {name}: {what}": n for what, n in flaws.items()})
@@ -320,7 +298,7 @@ class _Conversion:
         name = f"{log.name}@{log.time_us[first]}-{log.time_us[last - 1]}"
         flaws: Counter[str] = Counter()
         try:
-            recording, ego = read_span(log, name, first, last, flaws)
+            recording, ego = scenarios.read_span(log, name, first, last, flaws)
         except ConversionError as error:
             if len(windows) == 1:
                 report.failed[windows[0].token] = _reason(error)
@@ -338,6 +316,6 @@ class _Conversion:
                 window = replace(window, mission_goal=None)
             names = ("first_row", "last_row", "iteration_rows")
             rows = {name: getattr(window, name) - first for name in names}
-            self.writer.add_window(replace(window, log_name=name, ego=EGO, **rows))
+            self.writer.add_window(replace(window, log_name=name, ego=scenarios.EGO, **rows))
             report.converted.append(window.token)
         report.flaws.update({f"log {log.name}: {what}": n for what, n in (+flaws).items()})

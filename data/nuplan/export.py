@@ -5,7 +5,6 @@ OUT/maps/nuplan-maps-v1.0.json, OUT/maps/<map>/<version>/map.gpkg
 OUT/tokens.txt                      tokens of the scenarios, one per line
 """
 
-import json
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -16,7 +15,7 @@ import numpy as np
 
 from shiftsim.data.nuplan.export_log import log_token, write_nuplan_log
 from shiftsim.data.nuplan.export_map import epsg_of, write_nuplan_map
-from shiftsim.data.nuplan.scenarios import FUTURE_ROWS, PAST_ROWS, Mapping
+from shiftsim.data.nuplan.scenarios import FUTURE_ROWS, PAST_ROWS, Mapping, read_index
 from shiftsim.data.readers.samples import ego_states as states_of
 from shiftsim.data.recording import EgoTrace, Recording, Window, scenario
 from shiftsim.data.store.reading import ScenarioStore
@@ -112,10 +111,7 @@ def read_with_surroundings(store: ScenarioStore, token: str) -> Scenario:
     """A scenario with as many rows before and after its iterations as a conversion keeps.
 
     These are rows of its recording, as far as the ego was recorded there: those that its window
-    leaves out, too.
-
-    Raises:
-        DataError: The store is damaged.
+    leaves out, too. Raises DataError: the store is damaged.
     """
     shown, window = store.read(token), store.window(token)
     stored, trace = store.recording(window.log_name), store.ego(window.log_name, window.ego)
@@ -171,12 +167,8 @@ def plain_name(name: str) -> str:
 
 def _write_maps(store: ScenarioStore, report: ExportReport) -> None:
     index = report.maps / _INDEX
-    try:
-        listed = json.loads(index.read_text("utf-8")) if index.is_file() else {}
-        versions = {name: entry["version"] for name, entry in listed.items()}
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        what = f"{index}: not an index of maps: {error!r}"
-        raise ConversionError(what, hint="choose another folder") from error
+    listed = read_index(index) if index.is_file() else {}
+    versions = {name: entry["version"] for name, entry in listed.items()}
     for city in report.cities:
         if versions.get(city, MAP_VERSION) != MAP_VERSION:
             raise ConversionError(

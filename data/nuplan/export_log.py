@@ -35,38 +35,39 @@ HEIGHTS = {
 _SCENES = 5  # nuPlan rule 411: the first two and the last two are ignored
 _PICKLE = 2  # protocol
 
-_TABLES = {
-    "log": "token BLOB NOT NULL, vehicle_name VARCHAR(64), date VARCHAR(64), timestamp INTEGER, "
-    "logfile VARCHAR(64), location VARCHAR(64), map_version VARCHAR(64), PRIMARY KEY (token)",
-    "lidar": "token BLOB NOT NULL, log_token BLOB NOT NULL, channel VARCHAR(64), "
-    "model VARCHAR(64), translation BLOB, rotation BLOB, PRIMARY KEY (token)",
-    "camera": "token BLOB NOT NULL, log_token BLOB NOT NULL, channel VARCHAR(64), "
-    "model VARCHAR(64), translation BLOB, rotation BLOB, intrinsic BLOB, distortion BLOB, "
-    "width INTEGER, height INTEGER, PRIMARY KEY (token)",
-    "image": "token BLOB NOT NULL, next_token BLOB, prev_token BLOB, "
-    "ego_pose_token BLOB NOT NULL, camera_token BLOB NOT NULL, filename_jpg VARCHAR(128), "
-    "timestamp INTEGER, PRIMARY KEY (token)",
-    "ego_pose": "token BLOB NOT NULL, timestamp INTEGER, x FLOAT, y FLOAT, z FLOAT, qw FLOAT, "
-    "qx FLOAT, qy FLOAT, qz FLOAT, vx FLOAT, vy FLOAT, vz FLOAT, acceleration_x FLOAT, "
-    "acceleration_y FLOAT, acceleration_z FLOAT, angular_rate_x FLOAT, angular_rate_y FLOAT, "
-    "angular_rate_z FLOAT, epsg INTEGER, log_token BLOB NOT NULL, PRIMARY KEY (token)",
-    "scene": "token BLOB NOT NULL, log_token BLOB NOT NULL, name TEXT, goal_ego_pose_token BLOB, "
-    "roadblock_ids TEXT, PRIMARY KEY (token)",
-    "lidar_pc": "token BLOB NOT NULL, next_token BLOB, prev_token BLOB, "
-    "ego_pose_token BLOB NOT NULL, lidar_token BLOB NOT NULL, scene_token BLOB NOT NULL, "
-    "filename VARCHAR(128), timestamp INTEGER, PRIMARY KEY (token)",
-    "category": "token BLOB NOT NULL, name VARCHAR(64), description TEXT, PRIMARY KEY (token)",
-    "track": "token BLOB NOT NULL, category_token BLOB NOT NULL, width FLOAT, length FLOAT, "
-    "height FLOAT, PRIMARY KEY (token)",
-    "lidar_box": "token BLOB NOT NULL, lidar_pc_token BLOB NOT NULL, track_token BLOB NOT NULL, "
-    "next_token BLOB, prev_token BLOB, x FLOAT, y FLOAT, z FLOAT, width FLOAT, length FLOAT, "
-    "height FLOAT, vx FLOAT, vy FLOAT, vz FLOAT, yaw FLOAT, confidence FLOAT, "
-    "PRIMARY KEY (token)",
-    "scenario_tag": "token BLOB NOT NULL, lidar_pc_token BLOB NOT NULL, type TEXT, "
-    "agent_track_token BLOB, PRIMARY KEY (token)",
-    "traffic_light_status": "token BLOB NOT NULL, lidar_pc_token BLOB NOT NULL, "
-    "lane_connector_id INTEGER, status VARCHAR(8), PRIMARY KEY (token)",
+# tables with their columns: `!` is a token that must be there, the letters are of `_TYPES`
+_COLUMNS = {
+    "log": "token! vehicle_name:64 date:64 timestamp:i logfile:64 location:64 map_version:64",
+    "lidar": "token! log_token! channel:64 model:64 translation:b rotation:b",
+    "camera": "token! log_token! channel:64 model:64 translation:b rotation:b intrinsic:b"
+    " distortion:b width:i height:i",
+    "image": "token! next_token:b prev_token:b ego_pose_token! camera_token! filename_jpg:128"
+    " timestamp:i",
+    "ego_pose": "token! timestamp:i x y z qw qx qy qz vx vy vz acceleration_x acceleration_y"
+    " acceleration_z angular_rate_x angular_rate_y angular_rate_z epsg:i log_token!",
+    "scene": "token! log_token! name:t goal_ego_pose_token:b roadblock_ids:t",
+    "lidar_pc": "token! next_token:b prev_token:b ego_pose_token! lidar_token! scene_token!"
+    " filename:128 timestamp:i",
+    "category": "token! name:64 description:t",
+    "track": "token! category_token! width length height",
+    "lidar_box": "token! lidar_pc_token! track_token! next_token:b prev_token:b x y z width length"
+    " height vx vy vz yaw confidence",
+    "scenario_tag": "token! lidar_pc_token! type:t agent_track_token:b",
+    "traffic_light_status": "token! lidar_pc_token! lane_connector_id:i status:8",
 }
+_TYPES = {"": "FLOAT", "i": "INTEGER", "t": "TEXT", "b": "BLOB"}
+
+
+def _definition(columns: str) -> str:
+    """The columns of a table in SQL."""
+    out = []
+    for text in columns.split():
+        name, _, kind = text.partition(":")
+        sql = f"VARCHAR({kind})" if kind.isdigit() else _TYPES[kind]
+        out.append(f"{name[:-1]} BLOB NOT NULL" if name.endswith("!") else f"{name} {sql}")
+    return ", ".join([*out, "PRIMARY KEY (token)"])
+
+
 _INDEXES = tuple(
     f"CREATE INDEX {table}_{column}_idx ON {table} ({column})"
     for table, column in [("lidar_pc", "timestamp")]
@@ -108,28 +109,20 @@ def log_token(text: str) -> bytes:
 
 
 def connector_number(scenario: Scenario, name: str) -> int:
-    """The id of a lane connector that a traffic light of a scenario names.
-
-    Raises:
-        ConversionError: It is no integer.
-    """
+    """The id of a lane connector that a light names; a ConversionError where it is no integer."""
     try:
         return int(name)
     except ValueError as error:
-        raise ConversionError(
-            f"scenario {scenario.token!r}: a traffic light names connector {name!r}",
-            hint="nuPlan's format has integer ids",
-        ) from error
+        what = f"scenario {scenario.token!r}: a traffic light names connector {name!r}"
+        raise ConversionError(what, "nuPlan's format has integer ids") from error
 
 
 def write_nuplan_log(path: Path, scenario: Scenario, *, epsg: int) -> Mapping:
     """Write one scenario as a log: five scenes, of which the middle one holds all rows.
 
-    The file's name is the log's. Returns the mapping that cuts the scenario out again.
-
-    Raises:
-        ConversionError: A light belongs to a connector without an integer id, or the iterations
-            are not evenly spaced rows.
+    The file's name is the log's. Returns the mapping that cuts the scenario out again. Raises
+    ConversionError: a light belongs to a connector without an integer id, or the iterations are not
+    evenly spaced rows.
     """
     log = _Log(path.stem, scenario, epsg)
     place = (pickle.dumps(values, _PICKLE) for values in ([0.0] * 3, [1.0, 0.0, 0.0, 0.0]))
@@ -146,7 +139,8 @@ def write_nuplan_log(path: Path, scenario: Scenario, *, epsg: int) -> Mapping:
         anchor = log_token(scenario.token)
         rows["scenario_tag"] = [(log.make("tag"), anchor, scenario.scenario_type, None)]
     rows["traffic_light_status"] = log.lights()
-    write_database(path, _TABLES, rows, _INDEXES)
+    tables = {name: _definition(columns) for name, columns in _COLUMNS.items()}
+    write_database(path, tables, rows, _INDEXES)
     return log.mapping
 
 

@@ -76,17 +76,13 @@ def _tokens(path: Path, values: list[Any]) -> frozenset[str]:
 
 def _from_values(path: Path, values: Mapping[str, Any]) -> ScenarioFilter:
     if values.get("expand_scenarios"):
-        raise ConfigError(
-            f"{path}: expand_scenarios: true makes scenarios of a single row",
-            hint="nothing can be simulated in them: set it to false",
-        )
+        what = f"{path}: expand_scenarios: true makes scenarios of a single row"
+        raise ConfigError(what, "nothing can be simulated in them: set it to false")
     known = {*_KEYS, "_target_", "_convert_", "expand_scenarios", "token_set_path"}
     for key, value in values.items():
         if key not in known and value is not None and value is not False:
-            raise ConfigError(
-                f"{path}: {key}: {value!r} is not known",
-                hint=f"leave it out; known are {', '.join(sorted(known))}",
-            )
+            what = f"{path}: {key}: {value!r} is not known"
+            raise ConfigError(what, f"leave it out; known are {', '.join(sorted(known))}")
     found = {name: read(path, values, key) for key, (name, read) in _KEYS.items()}
     if found["speed_noise"] is None:
         del found["speed_noise"]

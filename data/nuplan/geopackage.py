@@ -83,8 +83,7 @@ class GeoPackage:
     def table(self, name: str, columns: str = "", extra: str = "") -> LayerTable:
         """A layer with the columns named, separated by blanks; those in `extra` may be missing.
 
-        Raises:
-            DataError: The layer or a column is missing, or a geometry is broken.
+        Raises DataError: the layer or a column is missing, or a geometry is broken.
         """
         raw = self.database.columns(name, ["fid", "geom", *columns.split()], extra.split())
         where = f"{self.path}: layer {name!r}"

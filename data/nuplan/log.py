@@ -75,11 +75,7 @@ class Log:
 
 @contextmanager
 def open_log(path: Path) -> Iterator[Log]:
-    """Open a log and read its clock.
-
-    Raises:
-        DataError: The file is broken, or a table, column or the merged point cloud is missing.
-    """
+    """Open a log and read its clock; a DataError where it is broken or lacks something."""
     with open_database(Path(path)) as database:
         for table, columns in _TABLES.items():
             database.require(table, columns.split())
@@ -93,10 +89,8 @@ def _read_clock(database: Database) -> Log:
         raise _damaged(path, "table 'log' names no map in map_version")
     lidars = database.query("SELECT token FROM lidar WHERE channel = ?", "lidar", [LIDAR_CHANNEL])
     if not lidars:
-        raise DataError(
-            f"{path}: table 'lidar' has no channel {LIDAR_CHANNEL!r}",
-            hint="the log was exported without its lidar rows; export it again",
-        )
+        what = f"{path}: table 'lidar' has no channel {LIDAR_CHANNEL!r}"
+        raise DataError(what, "the log was exported without its lidar rows; export it again")
     rows = database.query(
         "SELECT pc.token, pc.timestamp, pc.scene_token, pc.next_token, pc.rowid"
         " FROM lidar_pc AS pc JOIN lidar AS l ON pc.lidar_token = l.token"
@@ -243,10 +237,8 @@ def read_ego(log: Log, first: int, last: int, flaws: Counter[str] | None = None)
     states[:, :2], states[:, 2], states[:, 3:7] = values[:, :2], heading, values[:, 6:10]
     bad = np.flatnonzero(~np.isfinite(states).all(axis=1))
     if len(bad):
-        raise ConversionError(
-            f"{log.path}: ego_pose of lidar_pc {log.tokens[first + int(bad[0])]!r} is not finite",
-            hint="leave this scenario out or repair the log",
-        )
+        what = f"{log.path}: ego_pose of lidar_pc {log.tokens[first + int(bad[0])]!r} is not finite"
+        raise ConversionError(what, "leave this scenario out or repair the log")
     counts = Counter[str]() if flaws is None else flaws
     note_implausible("ego_pose", _EGO_COLUMNS, states[:, :7], counts)
     for name, values in zip(_EGO_COLUMNS, states.T, strict=False):

@@ -22,9 +22,7 @@ def thin_out(entries: Sequence[ScenarioEntry], chosen: ScenarioFilter) -> list[S
     """The entries that are left of those of all logs, in the order of the logs.
 
     nuPlan rule 432: so many per type, then so many in all, then those far enough apart in time.
-
-    Raises:
-        ConfigError: nuPlan would draw some of them at random.
+    Raises ConfigError: nuPlan would draw some of them at random.
     """
     by_type: dict[str, list[ScenarioEntry]] = {}
     for entry in entries:

@@ -4,18 +4,12 @@ import json
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from shiftsim.data.nuplan.boxes import make_tracks, read_boxes
-from shiftsim.data.nuplan.log import (
-    Log,
-    has_goals,
-    read_ego,
-    read_lights,
-    read_route,
-    read_types,
-)
+from shiftsim.data.nuplan.log import Log, has_goals, read_ego, read_lights, read_route, read_types
 from shiftsim.data.nuplan.map import read_map
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.errors import ConfigError, ConversionError, DataError
@@ -145,10 +139,8 @@ def cut_window(
     """The rows of a scenario; the window counts rows from the start of the log.
 
     `token` names the anchor row; where `mapping` is None, it is nuPlan's for the type. That is the
-    anchor's own where `scenario_type` is None.
-
-    Raises:
-        ConversionError: The log does not have the token, or too few rows there.
+    anchor's own where `scenario_type` is None. Raises ConversionError: the log does not have the
+    token, or too few rows there.
     """
     if token not in log.row_of:
         raise ConversionError(f"{log.path}: there is no lidar_pc {token!r}", hint="check the token")
@@ -206,35 +198,28 @@ def read_span(
 
 
 def find_maps(folder: Path) -> dict[str, Path]:
-    """Files `map.gpkg` of a folder of nuPlan maps, by map name.
-
-    Raises:
-        DataError: There is no index file, or it is broken or names a missing map.
-    """
+    """Files `map.gpkg` by map name; a DataError where the index is missing or broken."""
     indexes = sorted(folder.glob("*maps*.json"))
     if not indexes:
-        raise DataError(
-            f"{folder}: no index such as nuplan-maps-v1.0.json",
-            hint="give the folder that holds it, in nuPlan $NUPLAN_MAPS_ROOT",
-        )
-    out = {}
-    for index in indexes:
-        try:
-            for name, entry in json.loads(index.read_text("utf-8")).items():
-                out[name] = folder / name / str(entry["version"]) / "map.gpkg"
-        except (TypeError, KeyError, AttributeError) as error:
-            raise DataError(f"{index}: a map has no version", hint="get it again") from error
-        except (OSError, ValueError, RecursionError) as error:
-            raise DataError(f"{index}: not readable JSON: {error}", hint="get it again") from error
-    return out
+        what = f"{folder}: no index such as nuplan-maps-v1.0.json"
+        raise DataError(what, "give the folder that holds it, in nuPlan $NUPLAN_MAPS_ROOT")
+    listed = [item for index in indexes for item in read_index(index).items()]
+    return {name: folder / name / str(it["version"]) / "map.gpkg" for name, it in listed}
+
+
+def read_index(path: Path) -> dict[str, Any]:
+    """What an index lists of each map, its version at least, or a DataError."""
+    try:
+        listed: dict[str, Any] = json.loads(path.read_text("utf-8"))
+        [entry["version"] for entry in listed.values()]
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        what = f"{path}: not an index of maps: {error!r}"
+        raise DataError(what, hint="get it again, or choose another folder") from error
+    return listed
 
 
 def load_map(maps: dict[str, Path], name: str) -> VectorMap:
-    """Read one of the maps found by `find_maps`.
-
-    Raises:
-        DataError: There is no such map.
-    """
+    """One of the maps found by `find_maps`, or a DataError."""
     if name not in maps:
         raise DataError(
             f"there is no map {name!r} in the map folder", hint=f"found: {', '.join(sorted(maps))}"

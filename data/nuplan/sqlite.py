@@ -22,11 +22,7 @@ _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 
 
 class Database:
-    """An open file. Made by `open_database`.
-
-    Attributes:
-        path: The file.
-    """
+    """An open file. Made by `open_database`."""
 
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
         self.path = path
@@ -44,8 +40,7 @@ class Database:
     ) -> list[tuple[Any, ...]]:
         """All rows of a query whose names are ours or were checked by `require`.
 
-        Raises:
-            DataError: The file cannot be read; the message says `what` is read.
+        Raises DataError: the file cannot be read; the message says `what` is read.
         """
         try:
             return self._connection.execute(sql, tuple(parameters)).fetchall()
@@ -53,11 +48,7 @@ class Database:
             raise DataError(f"{self.path}: cannot read {what}: {error}", hint=_REPAIR) from error
 
     def require(self, table: str, columns: Sequence[str]) -> None:
-        """Make sure that an ordinary table with these columns exists.
-
-        Raises:
-            DataError: It does not.
-        """
+        """A DataError unless an ordinary table with these columns exists."""
         if table not in self._columns:
             raise DataError(f"{self.path}: table {table!r} is missing", hint=_REPAIR)
         missing = [name for name in columns if name not in self._columns[table]]
@@ -69,8 +60,7 @@ class Database:
     ) -> dict[str, list[object]]:
         """Whole columns of a table in the order of its rows; None where an optional one is missing.
 
-        Raises:
-            DataError: The table or a required column is missing, or the file cannot be read.
+        Raises DataError: the table or a required column is missing, or the file cannot be read.
         """
         self.require(table, required)
         present = [*required, *(name for name in optional if name in self._columns[table])]
@@ -83,11 +73,7 @@ class Database:
 
 @contextmanager
 def open_database(path: Path) -> Iterator[Database]:
-    """Open a file for reading; nothing in it is trusted and nothing is written.
-
-    Raises:
-        DataError: There is no such file, or it is not an SQLite database.
-    """
+    """Open an SQLite file for reading, or a DataError; nothing in it is trusted."""
     if not path.is_file():
         raise DataError(f"{path}: no such file", hint="check the path")
     # Without a journal beside it, nobody can be writing: no locks, also on read-only media.

@@ -86,8 +86,7 @@ def read_recording(
 ) -> TrackSamples:
     """One recording, checked; `category_map` gives the known category for names of the data set.
 
-    Raises:
-        ConversionError: A file is missing or broken, or its content contradicts itself.
+    Raises ConversionError: a file is missing or broken, or its content contradicts itself.
     """
     folder = site.folder / "annotations" / name
     warnings: Counter[str] = Counter()

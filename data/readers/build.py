@@ -13,23 +13,9 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from shiftsim.data.readers import motion
 from shiftsim.data.readers.codes import CATEGORIES, KIND_NAMES, LARGE, SIZES
-from shiftsim.data.readers.motion import (
-    believed_velocities,
-    contradiction,
-    fitted_velocities,
-    headings_of_motion,
-    held_headings,
-    track_medians,
-    unit_vectors,
-)
-from shiftsim.data.readers.samples import (
-    ROW_S,
-    ROW_US,
-    TrackSamples,
-    rows_between,
-    sample_run,
-)
+from shiftsim.data.readers.samples import ROW_S, ROW_US, TrackSamples, rows_between, sample_run
 from shiftsim.errors import ConversionError
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.world.state import AgentKind
@@ -58,8 +44,8 @@ def by_share_of_speed(
     stored: FloatArray, xy: FloatArray, time: FloatArray, track: IntArray, period: float
 ) -> tuple[FloatArray, BoolArray]:
     """The rule for tables: slopes of parabolas; errors of 10 % of the speed contradict."""
-    derived = fitted_velocities(xy, time, track, period)
-    return derived, contradiction(stored, derived, time, track)[0]
+    derived = motion.fitted_velocities(xy, time, track, period)
+    return derived, motion.contradiction(stored, derived, time, track)[0]
 
 
 def make_samples(
@@ -134,7 +120,7 @@ def make_samples(
     kinds = np.array([kind_of[category] for category in names], np.int64)
     derived, contradicts = velocity_rule(velocities, xy, time, track, frames.period)
     contradicts[track[(np.abs(velocities) > _MAX_SPEED).any(axis=1)]] = True
-    velocities = believed_velocities(velocities, derived, contradicts, track, warnings)
+    velocities = motion.believed_velocities(velocities, derived, contradicts, track, warnings)
     raw = full_headings(headings, velocities, track, warnings)
     samples = TrackSamples(
         name=name,
@@ -145,7 +131,7 @@ def make_samples(
         track=track,
         xy=xy,
         raw_headings=raw,
-        headings=held_headings(raw, velocities, time, track, warnings),
+        headings=motion.held_headings(raw, velocities, time, track, warnings),
         velocities=velocities,
         track_ids=track_ids,
         categories=names,
@@ -261,8 +247,7 @@ def _track_categories(
 ) -> tuple[str, ...]:
     """N most frequent category of every track; `category` (A,) are indices of `names`.
 
-    Raises:
-        ConversionError: One is not among the `known`.
+    Raises ConversionError: one is not among the `known`.
     """
     pairs, votes = np.unique(track * len(names) + category, return_counts=True)
     voted_track, voted = np.divmod(pairs, len(names))
@@ -286,8 +271,8 @@ def full_headings(
         return headings
     if given.any():
         warnings["rows without heading (direction of motion)"] += int((~given).sum())
-    ways = np.where(given[:, None], unit_vectors(headings), velocities)
-    return np.where(given, headings, headings_of_motion(ways, track, warnings))
+    ways = np.where(given[:, None], motion.unit_vectors(headings), velocities)
+    return np.where(given, headings, motion.headings_of_motion(ways, track, warnings))
 
 
 def full_sizes(
@@ -301,7 +286,7 @@ def full_sizes(
     each = zip(categories, kinds.tolist(), strict=True)
     usual = np.array([LARGE.get(name) or SIZES[AgentKind(kind)] for name, kind in each])
     known = (sizes > 0.0).all(axis=1)  # rows without a size say nothing of it
-    medians = track_medians(sizes[known], track[known], len(usual))
+    medians = motion.track_medians(sizes[known], track[known], len(usual))
     lacking = ~(medians > 0.0).all(axis=1)
     warnings["tracks without size (that of their kind)"] += int(lacking.sum())
     medians[lacking, :2] = usual[lacking]

@@ -23,11 +23,7 @@ from typing import Any
 
 from shiftsim._version import __version__
 from shiftsim.data.readers.reader import Reader
-from shiftsim.data.readers.scenarios import (
-    RecordingSummary,
-    convert_recording,
-    require_scenarios,
-)
+from shiftsim.data.readers.scenarios import RecordingSummary, convert_recording, require_scenarios
 from shiftsim.data.store import schema
 from shiftsim.data.store.map import write_map
 from shiftsim.data.store.reading import read_report

@@ -17,7 +17,7 @@ from shiftsim.data.maps.builder import BuiltMap
 from shiftsim.data.maps.opendrive.reading import read_opendrive
 from shiftsim.data.maps.opendrive.records import OpenDrive
 from shiftsim.data.readers.annotations import Dsc3dFile, Site, read_recording
-from shiftsim.data.readers.convert import ConversionReport, Executor, Progress, convert, serial_map
+from shiftsim.data.readers.convert import ConversionReport, convert
 from shiftsim.data.readers.placement import place_on_map
 from shiftsim.data.readers.reader import Reader, SourceRecording, opendrive_site
 from shiftsim.data.readers.samples import TrackSamples
@@ -41,22 +41,15 @@ _META = {
 class Dsc3dReader(Reader):
     """A DSC3D download with its map; its recordings are named by their folders.
 
-    Args:
-        src: Folder with `data_meta.json`, `annotations/` and `map/`.
-        site: Name of the site in the store; the name of the folder by default.
-        map_path: OpenDRIVE file, where it is not in the download.
-        config: Thresholds.
-
-    Raises:
-        ConversionError: The folder or its map cannot be read, or contradict each other.
+    Raises ConversionError: the folder or its map cannot be read, or contradict each other.
     """
 
     def __init__(
         self,
-        src: Path,
+        src: Path,  # folder with `data_meta.json`, `annotations/` and `map/`
         *,
-        site: str | None = None,
-        map_path: Path | None = None,
+        site: str | None = None,  # name in the store; that of the folder by default
+        map_path: Path | None = None,  # OpenDRIVE file, where it is not in the download
         config: ConversionConfig | None = None,
     ) -> None:
         self.config = config or ConversionConfig()
@@ -134,28 +127,16 @@ class Dsc3dReader(Reader):
 
 
 def convert_dsc3d(
-    src: Path,
-    store: Path,
-    *,
-    site: str | None = None,
-    map_path: Path | None = None,
-    options: ConversionConfig | None = None,
-    progress: Progress | None = None,
-    executor: Executor = serial_map,
+    src: Path, store: Path, *, site: str | None = None, options: ConversionConfig | None = None
 ) -> ConversionReport:
     """Convert a DSC3D download to scenarios in a store: `convert` of a `Dsc3dReader`."""
-    reader = Dsc3dReader(src, site=site, map_path=map_path, config=options)
-    return convert(reader, store, progress=progress, executor=executor)
+    return convert(Dsc3dReader(src, site=site, config=options), store)
 
 
 def open_site(src: Path) -> Site:
-    """The site of a DSC3D download, from its `data_meta.json`.
+    """The site of a DSC3D download, from its `data_meta.json`; else a ConversionError.
 
-    Args:
-        src: The folder that holds `data_meta.json`, or one above a `data` or `release/data` folder.
-
-    Raises:
-        ConversionError: The file is missing, not JSON, without a key or of another major version.
+    `src` is the folder that holds it, or one above a `data` or `release/data` folder.
     """
     folders = (src, src / "data", src / "release/data")
     found = [folder for folder in folders if (folder / "data_meta.json").exists()]
@@ -195,11 +176,7 @@ def open_site(src: Path) -> Site:
 
 
 def find_map(site: Site, given: Path | None = None) -> Path:
-    """The OpenDRIVE file of a site: `map/map.xodr`, any file in `map/`, or `map.xodr` at the top.
-
-    Raises:
-        ConversionError: There is none.
-    """
+    """The map of a site, or a ConversionError: `map/map.xodr`, any in `map/`, or `map.xodr`."""
     if given is not None:
         if not given.is_file():
             raise ConversionError(f"map {given} does not exist", "check the path")
@@ -208,10 +185,8 @@ def find_map(site: Site, given: Path | None = None) -> Path:
     for path in (site.folder / "map/map.xodr", *others, site.folder / "map.xodr"):
         if path.is_file():
             return path
-    raise ConversionError(
-        f"{site.folder}: this download has no OpenDRIVE map (map/map.xodr)",
-        "ask DeepScenario support for the map, or give one with --map",
-    )
+    what = f"{site.folder}: this download has no OpenDRIVE map (map/map.xodr)"
+    raise ConversionError(what, "ask DeepScenario support for the map, or give one with --map")
 
 
 def _check_georeference(drive: OpenDrive, site: Site) -> None:

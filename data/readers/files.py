@@ -178,13 +178,8 @@ class SourceFile:
     ) -> pa.Table:
         """Columns of a Parquet file, or of an Arrow IPC file (`.arrow`), and its metadata.
 
-        Args:
-            wanted: Type of each column; there are no nulls but in lists whose type allows them.
-            optional: Columns that may be missing.
-
-        Raises:
-            ConversionError: The file is missing, broken or without rows, a column is missing or of
-                another type, or has nulls where it may not.
+        All have the type that is `wanted`, and no nulls but in lists whose type allows them; those
+        that are `optional` may be missing. Else it is a ConversionError.
         """
         self.require_size()
         try:
@@ -278,9 +273,8 @@ def _nulls(found: pa.Array, kind: pa.DataType, *, allowed: bool = False) -> int:
 class SceneFolder(Reader):
     """What the readers of folders of scenes share; each scene has a map of its own.
 
-    Args:
-        source: Where the files are; a file itself is the only scene.
-        vehicles: Whether every vehicle that drives is an ego, not the recording car alone.
+    `source` may be the only scene itself. With `vehicles` every vehicle that drives is an ego, not
+    the recording car alone.
     """
 
     name = ""  # of the data set

@@ -34,27 +34,16 @@ class SourceRecording:
 
 
 class Reader(ABC):
-    """A source of recordings. It must pickle.
+    """A source of recordings. It must pickle."""
 
-    Attributes:
-        name: Name of the site or of the data set.
-        source: Where it is.
-        site: The map that all recordings share, whose report the store gets; None without one.
-        settings: What the result depends on beside the files, JSON values only.
-    """
-
-    name: str
-    source: Path
-    site: BuiltMap | None
-    settings: Mapping[str, Any]
+    name: str  # of the site or of the data set
+    source: Path  # where it is
+    site: BuiltMap | None  # the map that all recordings share, whose report the store gets
+    settings: Mapping[str, Any]  # what the result depends on beside the files, JSON values only
 
     @abstractmethod
     def recordings(self) -> Sequence[str]:
-        """Names of the recordings, in the order in which they are reported.
-
-        Raises:
-            ConversionError: There is none.
-        """
+        """Names of the recordings, in the order of the report; a ConversionError without any."""
 
     @abstractmethod
     def files(self, recording: str) -> Sequence[Path]:
@@ -62,27 +51,18 @@ class Reader(ABC):
 
     @abstractmethod
     def read(self, recording: str) -> SourceRecording:
-        """One recording.
-
-        Raises:
-            DataError: A file is missing or broken, or contradicts itself.
-        """
+        """One recording; a DataError where a file is missing or broken, or contradicts itself."""
 
     def summarise(self, entries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         """What the report says of all recordings, from the entry of each, details included.
 
-        Raises:
-            ConversionError: They and the map contradict each other; nothing is written then.
+        Raises ConversionError: they and the map contradict each other; nothing is written then.
         """
         return {}
 
 
 def opendrive_site(drive: OpenDrive, *, name: str, **how: Any) -> BuiltMap:
-    """The map of a site from OpenDRIVE; `how` as for `build_road_map`.
-
-    Raises:
-        ConversionError: It has no lane that cars may use.
-    """
+    """The map of a site from OpenDRIVE, as `build_road_map`; else a ConversionError."""
     road, report = build_road_map(drive, name=name, **how)
     require_lanes(drive, report)
     return site_map(road, report.warnings)

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from shiftsim.data.maps.lights import light_rows
+from shiftsim.data.readers import windows
 from shiftsim.data.readers.placement import extent_of
 from shiftsim.data.readers.reader import SourceRecording, site_map
 from shiftsim.data.readers.routes import find_route, starts_on_lane
@@ -29,21 +30,6 @@ from shiftsim.data.readers.samples import (
     rows_between,
     rows_of,
     sample_run,
-)
-from shiftsim.data.readers.windows import (
-    CATEGORY,
-    EGO,
-    GAP,
-    LANE,
-    OVERLAP,
-    PRESENCE,
-    ROUTE,
-    SPEED,
-    ConversionConfig,
-    Span,
-    WindowVerdicts,
-    evaluate_windows,
-    window_spans,
 )
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.data.store.writing import StoreWriter
@@ -94,20 +80,20 @@ def make_scenarios(samples: TrackSamples, road: VectorMap, **how: Any) -> Conver
 
 def convert_recording(source: SourceRecording) -> Converted:
     """All scenarios of one recording of a source; see `make_scenarios`."""
-    config = source.config or ConversionConfig(ego_categories=EGO_CATEGORIES)
+    config = source.config or windows.ConversionConfig(ego_categories=EGO_CATEGORIES)
     samples, road = replace(source.samples, max_hole_s=config.max_hole_s), source.map.road
     spans = source.spans
     if spans is None:
         spans = list(_usable_spans(samples, source.egos, config, source.left_out_s))
-    windows = evaluate_windows(samples, config, spans)
+    verdicts = windows.evaluate_windows(samples, config, spans)
     padding = rows_of(config.padding_s)
     recording = resample(samples, f"{road.name}_{samples.name}", road.name, padding)
     rejected: Counter[str] = Counter()
-    accepted = _accepted_runs(windows, config, rejected)
+    accepted = _accepted_runs(verdicts, config, rejected)
     traces: list[EgoTrace] = []
     scenarios: list[Window] = []
     for run, numbers in sorted(accepted.items()):
-        spans = [windows[number].span for number in numbers]
+        spans = [verdicts[number].span for number in numbers]
         first = min(rows_of(span.start_s) for span in spans)
         last = max(rows_of(span.start_s) + rows_of(span.length_s) for span in spans) + padding
         rows = {"first_row": first, "last_row": last, "padding": padding}
@@ -132,8 +118,8 @@ def convert_recording(source: SourceRecording) -> Converted:
         name=samples.name,
         duration_s=samples.duration,
         tracks=len(samples.track_ids),
-        windows=len(windows),
-        seen=sum(len(window.tracks) for window in windows),
+        windows=len(verdicts),
+        seen=sum(len(window.tracks) for window in verdicts),
         candidates=sum(map(len, accepted.values())),
         accepted=len(scenarios),
         rejected=dict(sorted(rejected.items())),
@@ -145,25 +131,21 @@ def convert_recording(source: SourceRecording) -> Converted:
 
 # what helps against a rule that leaves no ego
 _REMEDIES = {
-    CATEGORY: "only cars, vans, pickups and vehicles become egos by themselves: name another with"
-    " --ego ID",
-    PRESENCE: "no vehicle is seen throughout a window: try shorter ones, --window-s 10"
+    windows.CATEGORY: "only cars, vans, pickups and vehicles become egos by themselves: name"
+    " another with --ego ID",
+    windows.PRESENCE: "no vehicle is seen throughout a window: try shorter ones, --window-s 10"
     " --overlap-s 5 --history-s 2, or name an ego whose own time is taken, --ego ID",
-    SPEED: "all vehicles stand",
-    OVERLAP: "boxes lie on one another: check sizes and headings, and whether an object is in the"
-    " file twice",
-    LANE: "egos start beside the lanes or against them: look at the picture",
-    ROUTE: "egos touch no road of the map: look at the picture",
-    GAP: "egos change between roads that the map does not link: add the links to the map",
+    windows.SPEED: "all vehicles stand",
+    windows.OVERLAP: "boxes lie on one another: check sizes and headings, and whether an object is"
+    " in the file twice",
+    windows.LANE: "egos start beside the lanes or against them: look at the picture",
+    windows.ROUTE: "egos touch no road of the map: look at the picture",
+    windows.GAP: "egos change between roads that the map does not link: add the links to the map",
 }
 
 
 def require_scenarios(summary: RecordingSummary, source: Path) -> None:
-    """Raise an error if a recording has no scenario.
-
-    Raises:
-        ConversionError: It has none; the rule that dropped most of the egos, and a remedy.
-    """
+    """A ConversionError if a recording has no scenario, with the rule that dropped most egos."""
     if summary.accepted:
         return
     if not summary.seen:
@@ -173,11 +155,11 @@ def require_scenarios(summary: RecordingSummary, source: Path) -> None:
             "check the unit of time, or --hz",
         )
     counts = ", ".join(f"{rule} {count}" for rule, count in summary.rejected.items())
-    others = {rule: count for rule, count in summary.rejected.items() if rule != CATEGORY}
+    others = {rule: count for rule, count in summary.rejected.items() if rule != windows.CATEGORY}
     raise ConversionError(
         f"{source}: no scenario is left of {summary.seen} pairs of window and object; dropped"
         f" by the rules {counts}",
-        _REMEDIES[max(others, key=lambda rule: others[rule]) if others else CATEGORY],
+        _REMEDIES[max(others, key=lambda rule: others[rule]) if others else windows.CATEGORY],
     )
 
 
@@ -192,8 +174,11 @@ def write_converted(writer: StoreWriter, converted: Converted) -> None:
 
 
 def _usable_spans(
-    samples: TrackSamples, egos: Sequence[str] | None, config: ConversionConfig, left_out_s: float
-) -> Iterator[Span]:
+    samples: TrackSamples,
+    egos: Sequence[str] | None,
+    config: windows.ConversionConfig,
+    left_out_s: float,
+) -> Iterator[windows.Span]:
     """Windows of a recording; those of named egos begin where each is first seen."""
     runs, end = samples.runs, samples.duration - left_out_s
     if egos is None:
@@ -216,40 +201,44 @@ def _usable_spans(
             yield from _spans(int(first[run]), int(rows[run]), numbers[ego], config)
 
 
-def _spans(first: int, rows: int, only: int, config: ConversionConfig) -> Iterator[Span]:
+def _spans(
+    first: int, rows: int, only: int, config: windows.ConversionConfig
+) -> Iterator[windows.Span]:
     """Windows within some rows of 0.05 s; one shorter window where none fits."""
-    full = window_spans(rows * ROW_S, config)
+    full = windows.window_spans(rows * ROW_S, config)
     for span in full:
         start = round((first + rows_of(span.start_s)) * ROW_S, 2)
-        yield Span(start, span.length_s, span.history_s, only)
+        yield windows.Span(start, span.length_s, span.history_s, only)
     if not full and rows * ROW_S >= SHORT_HISTORY_S + _LEAST_S:
         history = min(SHORT_HISTORY_S, config.history_s)
-        yield Span(round(first * ROW_S, 2), round(rows * ROW_S, 2), history, only)
+        yield windows.Span(round(first * ROW_S, 2), round(rows * ROW_S, 2), history, only)
 
 
 def _accepted_runs(
-    windows: Sequence[WindowVerdicts], config: ConversionConfig, rejected: Counter[str]
+    verdicts: Sequence[windows.WindowVerdicts],
+    config: windows.ConversionConfig,
+    rejected: Counter[str],
 ) -> dict[int, list[int]]:
     """Numbers of the windows in which each run may serve as ego; the others are counted."""
     accepted: dict[int, list[int]] = {}
-    for number, window in enumerate(windows):
+    for number, window in enumerate(verdicts):
         num_egos = 0
         for run, verdict in zip(window.runs.tolist(), window.verdicts, strict=True):
-            if verdict == EGO and num_egos != config.max_per_window:
+            if verdict == windows.EGO and num_egos != config.max_per_window:
                 accepted.setdefault(run, []).append(number)
                 num_egos += 1
             else:
-                rejected[verdict if verdict != EGO else "beyond max_per_window"] += 1
+                rejected[verdict if verdict != windows.EGO else "beyond max_per_window"] += 1
     return accepted
 
 
 def _scenario(
     source: SourceRecording,
     samples: TrackSamples,
-    config: ConversionConfig,
+    config: windows.ConversionConfig,
     run: int,
     number: int,
-    span: Span,
+    span: windows.Span,
     trace: EgoTrace,
 ) -> Window | str:
     """The scenario of an ego in a window, or the rule that its start or its route fails."""
@@ -257,14 +246,14 @@ def _scenario(
     (pose,), _ = sample_run(samples, run, np.array([span.start_s + span.history_s]))
     pose[:2] += samples.offset
     if not starts_on_lane(road, pose, config):
-        return LANE
+        return windows.LANE
     first = rows_of(span.start_s)  # with the padding, one padding earlier than the window
     start = first + padding + rows_of(span.history_s)
     end = first + padding + rows_of(span.length_s)
     states = trace.states[start - trace.first_row : end - trace.first_row]
     route = find_route(road, states[:, :3], config)
     if route is None or not route.is_linked:
-        return ROUTE if route is None else GAP
+        return windows.ROUTE if route is None else windows.GAP
     goal = states[-1, :3].copy()
     last = int(np.searchsorted(samples.track, track, side="right")) - 1
     if samples.time[last] > span.start_s + span.length_s:

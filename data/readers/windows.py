@@ -14,6 +14,7 @@ import shapely
 
 from shiftsim.data.readers.samples import ROW_S, TrackSamples, rows_of
 from shiftsim.errors import ConfigError, one_of
+from shiftsim.files import make_table
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.world.ranges import SETTINGS
@@ -65,12 +66,14 @@ class ConversionConfig:
     category_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            _check_type(item.name, getattr(self, item.name))
+        for name in SETTINGS.keys() & {item.name for item in fields(self)}:
+            value = getattr(self, name)
+            if value is not None and not SETTINGS[name].holds(value):
+                raise ConfigError(f"{name} is {value!r}; it must be within {SETTINGS[name]}")
         for name in ("window_s", "overlap_s", "history_s", "padding_s"):
             value = getattr(self, name)
-            if not np.isfinite(value) or value < 0 or abs(rows_of(value) * ROW_S - value) > _EPS:
-                raise ConfigError(f"{name} = {value!r} is not a multiple of {ROW_S} s, 0 or more")
+            if abs(rows_of(value) * ROW_S - value) > _EPS:
+                raise ConfigError(f"{name} = {value!r} is not a multiple of {ROW_S} s")
         if self.overlap_s >= self.window_s:
             raise ConfigError(f"overlap_s {self.overlap_s!r} must be below window_s")
         if self.window_s - self.history_s < 0.3:
@@ -91,27 +94,7 @@ def make_config(values: Mapping[str, Any]) -> ConversionConfig:
     """
     for name in values:
         one_of("setting", name, [item.name for item in fields(ConversionConfig)])
-    plain: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in values.items()}
-    return ConversionConfig(**plain)
-
-
-def _check_type(name: str, value: Any) -> None:
-    """Types are checked strictly: TOML and Python callers get the same message."""
-    count = value if isinstance(value, int) and not isinstance(value, bool) else -1
-    is_number = count >= 0 or (isinstance(value, float) and 0 <= value < np.inf)
-    texts = [*value, *getattr(value, "values", list)()] if isinstance(value, tuple | dict) else [0]
-    are_texts = all(isinstance(text, str) for text in texts)
-    is_good, wanted = {
-        "ego_categories": (isinstance(value, tuple) and are_texts, "a list of names"),
-        "category_map": (isinstance(value, dict) and are_texts, "a table of names"),
-        "country": (isinstance(value, str), "a name"),
-        "route_extension_blocks": (count >= 0, "an integer from 0 on"),
-        "max_per_window": (value is None or count > 0, "an integer from 1 on"),
-    }.get(name, (is_number, "a number from 0 on"))
-    if not is_good:
-        raise ConfigError(f"{name} is {value!r}; it must be {wanted}")
-    if name in SETTINGS and value is not None and not SETTINGS[name].holds(value):
-        raise ConfigError(f"{name} is {value!r}; it must be within {SETTINGS[name]}")
+    return make_table(ConversionConfig, values, "settings")
 
 
 @dataclass(frozen=True)

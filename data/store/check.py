@@ -22,19 +22,10 @@ from shiftsim.data.store.tables import MANIFEST, REPORTS, column, digest, read_m
 from shiftsim.errors import DataError
 from shiftsim.geometry.boxes import boxes_to_corners, wrap_angles
 from shiftsim.kernels import FloatArray, IntArray
+from shiftsim.world import state
 from shiftsim.world.map import VectorMap
 from shiftsim.world.ranges import CHECK
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import (
-    HEADING,
-    LAST_AGENT_KIND,
-    PACIFICA,
-    VX,
-    VY,
-    AgentKind,
-    LightStatus,
-    center_poses,
-)
 
 _MAX_SPEED = 100.0  # m/s; anything faster is in the wrong unit
 _LAST_STEPS_S = 0.5  # by which the last iteration may come before the end
@@ -164,10 +155,7 @@ def _noted(
 
 
 def _check_recording(
-    store: ScenarioStore,
-    name: str,
-    scenarios: list[dict[str, str]],
-    overlaps: dict[str, _Overlaps],
+    store: ScenarioStore, name: str, scenarios: list[dict[str, str]], overlaps: dict[str, _Overlaps]
 ) -> tuple[RecordingRow, list[Problem]]:
     """One recording with its egos and scenarios."""
     problems: list[Problem] = []
@@ -262,7 +250,7 @@ def _check_boxes(boxes: pa.Table, time_us: IntArray) -> Iterator[_Finding]:
         return
     motion = np.column_stack([column(boxes, name) for name in MOTION])
     kinds = column(boxes, "kind")
-    good = np.isfinite(motion).all(axis=1) & (kinds <= LAST_AGENT_KIND)
+    good = np.isfinite(motion).all(axis=1) & (kinds <= state.LAST_AGENT_KIND)
     good = np.flatnonzero(good & (row >= 0) & (row < len(time_us)))
     if not len(good) or (np.diff(time_us) <= 0).any():
         return
@@ -281,7 +269,7 @@ def _check_boxes(boxes: pa.Table, time_us: IntArray) -> Iterator[_Finding]:
         yield "velocity", what, True
     # whether most vehicles point somewhere else than they move; some do go backwards
     moving = np.hypot(derived[:, 0], derived[:, 1]) > _FAST
-    moving &= kinds[good] == AgentKind.VEHICLE
+    moving &= kinds[good] == state.AgentKind.VEHICLE
     course = np.arctan2(derived[moving, 1], derived[moving, 0])
     turned = np.abs(wrap_angles(motion[good, 2][moving] - course))
     rows = np.bincount(owner[moving], minlength=len(names))
@@ -300,8 +288,8 @@ def _check_ego(states: FloatArray, time_us: IntArray) -> Iterator[_Finding]:
     """What is wrong with the velocities of an ego, states (R, 11) at times (R,)."""
     if not np.isfinite(states).all() or (np.diff(time_us) <= 0).any():
         return
-    cos, sin = np.cos(states[:, HEADING]), np.sin(states[:, HEADING])
-    vx, vy = states[:, VX], states[:, VY]
+    cos, sin = np.cos(states[:, state.HEADING]), np.sin(states[:, state.HEADING])
+    vx, vy = states[:, state.VX], states[:, state.VY]
     stored = np.column_stack([vx * cos - vy * sin, vx * sin + vy * cos])
     time, track = (time_us - time_us[0]) * 1e-6, np.zeros(len(states), np.int64)
     derived = fitted_velocities(states[:, :2], time, track, _ROW_S)
@@ -352,8 +340,8 @@ def _seconds(scene: Scenario) -> FloatArray:
 def _check_lanes(scene: Scenario, overlaps: _Overlaps) -> Iterator[_Finding]:
     """Lanes that overlap where the ego is, else on the route."""
     road, ids = scene.map, scene.map.edges.ids
-    centers = center_poses(scene.expert[:, :3])
-    size = np.array([PACIFICA.length, PACIFICA.width])
+    centers = state.center_poses(scene.expert[:, :3])
+    size = np.array([state.PACIFICA.length, state.PACIFICA.width])
     for iteration, center in enumerate(centers):
         for x, y in [center[:2].tolist(), *boxes_to_corners(center, size).tolist()]:
             lanes = road.lanes_at(x, y)
@@ -382,7 +370,7 @@ def _check_lanes(scene: Scenario, overlaps: _Overlaps) -> Iterator[_Finding]:
 def _check_place(scene: Scenario) -> Iterator[_Finding]:
     """Where the ego is beside the map; an error where it is there for long."""
     layers = [x for x in (scene.map.edges, scene.map.drivable_areas) if len(x)]
-    centers = center_poses(scene.expert[:, :3])[:, :2]
+    centers = state.center_poses(scene.expert[:, :3])[:, :2]
     if not np.isfinite(centers).all():
         return
     off = np.array([min((x.nearest(*at)[1] for x in layers), default=np.inf) for at in centers])
@@ -420,7 +408,7 @@ def _check_route(scene: Scenario) -> Iterator[_Finding]:
 
 def _wrong_numbers(scene: Scenario) -> Iterator[str]:
     tracks, valid, codes = scene.tracks, scene.tracks.valid, scene.traffic_lights.status
-    moving = tracks.velocities[:, tracks.kinds <= LAST_AGENT_KIND]
+    moving = tracks.velocities[:, tracks.kinds <= state.LAST_AGENT_KIND]
     sizes = tracks.sizes[valid]
     with np.errstate(invalid="ignore"):
         wrong = {
@@ -428,17 +416,21 @@ def _wrong_numbers(scene: Scenario) -> Iterator[str]:
             "there are fewer than three iterations": len(scene.iteration_rows) < 3,
             "an ego state is not finite": not np.isfinite(scene.ego).all(),
             f"the ego is faster than {_MAX_SPEED:g} m/s": (
-                np.hypot(scene.ego[:, VX], scene.ego[:, VY]) > _MAX_SPEED
+                np.hypot(scene.ego[:, state.VX], scene.ego[:, state.VY]) > _MAX_SPEED
             ).any(),
-            "an ego heading is not in radians": (np.abs(scene.ego[:, HEADING]) > _MAX_ANGLE).any(),
+            "an ego heading is not in radians": (
+                np.abs(scene.ego[:, state.HEADING]) > _MAX_ANGLE
+            ).any(),
             "the mission goal is not finite": scene.mission_goal is not None
             and not np.isfinite(scene.mission_goal).all(),
             "two tracks have one token": len(set(tracks.tokens)) != tracks.num_tracks,
-            "a track has an unknown kind": not np.isin(tracks.kinds, list(AgentKind)).all(),
+            "a track has an unknown kind": not np.isin(tracks.kinds, list(state.AgentKind)).all(),
             "a track's pose is not finite": not np.isfinite(tracks.poses[valid]).all(),
             "a track has no length or width": not (sizes > 0.0).all(),
             f"a track is longer than {_MAX_LENGTH:g} m": (sizes > _MAX_LENGTH).any(),
             f"a track is faster than {_MAX_SPEED:g} m/s": (np.abs(moving) > _MAX_SPEED).any(),
-            "a traffic light has an unknown status": not np.isin(codes, list(LightStatus)).all(),
+            "a traffic light has an unknown status": not np.isin(
+                codes, list(state.LightStatus)
+            ).all(),
         }
     yield from (what for what, is_wrong in wrong.items() if is_wrong)

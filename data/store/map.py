@@ -87,8 +87,7 @@ SCHEMA = make_schema(
 def write_map(path: Path, road: VectorMap) -> None:
     """Write a map; equal maps give equal bytes.
 
-    Raises:
-        DataError: A number is outside of its range, or an index of something that is not there.
+    Raises DataError: a number is outside of its range, or an index of something that is not there.
     """
     require_sound(road, str(path))
     values: dict[str, Any] = {name: getattr(road, name) for name in ("name", *_NUMBERS)}
@@ -120,11 +119,7 @@ def _one_row(values: Any, kind: pa.DataType) -> pa.Array:
 
 
 def read_map_file(path: Path) -> VectorMap:
-    """Read a map back; its arrays are read-only, and lie in the file.
-
-    Raises:
-        DataError: The file is missing or damaged.
-    """
+    """Read a map back, or a DataError; its arrays are read-only, and lie in the file."""
     try:
         table = pa.ipc.open_file(pa.memory_map(str(path))).read_all()
         if table.schema != SCHEMA:
@@ -179,11 +174,7 @@ def _assemble(values: dict[str, Any]) -> VectorMap:
 
 
 def require_sound(road: VectorMap, where: str) -> None:
-    """Refuse a map with a number outside of its range, or an index of something that is not there.
-
-    Raises:
-        DataError: It has one.
-    """
+    """Refuse a map with a number out of its range or an index of nothing, with a DataError."""
     count = {name: len(getattr(road, name)) for name in LAYERS}
     for name in LAYERS:
         layer: Layer = getattr(road, name)

@@ -124,10 +124,8 @@ class ScenarioStore:
             DataError: The store has no such scenario.
         """
         if token not in self._row_of:
-            raise DataError(
-                f"store {self.path.name!r} has no scenario {token!r}",
-                hint="its `tokens` are the scenarios it has",
-            )
+            what = f"store {self.path.name!r} has no scenario {token!r}"
+            raise DataError(what, "its `tokens` are the scenarios it has")
         (row,) = self._table.slice(self._row_of[token], 1).to_pylist()
         try:
             window = window_of(row)
@@ -183,11 +181,7 @@ class ScenarioStore:
         return self._maps[city]
 
     def failed_checks(self) -> Iterator[tuple[Path, dict[str, int]]]:
-        """Reports of maps that failed checks when they were made, and which: count by kind.
-
-        Raises:
-            DataError: A report is damaged.
-        """
+        """Reports of maps that failed checks when they were made, and which: count by kind."""
         for name in tables.read_manifest(self.path)["files"]:
             if not name.startswith(f"{tables.REPORTS}/"):
                 continue
@@ -218,10 +212,8 @@ class ScenarioStore:
             _limit(self._recordings)
             place = self._table["recording"].index(name).as_py()
             if place < 0:
-                raise DataError(
-                    f"store {self.path.name!r} has no scenario of recording {name!r}",
-                    hint="`summary` names the recordings",
-                )
+                what = f"store {self.path.name!r} has no scenario of recording {name!r}"
+                raise DataError(what, "`summary` names the recordings")
             city = self._table["city"][place].as_py()
             self._recordings[name] = StoredRecording(self.recording_folder(name), name, city)
         return self._recordings[name]

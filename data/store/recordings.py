@@ -10,18 +10,8 @@ import numpy as np
 import pyarrow as pa
 
 from shiftsim.data.recording import EgoTrace, Recording, Window, visible_columns
-from shiftsim.data.store import schema
-from shiftsim.data.store.tables import (
-    FRAMES,
-    LIGHTS,
-    REPAIR,
-    TRACKS,
-    Table,
-    column,
-    ego_file,
-    require_ranges,
-    write_blocks,
-)
+from shiftsim.data.store import schema, tables
+from shiftsim.data.store.tables import require_ranges
 from shiftsim.errors import DataError
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.world.state import NUM_STATE, LightStatus, Tracks, TrafficLights
@@ -31,49 +21,45 @@ _Choice: TypeAlias = Callable[[BoolArray, IntArray, Sequence[str]], IntArray]
 
 
 def write_recording(folder: Path, recording: Recording) -> None:
-    """Write frames, lights and tracks of a recording.
-
-    Raises:
-        DataError: Its arrays do not fit together, or hold a number outside of its range.
-    """
+    """Write frames, lights and tracks of a recording; a DataError where numbers do not fit."""
     count, tracks = len(recording.time_us), recording.tracks
     shape = (count, len(tracks.tokens))
-    _require(tracks.valid.shape == shape and tracks.kinds.shape == shape[1:], folder / TRACKS)
+    _require(
+        tracks.valid.shape == shape and tracks.kinds.shape == shape[1:], folder / tables.TRACKS
+    )
     for values, width in ((tracks.poses, 3), (tracks.velocities, 2), (tracks.sizes, 2)):
-        _require(values.shape == (*shape, width), folder / TRACKS)
+        _require(values.shape == (*shape, width), folder / tables.TRACKS)
     lights = recording.lights
-    _require(lights.status.shape == (count, len(lights.connector_ids)), folder / LIGHTS)
-    tables = {
-        FRAMES: [frames_table(recording.time_us)],
-        LIGHTS: list(_parts(count, partial(lights_table, lights))),
-        TRACKS: list(_parts(count, partial(tracks_table, tracks))),
+    _require(lights.status.shape == (count, len(lights.connector_ids)), folder / tables.LIGHTS)
+    blocks_of = {
+        tables.FRAMES: [frames_table(recording.time_us)],
+        tables.LIGHTS: list(_parts(count, partial(lights_table, lights))),
+        tables.TRACKS: list(_parts(count, partial(tracks_table, tracks))),
     }
-    for name, blocks in tables.items():
+    for name, blocks in blocks_of.items():
         for block in blocks:
             require_ranges(block, str(folder / name))
     if (np.diff(recording.time_us) < 0).any():  # they may repeat, nuPlan rule 431
-        raise DataError(f"{folder / FRAMES}: column 'time_us' does not increase", REPAIR)
-    tables[FRAMES] = _split(tables[FRAMES][0])
-    for name, blocks in tables.items():
-        write_blocks(folder / name, blocks)
+        raise DataError(
+            f"{folder / tables.FRAMES}: column 'time_us' does not increase", tables.REPAIR
+        )
+    blocks_of[tables.FRAMES] = _split(blocks_of[tables.FRAMES][0])
+    for name, blocks in blocks_of.items():
+        tables.write_blocks(folder / name, blocks)
 
 
 def write_ego(folder: Path, ego: EgoTrace) -> None:
-    """Write the states of one ego.
-
-    Raises:
-        DataError: A number is outside of its range.
-    """
-    path = ego_file(folder, ego.name)
+    """Write the states of one ego; a DataError where a number is outside of its range."""
+    path = tables.ego_file(folder, ego.name)
     _require(ego.states.ndim == 2 and ego.states.shape[1] == NUM_STATE, path)
     table = ego_table(ego.states, ego.first_row)
     require_ranges(table, str(path))
-    write_blocks(path, _split(table))
+    tables.write_blocks(path, _split(table))
 
 
 def _require(fits: object, path: Path) -> None:
     if not fits:
-        raise DataError(f"{path}: the arrays do not fit together", REPAIR)
+        raise DataError(f"{path}: the arrays do not fit together", tables.REPAIR)
 
 
 def _split(table: pa.Table) -> list[pa.Table]:
@@ -137,24 +123,14 @@ def _as_type(values: np.ndarray, kind: pa.DataType) -> np.ndarray:
 
 
 class StoredRecording:
-    """Open files of one recording; its rows are read when asked for.
-
-    Attributes:
-        log_name: Its name.
-        city: Map it was recorded on.
-        tracks: Rows of `schema.TRACKS`.
-    """
+    """Open files of one recording; its rows are read when asked for."""
 
     def __init__(self, folder: Path, log_name: str, city: str) -> None:
-        """Open the files.
-
-        Raises:
-            DataError: A file or a column is missing, or is damaged.
-        """
+        """Open the files; a DataError where one is missing or damaged."""
         self.log_name, self.city = log_name, city
-        self.frames = Table(folder / FRAMES, schema.FRAMES)
-        self.lights = Table(folder / LIGHTS, schema.LIGHTS)
-        self.tracks = Table(folder / TRACKS, schema.TRACKS)
+        self.frames = tables.Table(folder / tables.FRAMES, schema.FRAMES)
+        self.lights = tables.Table(folder / tables.LIGHTS, schema.LIGHTS)
+        self.tracks = tables.Table(folder / tables.TRACKS, schema.TRACKS)
 
     @property
     def num_rows(self) -> int:
@@ -162,47 +138,40 @@ class StoredRecording:
         return self.frames.num_rows
 
     def read(self, first: int, last: int) -> Recording:
-        """The rows first … last - 1, as a recording of its own.
-
-        Raises:
-            DataError: A file is damaged or does not have the rows.
-        """
+        """The rows first … last - 1 as a recording of its own, or a DataError."""
         return self._read(first, last, lambda valid, *_: np.flatnonzero(valid.any(axis=0)), False)
 
     def read_window(self, window: Window, *, validate: bool) -> Recording:
-        """The rows of a window, and the tracks that it shows.
-
-        Raises:
-            DataError: A file is damaged or does not have the rows, or, where `validate` is asked
-                for, a box holds a number outside of its range.
-        """
+        """The rows of a window, and the tracks that it shows, or a DataError."""
         choose = partial(visible_columns, without=window.ego)
         return self._read(window.first_row, window.last_row, choose, validate)
 
     def _read(self, first: int, last: int, choose: _Choice, validate: bool) -> Recording:
         frames = _rows(self.frames, first, last, validate)
-        time_us = column(frames, "time_us")
+        time_us = tables.column(frames, "time_us")
         if validate and (np.diff(time_us) < 0).any():
-            raise DataError(f"{self.frames.path}: column 'time_us' does not increase", REPAIR)
+            raise DataError(
+                f"{self.frames.path}: column 'time_us' does not increase", tables.REPAIR
+            )
         lights = self._lights(first, last, validate)
         tracks = self._tracks(first, last, choose, validate)
         return Recording(self.log_name, self.city, time_us, tracks, lights)
 
     def _lights(self, first: int, last: int, validate: bool) -> TrafficLights:
         found = self.lights.read(self.lights.blocks(first, last), validate=validate)
-        row = column(found, "row")
+        row = tables.column(found, "row")
         found = found.filter(pa.array((row >= first) & (row < last)))
         light, each = _columns(found, "light")
         status = np.full((last - first, len(each)), LightStatus.ABSENT, np.int8)
-        status[column(found, "row") - first, light] = column(found, "status")
+        status[tables.column(found, "row") - first, light] = tables.column(found, "status")
         return TrafficLights(tuple(found["connector"].take(each).to_pylist()), status)
 
     def _tracks(self, first: int, last: int, choose: _Choice, validate: bool) -> Tracks:
         found = self.tracks.read(self.tracks.blocks(first, last), validate=validate)
-        row = column(found, "row") - first
+        row = tables.column(found, "row") - first
         track, each = _columns(found, "track")
         tokens: list[str] = found["token"].take(each).to_pylist()
-        kinds = column(found, "kind")[each].astype(np.int64)
+        kinds = tables.column(found, "kind")[each].astype(np.int64)
         inside = (row >= 0) & (row < last - first)  # row groups hold more than the window
         valid = np.zeros((last - first, len(each)), np.bool_)
         valid[row[inside], track[inside]] = True
@@ -216,22 +185,17 @@ class StoredRecording:
         poses, velocities, sizes = (np.full((*valid.shape, n), np.nan) for n in (3, 2, 2))
         axes = [(x.reshape(-1, x.shape[2]).T) for x in (poses, velocities, sizes)]
         for name, values in zip(schema.BOX, chain(*axes), strict=True):
-            values[boxes] = column(found, name)[inside]
+            values[boxes] = tables.column(found, name)[inside]
         return Tracks(valid, poses, velocities, sizes, kinds, tuple(tokens))
 
 
 def _columns(found: pa.Table, name: str) -> tuple[IntArray, pa.Array]:
-    """Columns in dense arrays of what the rows of a table are about.
+    """Columns in dense arrays of what A rows of a table are about, the track or light of a column.
 
-    Args:
-        found: The table, of A rows; it has few runs of equal numbers, as files are written.
-        name: Column with the number of a track or light.
-
-    Returns:
-        Column (A,) of each row, in the order of the numbers; and the index (N,) of a row of the
-        table for each column.
+    Returns the column (A,) of each row, in the order of the numbers, and the index (N,) of a row of
+    the table for each column. There are few runs of equal numbers, as files are written.
     """
-    numbers = column(found, name)
+    numbers = tables.column(found, name)
     begins = np.ones(len(numbers), np.bool_)
     begins[1:] = numbers[1:] != numbers[:-1]
     starts = np.flatnonzero(begins)
@@ -240,43 +204,31 @@ def _columns(found: pa.Table, name: str) -> tuple[IntArray, pa.Array]:
     return np.repeat(place, lengths), starts[each]
 
 
-def _rows(table: Table, first: int, last: int, validate: bool) -> pa.Table:
-    """The rows first … last - 1 of a recording, of a table that has one row for each.
-
-    Raises:
-        DataError: It is damaged or does not have them.
-    """
+def _rows(table: tables.Table, first: int, last: int, validate: bool) -> pa.Table:
+    """The rows first … last - 1 of a table with one row for each, or a DataError."""
     found = table.read(table.blocks(first, last), validate=validate)
-    row = column(found, "row")
+    row = tables.column(found, "row")
     start = int(np.searchsorted(row, first))
     rows = row[start : start + last - first]
     if not first < last or not np.array_equal(rows, np.arange(first, last)):
-        raise DataError(f"{table.path}: no rows {first} … {last - 1}", hint=REPAIR)
+        raise DataError(f"{table.path}: no rows {first} … {last - 1}", hint=tables.REPAIR)
     return found.slice(start, last - first)
 
 
-def open_ego(folder: Path, name: str) -> Table:
+def open_ego(folder: Path, name: str) -> tables.Table:
     """Open the file of an ego's states."""
-    return Table(ego_file(folder, name), schema.EGO)
+    return tables.Table(tables.ego_file(folder, name), schema.EGO)
 
 
-def ego_span(table: Table) -> tuple[int, int]:
-    """Row of the recording of an ego's first state, and one past that of its last.
-
-    Raises:
-        DataError: The file is damaged.
-    """
-    rows = column(table.read(columns=["row"]), "row")
+def ego_span(table: tables.Table) -> tuple[int, int]:
+    """Rows of an ego's first state and behind its last one, or a DataError."""
+    rows = tables.column(table.read(columns=["row"]), "row")
     if not len(rows):
-        raise DataError(f"{table.path}: there are no states", hint=REPAIR)
+        raise DataError(f"{table.path}: there are no states", hint=tables.REPAIR)
     return int(rows[0]), int(rows[-1]) + 1
 
 
-def ego_states(table: Table, first: int, last: int, *, validate: bool = True) -> FloatArray:
-    """(R, 11) states of an ego over the rows first … last - 1 of the recording.
-
-    Raises:
-        DataError: The file is damaged or does not have the rows.
-    """
+def ego_states(table: tables.Table, first: int, last: int, *, validate: bool = True) -> FloatArray:
+    """(R, 11) states of an ego over the rows first … last - 1 of the recording, or a DataError."""
     found = _rows(table, first, last, validate)
-    return np.column_stack([column(found, name) for name in schema.EGO_COLUMNS])
+    return np.column_stack([tables.column(found, name) for name in schema.EGO_COLUMNS])

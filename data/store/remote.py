@@ -24,11 +24,9 @@ _OVERLAYS = ("filter", Path(REVIEW).parent.name, "splits")  # may change, and ar
 
 
 class RemoteFiles:
-    """Local copies of the files of a store behind a URL.
+    """Local copies, below `path`, of the files of a store behind a URL.
 
-    Attributes:
-        url: Of the store.
-        path: Folder of the copies; the list of scenarios and what lies beside it are there.
+    The list of scenarios and what lies beside it are always there.
     """
 
     def __init__(self, url: str) -> None:
@@ -54,11 +52,7 @@ class RemoteFiles:
         self._mirror_overlays()
 
     def need(self, name: str) -> None:
-        """Copy a file of the store, or all of a folder, as far as they are not here, and whole.
-
-        Raises:
-            DataError: A file cannot be read, or is not what the store was written with.
-        """
+        """Copy a file, or all of a folder, unless it is here and whole; or a DataError."""
         for file in self._files:
             if (file == name or file.startswith(f"{name}/")) and file not in self._checked:
                 place = safe_join(self.path, file)
@@ -109,10 +103,8 @@ class RemoteFiles:
                 ):
                     shutil.copyfileobj(source, copy, 1 << 20)
                 if name in self._files and digest(partial) != self._files[name]:
-                    raise DataError(
-                        f"{self.url}/{name}: damaged, or changed since the store was written",
-                        hint="upload the store again",
-                    )
+                    what = f"{self.url}/{name}: damaged, or changed since the store was written"
+                    raise DataError(what, "upload the store again")
                 partial.replace(target)
         except (OSError, pa.ArrowException) as error:
             text = " ".join(str(error).split())

@@ -8,7 +8,7 @@
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -41,20 +41,12 @@ class Review:
         return self.decision == UNDECIDED and not self.comment and self.route is None
 
 
-class Reviews(Mapping[str, Review]):
-    """The reviews of a store, by scenario."""
+class Reviews(dict[str, Review]):
+    """The reviews of a store, by scenario, sorted."""
 
     def __init__(self, reviews: Iterable[Review] = ()) -> None:
-        self._by_token = {review.token: review for review in reviews if not review.is_empty}
-
-    def __getitem__(self, token: str) -> Review:
-        return self._by_token[token]
-
-    def __iter__(self) -> Any:
-        return iter(sorted(self._by_token))
-
-    def __len__(self) -> int:
-        return len(self._by_token)
+        said = {review.token: review for review in reviews if not review.is_empty}
+        super().__init__(sorted(said.items()))
 
     @property
     def hash(self) -> str:
@@ -89,11 +81,7 @@ def _digest(rows: list[Any]) -> str:
 
 
 def read_reviews(store: Path) -> Reviews:
-    """The reviews of a store; none where nobody reviewed it.
-
-    Raises:
-        DataError: The file is damaged.
-    """
+    """The reviews of a store, none where nobody reviewed it; a DataError if damaged."""
     path = store / REVIEW
     if not path.is_file():
         return Reviews()
@@ -108,11 +96,7 @@ def read_reviews(store: Path) -> Reviews:
 
 
 def parse_review(values: Any, where: str) -> Review:
-    """A review from JSON values, which are somewhere.
-
-    Raises:
-        DataError: They are none.
-    """
+    """A review from JSON values, which are at `where`; a DataError if they are none."""
     try:
         review = make_table(Review, values, where)
         one_of(f"{where}: decision", review.decision, _DECISIONS)
@@ -138,11 +122,7 @@ def write_reviews(store: Path, reviews: Reviews) -> Path:
 
 
 def require_blocks(road: VectorMap, review: Review, where: str) -> None:
-    """Every roadblock of a corrected route must be on the map.
-
-    Raises:
-        DataError: One is not.
-    """
+    """Every roadblock of a corrected route must be on the map, else a DataError."""
     unknown = [name for name in review.route or () if name not in road.blocks.index]
     if unknown:
         raise DataError(

@@ -77,16 +77,7 @@ TRACKS = make_schema(
 MAY_BE_NAN = ("vx_mps", "vy_mps")  # in tracks: of static objects
 
 EGO_COLUMNS = (
-    "x_m",
-    "y_m",
-    "heading_rad",
-    "vx_mps",
-    "vy_mps",
-    "ax_mps2",
-    "ay_mps2",
-    "steering_angle_rad",
-    "steering_rate_radps",
-    "yaw_rate_radps",
-    "yaw_accel_radps2",
+    *(*MOTION, "ax_mps2", "ay_mps2"),
+    *("steering_angle_rad", "steering_rate_radps", "yaw_rate_radps", "yaw_accel_radps2"),
 )
 EGO = make_schema(row=_I32, **dict.fromkeys(EGO_COLUMNS, _F64))

@@ -69,22 +69,14 @@ def ego_file(folder: Path, name: str) -> Path:
 
 
 def read_manifest(store: Path) -> dict[str, Any]:
-    """Content of `store.json`.
-
-    Raises:
-        DataError: It is missing or broken, or of another version.
-    """
+    """Content of `store.json`, or a DataError."""
     path = store / MANIFEST
     if not path.is_file():
         if (store / PARTIAL).is_dir():
-            raise DataError(
-                f"{store}: the conversion of this store was interrupted",
-                hint="start the same shiftsim convert again, it goes on",
-            )
-        raise DataError(
-            f"{store}: not a scenario store: {MANIFEST} is missing",
-            hint="give the folder that `shiftsim convert` wrote",
-        )
+            what = f"{store}: the conversion of this store was interrupted"
+            raise DataError(what, "start the same shiftsim convert again, it goes on")
+        what = f"{store}: not a scenario store: {MANIFEST} is missing"
+        raise DataError(what, "give the folder that `shiftsim convert` wrote")
     try:
         manifest = json.loads(path.read_text("utf-8"))
         kind, version = manifest["format"], manifest["version"]
@@ -162,12 +154,7 @@ def write_json(path: Path, content: object) -> None:
 
 
 class Table:
-    """An open Parquet file of a store.
-
-    Attributes:
-        path: The file.
-        footer: Content of the footer; empty where there is none.
-    """
+    """An open Parquet file of a store, and its `footer`, empty where there is none."""
 
     def __init__(self, path: Path, expected: pa.Schema) -> None:
         self.path = path
@@ -242,9 +229,8 @@ class Table:
     ) -> pa.Table:
         """Rows of some row groups and columns; of all where None.
 
-        Raises:
-            DataError: The file is damaged or, where `validate` is asked for, holds a number
-                outside of its range.
+        Raises DataError: the file is damaged or, where `validate` is asked for, holds a number
+        outside of its range.
         """
         groups = list(range(self._file.num_row_groups)) if blocks is None else blocks
         wanted = self._names if columns is None else columns

@@ -72,10 +72,8 @@ class StoreWriter:
         is_partial = (self.path / tables.PARTIAL).is_dir()
         others = {path.name for path in self.path.iterdir()} - {tables.REPORTS}
         if not self._files and not is_partial and others:
-            raise DataError(
-                f"{self.path}: the folder is not empty and not a store",
-                hint="give a new folder, or a store to add to",
-            )
+            what = f"{self.path}: the folder is not empty and not a store"
+            raise DataError(what, "give a new folder, or a store to add to")
 
     def __enter__(self) -> "StoreWriter":
         return self
@@ -94,22 +92,14 @@ class StoreWriter:
         return window_of(self._rows[token])
 
     def add_map(self, road: VectorMap) -> None:
-        """Write a map.
-
-        Raises:
-            DataError: A number is outside of its range, or an index of something that is not there.
-        """
+        """Write a map; a DataError where it is not sound."""
         path = tables.map_file(self.path, road.name)
         with _to_be_written():
             write_map(path, road)
         self._note(path)
 
     def add_recording(self, recording: Recording) -> None:
-        """Write a recording.
-
-        Raises:
-            DataError: Its arrays do not fit together, or hold a number outside of its range.
-        """
+        """Write a recording; a DataError where its arrays or numbers do not fit."""
         folder = tables.recording_folder(self.path, recording.log_name)
         with _to_be_written():
             write_recording(folder, recording)
@@ -118,30 +108,19 @@ class StoreWriter:
         self._cities[recording.log_name] = recording.city
 
     def add_ego(self, ego: EgoTrace) -> None:
-        """Write the states of an ego.
-
-        Raises:
-            DataError: A number is outside of its range.
-        """
+        """Write the states of an ego; a DataError where a number is outside of its range."""
         folder = tables.recording_folder(self.path, ego.log_name)
         with _to_be_written():
             write_ego(folder, ego)
         self._note(tables.ego_file(folder, ego.name))
 
     def add_window(self, window: Window) -> None:
-        """Add a scenario; its recording and ego are added before.
-
-        Raises:
-            DataError: The recording or the ego is not in the store, or a number is outside of its
-                range.
-        """
+        """Add a scenario whose recording and ego were added before; else a DataError."""
         folder = tables.recording_folder(self.path, window.log_name)
         for path in (folder / tables.FRAMES, tables.ego_file(folder, window.ego)):
             if self._name(path) not in self._files:
-                raise DataError(
-                    f"scenario {window.token!r}: the store does not have {self._name(path)}",
-                    hint="add the recording and the ego before the window",
-                )
+                what = f"scenario {window.token!r}: the store does not have {self._name(path)}"
+                raise DataError(what, "add the recording and the ego before the window")
         row, file = window_row(window, self._cities[window.log_name]), self.path / tables.SCENARIOS
         table = pa.Table.from_pylist([row], schema=schema.SCENARIOS)
         with _to_be_written():

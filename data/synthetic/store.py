@@ -13,14 +13,8 @@ import numpy as np
 from shiftsim.data.store.reading import ScenarioStore, read_report
 from shiftsim.data.store.tables import MANIFEST
 from shiftsim.data.store.writing import StoreWriter, window_row
+from shiftsim.data.synthetic import recordings
 from shiftsim.data.synthetic.layouts import KINDS
-from shiftsim.data.synthetic.recordings import (
-    TownSpec,
-    generate_town,
-    make_town,
-    usable,
-    write_recordings,
-)
 from shiftsim.errors import ConfigError, DataError
 
 DEMO_SPLIT = "demo-mini"
@@ -36,7 +30,7 @@ _DEMO = {
     "street": "street",
 }
 DEMO_TOWNS = tuple(
-    TownSpec(name, kind, number, num_recordings=2, overlap_s=0.0, min_scenarios=6)
+    recordings.TownSpec(name, kind, number, num_recordings=2, overlap_s=0.0, min_scenarios=6)
     for number, (name, kind) in enumerate(_DEMO.items(), start=1)
 )
 
@@ -47,7 +41,7 @@ def demo_store(path: Path) -> Path:
         return path
     with _made_in_place(path) as (parts, store):
         for town in DEMO_TOWNS:
-            make_town(parts, town)
+            recordings.make_town(parts, town)
         _join(parts, DEMO_TOWNS, store, {"name": "demo"})
         tokens = _sample(ScenarioStore(store))
         (store / "splits").mkdir(exist_ok=True)
@@ -68,42 +62,26 @@ def _made_in_place(path: Path) -> Iterator[tuple[Path, Path]]:
         store.rename(path)
 
 
-def write_demo(folder: Path, only: str = "") -> None:
-    """Write the recordings of the demo, one DSC3D folder per town: all, or the one named."""
-    for town in DEMO_TOWNS:
-        if only in ("", town.name):
-            write_recordings(folder / town.name, town, *generate_town(town))
-
-
-def town_specs(towns: int, seed: int) -> list[TownSpec]:
+def town_specs(towns: int, seed: int) -> list[recordings.TownSpec]:
     """The random towns of a seed, of every kind in turn."""
     kinds = list(KINDS)
     return [
-        TownSpec(f"town-{seed}-{number:03d}", kinds[(number - 1) % len(kinds)], number)
+        recordings.TownSpec(f"town-{seed}-{number:03d}", kinds[(number - 1) % len(kinds)], number)
         for number in range(1, towns + 1)
     ]
 
 
 def write_towns(
-    path: Path,
+    path: Path,  # its folder, which must not exist, or hold that store already
     *,
-    towns: int,
+    towns: int,  # how many; a store of more holds those of fewer
     seed: int,
-    spread: Callable[[Any, Sequence[TownSpec]], Iterable[Any]],
+    spread: Callable[[Any, Sequence[recordings.TownSpec]], Iterable[Any]],  # over processes
     progress: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> ScenarioStore:
     """A store of random towns, the same bytes for the same number and seed.
 
-    Args:
-        path: Its folder, which must not exist, or hold that store already.
-        towns: How many towns; a store of more holds those of fewer.
-        seed: Of everything that is random.
-        spread: How towns are spread over processes.
-        progress: Called with towns done, towns in all and the name of the last one.
-
-    Raises:
-        ConfigError: The folder holds something else.
-        DataError: A process died.
+    It is a ConfigError if the folder holds something else, a DataError if a process dies.
     """
     provenance = {"name": "towns", "seed": seed, "towns": towns}
     if path.exists():
@@ -115,7 +93,7 @@ def write_towns(
     specs = town_specs(towns, seed)
     progress(0, towns, "")
     with _made_in_place(path) as (parts, store):
-        outcomes = spread(partial(partial, make_town, parts), specs)
+        outcomes = spread(partial(partial, recordings.make_town, parts), specs)
         for done, outcome in enumerate(outcomes, start=1):
             if outcome.death:
                 raise DataError(f"town {outcome.task.name!r}: {outcome.death}", hint="start again")
@@ -124,7 +102,9 @@ def write_towns(
     return ScenarioStore(path)
 
 
-def _join(parts: Path, towns: Sequence[TownSpec], path: Path, provenance: dict[str, Any]) -> None:
+def _join(
+    parts: Path, towns: Sequence[recordings.TownSpec], path: Path, provenance: dict[str, Any]
+) -> None:
     """Move the stores of single towns into one of all."""
     with StoreWriter(path, provenance) as writer:
         for town in towns:
@@ -132,7 +112,7 @@ def _join(parts: Path, towns: Sequence[TownSpec], path: Path, provenance: dict[s
             store = ScenarioStore(part)
             writer.add_map(store.map(town.name))
             rows: dict[str, list[dict[str, Any]]] = {}
-            for window in usable(store):
+            for window in recordings.usable(store):
                 rows.setdefault(window.log_name, []).append(window_row(window, town.name))
             for recording, windows in sorted(rows.items()):
                 writer.take_recording(store.recording_folder(recording), recording, windows)

@@ -8,16 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from shiftsim.data.synthetic import roads
 from shiftsim.data.synthetic.agents import Walk, arc_at, resample
-from shiftsim.data.synthetic.roads import (
-    STEP,
-    CrosswalkSpec,
-    LaneSpec,
-    Piece,
-    RoadSpec,
-    connect,
-    town_xml,
-)
 from shiftsim.kernels import FloatArray
 from shiftsim.world.state import LightStatus
 
@@ -38,7 +30,7 @@ class Street:
     name: str  # without digits at the end
     id: int  # from 1 to 9
     start: tuple[float, float, float]  # x [m], y [m], heading [rad]
-    pieces: tuple[Piece, ...]  # geometry
+    pieces: tuple[roads.Piece, ...]  # geometry
     width: float  # of every lane [m]
     limit: float  # speed limit [km/h]
     lanes: int = 1  # per direction
@@ -74,20 +66,22 @@ class Street:
         return f"crosswalk_{self.id}_{number}"
 
     @cached_property
-    def road(self) -> RoadSpec:
+    def road(self) -> roads.RoadSpec:
         """The same as a road of the map."""
         strips = [("driving", self.width)] * self.lanes
         strips += [("parking", self.parking)] if self.parking > 0.0 else []
         strips += [("sidewalk", self.sidewalk)] if self.sidewalk > 0.0 else []
         lanes = tuple(
-            LaneSpec(sign * number, kind, width, width)
+            roads.LaneSpec(sign * number, kind, width, width)
             for sign in ((-1,) if self.is_one_way else (1, -1))
             for number, (kind, width) in enumerate(strips, start=1)
         )
         before, after = (("junction", x, "") if x else None for x in self.junctions)
-        road = RoadSpec(self.id, self.start, self.pieces, lanes, self.limit, -1, before, after)
+        road = roads.RoadSpec(
+            self.id, self.start, self.pieces, lanes, self.limit, -1, before, after
+        )
         walks = [
-            CrosswalkSpec(self.crossing_name(number), *ends, self.half)
+            roads.CrosswalkSpec(self.crossing_name(number), *ends, self.half)
             for number, ends in enumerate(self.crossings if self.is_marked else ())
         ]
         sign = self.stop if self.has_stop_sign else None
@@ -162,7 +156,7 @@ class Leg:
     def centers(self, lane: int, s: FloatArray | Sequence[float] | None = None) -> FloatArray:
         """(n, 2) centre of a lane in its direction: at some places along the street, or all."""
         road = self.street.road
-        places = np.arange(0.0, road.length, STEP) if s is None else np.array(s)
+        places = np.arange(0.0, road.length, roads.STEP) if s is None else np.array(s)
         center = road.center_of(self.lane_id(lane), places)[:, :2]
         return center if self.is_forward else center[::-1]
 
@@ -187,7 +181,7 @@ class Town:
 
     name: str  # of the town
     streets: dict[str, Street] = field(default_factory=dict)  # by name
-    connectors: dict[Turn, RoadSpec] = field(default_factory=dict)  # roads of junctions
+    connectors: dict[Turn, roads.RoadSpec] = field(default_factory=dict)  # roads of junctions
     # connecting roads and narrow places that cannot be used at once
     conflicts: set[tuple[int, int]] = field(default_factory=set)
     walks: list[Walk] = field(default_factory=list)
@@ -197,7 +191,7 @@ class Town:
     def xml(self) -> str:
         """The OpenDRIVE file of its roads."""
         streets = [street.road for street in self.streets.values()]
-        return town_xml(self.name, [*streets, *self.connectors.values()])
+        return roads.town_xml(self.name, [*streets, *self.connectors.values()])
 
     def parked(self) -> FloatArray:
         """(n, 3) poses of parked cars."""
@@ -250,11 +244,11 @@ def _connect(town: Town, source: Leg, target: Leg) -> None:
         start = source.pose(from_lane, at_end=True).tolist()
         end = target.pose(to_lane, at_end=False).tolist()
         lanes = source.lane_id(from_lane), target.lane_id(to_lane)
-        town.connectors[Turn(source.enters, a.name, from_lane, b.name)] = RoadSpec(
+        town.connectors[Turn(source.enters, a.name, from_lane, b.name)] = roads.RoadSpec(
             number,
             (start[0], start[1], start[2]),
-            connect(start, end, ease=turn > 0.0 and not a.is_one_way),
-            (LaneSpec(-1, "driving", a.width, b.width, *lanes),),
+            roads.connect(start, end, ease=turn > 0.0 and not a.is_one_way),
+            (roads.LaneSpec(-1, "driving", a.width, b.width, *lanes),),
             min(a.limit, b.limit),
             junction=source.enters,
             predecessor=("road", a.id, "end" if source.is_forward else "start"),
@@ -268,7 +262,7 @@ def _add_walks(town: Town, street: Street) -> None:
         _add_crossing(town, street, number)
     road = street.road
     first = 0.5 * sum(street.crossings[0]) + 8.0 if street.crossings else 3.0
-    s = np.arange(first, road.length - 3.0, STEP)
+    s = np.arange(first, road.length - 3.0, roads.STEP)
     left, right = (road.at(s, sign * (street.half + 2.5))[:, :2] for sign in (1.0, -1.0))
     town.walks += [Walk(resample(points, _ROUNDING)) for points in (left, right[::-1])]
 
@@ -281,10 +275,10 @@ def _add_crossing(town: Town, street: Street, number: int) -> None:
     for sign, offsets in ((1.0, (-0.9, -0.2)), (-1.0, (0.5, 1.2))):
         aside = half + 1.2 + 0.4 * sign
         for at in (middle + offset for offset in offsets):
-            before = road.at(np.arange(far, at, -STEP), sign * aside)[:, :2]
-            lateral = np.arange(aside, -aside, -STEP)
+            before = road.at(np.arange(far, at, -roads.STEP), sign * aside)[:, :2]
+            lateral = np.arange(aside, -aside, -roads.STEP)
             over = road.at(np.full(len(lateral), at), sign * lateral)[:, :2]
-            after = road.at(np.arange(at, far - 6.0, STEP), -sign * aside)[:, :2]
+            after = road.at(np.arange(at, far - 6.0, roads.STEP), -sign * aside)[:, :2]
             points = resample(np.concatenate([before, over, after]), _ROUNDING)
             kerb = arc_at(points, over[0]) + (aside - half) - 0.6
             across = kerb + 2 * half + 1.4

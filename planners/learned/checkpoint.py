@@ -21,14 +21,8 @@ from typing import Any, NamedTuple, TypeAlias
 from shiftsim.errors import CheckpointError, ConfigError, MissingExtraError, nearest
 from shiftsim.files import checkpoint_folder, expand
 from shiftsim.planners import table
+from shiftsim.planners.learned import reader
 from shiftsim.planners.learned.deterministic import network_weights
-from shiftsim.planners.learned.reader import (
-    ARGS_HINT,
-    Contents,
-    read_contents,
-    read_json_object,
-    unreadable,
-)
 from shiftsim.planners.table import OFFICIAL, PUBLISHED, SHIPPED, SHIPPED_NOTE
 from shiftsim.world.ranges import CHECKPOINT
 
@@ -139,10 +133,8 @@ def find_checkpoint(spec: str, planner: str = "") -> Path:
             return _inside(path)
     near = nearest(Path(spec).name, sorted(path.name for path in checkpoint_folder().glob("*")))
     whose = f" of planner {planner!r}" if planner else ""
-    raise CheckpointError(
-        f"checkpoint {spec!r}{whose} does not exist, nor in {str(checkpoint_folder())!r}",
-        hint=f"did you mean {near!r}?" if near else how_to_get(planner),
-    )
+    what = f"checkpoint {spec!r}{whose} does not exist, nor in {str(checkpoint_folder())!r}"
+    raise CheckpointError(what, f"did you mean {near!r}?" if near else how_to_get(planner))
 
 
 def _meant_by(spec: str, planner: str) -> Path | None:
@@ -177,7 +169,7 @@ def how_to_get(planner: str) -> str:
 
 def open_checkpoint(path: Path) -> Checkpoint:
     """The weights in a file, whatever planner they are of; else a CheckpointError."""
-    contents = read_contents(path)
+    contents = reader.read_contents(path)
     entry = next((e for e in _ENTRIES if isinstance(contents.entries.get(e), dict)), "")
     holder = contents.entries[entry] if entry else contents.entries
     tensors = {str(name): value for name, value in holder.items() if hasattr(value, "as_strided")}
@@ -217,17 +209,17 @@ def _without_prefixes(tensors: dict[str, Any]) -> dict[str, Any]:
     return state
 
 
-def _args_of(path: Path, contents: Contents) -> dict[str, Any] | None:
+def _args_of(path: Path, contents: reader.Contents) -> dict[str, Any] | None:
     """Settings in the file's own metadata, or in `args.json` beside it."""
     if "args" in contents.metadata:
         try:
             value = json.loads(contents.metadata["args"])
         except (ValueError, RecursionError) as error:
             what = f"checkpoint {str(path)!r}: args in it are not JSON"
-            raise CheckpointError(what, ARGS_HINT) from error
+            raise CheckpointError(what, reader.ARGS_HINT) from error
         return value if isinstance(value, dict) else None
     beside = path.parent / "args.json"
-    return read_json_object(beside) if beside.is_file() else None
+    return reader.read_json_object(beside) if beside.is_file() else None
 
 
 def needed_args(found: Checkpoint, planner: str) -> dict[str, Any] | None:
@@ -352,7 +344,7 @@ def file_hash(path: Path) -> str:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise unreadable(path, error) from error
+        raise reader.unreadable(path, error) from error
 
 
 def _fingerprint(spec: str, planner: str) -> str:
@@ -374,10 +366,8 @@ def _inside(folder: Path) -> Path:
     if len(found) == 1:
         return found[0]
     names = ", ".join(path.name for path in found)
-    raise CheckpointError(
-        f"folder {str(folder)!r} holds {len(found) or 'no'} checkpoints",
-        hint=f"name one of them: {names}" if found else "give the file itself",
-    )
+    what = f"folder {str(folder)!r} holds {len(found) or 'no'} checkpoints"
+    raise CheckpointError(what, f"name one of them: {names}" if found else "give the file itself")
 
 
 def _known_deterministic(spec: str) -> str:
@@ -400,8 +390,7 @@ def require_torch(who: str) -> None:
 def resolve_device(name: str) -> str:
     """The device, `cpu` or `cuda:N`, of such a name, `cuda`, or `auto` (a GPU, else the CPU).
 
-    Raises:
-        ConfigError: The name is unknown, or this machine has no such device.
+    Raises ConfigError: the name is unknown, or this machine has no such device.
     """
     import torch
 
@@ -413,10 +402,8 @@ def resolve_device(name: str) -> str:
         return "cpu"
     index = int(number or 0)
     if index >= count:
-        raise ConfigError(
-            f"device {name!r}: torch {torch.__version__} sees {count or 'no'} CUDA devices",
-            hint="use --device cpu, or install a torch that fits the driver",
-        )
+        what = f"device {name!r}: torch {torch.__version__} sees {count or 'no'} CUDA devices"
+        raise ConfigError(what, "use --device cpu, or install a torch that fits the driver")
     return f"cuda:{index}"
 
 

@@ -91,10 +91,8 @@ def convert_checkpoint(spec: str, out: Path) -> Inspection:
     found = checkpoint.open_checkpoint(checkpoint.find_checkpoint(spec))
     planner = checkpoint.most_like(checkpoint.shapes_of(found.state))
     if not planner:
-        raise CheckpointError(
-            f"checkpoint {str(found.path)!r} is of no planner known here",
-            hint=f"shiftsim checkpoint inspect {found.path}",
-        )
+        what = f"checkpoint {str(found.path)!r} is of no planner known here"
+        raise CheckpointError(what, f"shiftsim checkpoint inspect {found.path}")
     args = checkpoint.needed_args(found, planner)
     state = checkpoint.checked_state(found, planner, args)
     metadata = {"planner": planner, "source_sha256": checkpoint.file_hash(found.path)}

@@ -12,16 +12,7 @@ import numpy as np
 from shiftsim.geometry.boxes import turned
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.sim.planner import History
-from shiftsim.world.state import (
-    AY,
-    HEADING,
-    LAST_AGENT_KIND,
-    NUM_STATE,
-    PACIFICA,
-    VX,
-    Tracks,
-    Trajectory,
-)
+from shiftsim.world import state
 
 STEP = 0.1  # s, between poses of a plan
 SAMPLES = 21  # of a history of 2 s
@@ -61,7 +52,7 @@ def agent_features(history: History, center: FloatArray, max_agents: int) -> Age
     own = (
         ego[:, :3],
         np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy]),
-        np.full((len(ego), 2), [PACIFICA.length, PACIFICA.width]),
+        np.full((len(ego), 2), [state.PACIFICA.length, state.PACIFICA.width]),
         np.ones(len(ego), np.bool_),
     )
     others = (tracks.poses, tracks.velocities, tracks.sizes, tracks.valid)
@@ -78,7 +69,7 @@ def agent_features(history: History, center: FloatArray, max_agents: int) -> Age
 
     category = np.zeros(len(nearest) + 1, np.int64)
     category[1:] = tracks.kinds[nearest] + 1
-    heading = float(ego[-1, HEADING])
+    heading = float(ego[-1, state.HEADING])
     return AgentFeatures(
         tracks=nearest,
         position=filled(turned(poses[..., :2] - ego[-1, :2], heading)),
@@ -90,10 +81,10 @@ def agent_features(history: History, center: FloatArray, max_agents: int) -> Age
     )
 
 
-def _nearest_agents(tracks: Tracks, center: FloatArray, count: int) -> IntArray:
+def _nearest_agents(tracks: state.Tracks, center: FloatArray, count: int) -> IntArray:
     """Present agents, nearest first."""
     # nuPlan rule 300: sorted from a list by kind, by a method that does not keep the order of ties
-    present = np.flatnonzero(tracks.valid[-1] & (tracks.kinds <= LAST_AGENT_KIND))
+    present = np.flatnonzero(tracks.valid[-1] & (tracks.kinds <= state.LAST_AGENT_KIND))
     by_kind = present[np.argsort(tracks.kinds[present], kind="stable")]
     away = tracks.poses[-1, by_kind, :2] - center[:2]
     order = np.argsort(np.sqrt(away[:, 0] ** 2 + away[:, 1] ** 2))
@@ -109,25 +100,28 @@ def poses_of(plan: np.ndarray) -> FloatArray:
 def map_poses(poses: FloatArray, ego: FloatArray) -> FloatArray:
     """Poses (..., 3) of the ego frame in that of the map."""
     # nuPlan rule 303: headings are not wrapped
-    cos, sin = np.cos(ego[HEADING]), np.sin(ego[HEADING])
+    cos, sin = np.cos(ego[state.HEADING]), np.sin(ego[state.HEADING])
     x, y, heading = poses[..., 0], poses[..., 1], poses[..., 2]
     return np.stack(
-        [ego[0] + cos * x - sin * y, ego[1] + sin * x + cos * y, ego[HEADING] + heading], axis=-1
+        [ego[0] + cos * x - sin * y, ego[1] + sin * x + cos * y, ego[state.HEADING] + heading],
+        axis=-1,
     )
 
 
-def straight_on(history: History) -> Trajectory:
+def straight_on(history: History) -> state.Trajectory:
     """A fallback where a planner has no plan: heading and speed are kept for 8 s."""
     present = history.ego[-1]
     times = STEP * np.arange(1, PLAN_POSES + 1)
-    speed = present[VX] * np.array([np.cos(present[HEADING]), np.sin(present[HEADING])])
+    speed = present[state.VX] * np.array(
+        [np.cos(present[state.HEADING]), np.sin(present[state.HEADING])]
+    )
     poses = np.empty((PLAN_POSES, 3))
     poses[:, :2] = present[:2] + times[:, None] * speed
-    poses[:, HEADING] = present[HEADING]
+    poses[:, state.HEADING] = present[state.HEADING]
     return plan_of_poses(poses, history)
 
 
-def plan_of_poses(poses: FloatArray, history: History) -> Trajectory:
+def plan_of_poses(poses: FloatArray, history: History) -> state.Trajectory:
     """The present state followed by a plan.
 
     Velocities and accelerations are derivatives of history and plan together, taken on the uneven
@@ -143,14 +137,14 @@ def plan_of_poses(poses: FloatArray, history: History) -> Trajectory:
     """
     past_s = np.asarray(history.time_us * 1e-6, np.float64)
     times = np.arange(0.0, len(poses) * STEP - STEP / 2.0, STEP) + STEP + past_s[-1]
-    states = np.zeros((len(poses) + 1, NUM_STATE))
+    states = np.zeros((len(poses) + 1, state.NUM_STATE))
     states[0] = history.ego[-1]
     states[1:, :3] = poses
-    states[1:, VX : AY + 1] = _motion(history.ego[:, :3], past_s, states[:, :3], times)
+    states[1:, state.VX : state.AY + 1] = _motion(history.ego[:, :3], past_s, states[:, :3], times)
     time_us = np.empty(len(states), np.int64)
     time_us[0] = history.time_us[-1]
     time_us[1:] = times * 1e6  # nuPlan rule 391: truncated, a microsecond may be lost
-    return Trajectory(time_us, states)
+    return state.Trajectory(time_us, states)
 
 
 def _motion(
@@ -176,7 +170,7 @@ def _motion(
     bend = np.einsum("k,nkc->nc", _BEND, window) / spacing**2
     ahead = (index - center)[:, None] * spacing
     slope = np.einsum("k,nkc->nc", _SLOPE, window) / spacing + bend * ahead
-    cos, sin = np.cos(even[:, HEADING]), np.sin(even[:, HEADING])
+    cos, sin = np.cos(even[:, state.HEADING]), np.sin(even[:, state.HEADING])
     parts = []
     for x, y in (slope.T, bend.T):
         parts += [x * cos + y * sin, x * sin - y * cos]  # nuPlan rule 392

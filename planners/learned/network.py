@@ -82,22 +82,14 @@ def perceptron(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
 
 
 class Scenes:
-    """The rows of B scenes one after another, without those that fill the batch up.
-
-    Attributes:
-        counts: How many rows each scene has.
-        valid: (T,) rows that take part in attention.
-        masks: By scene (1, 1, 1, count) logits added to its rows as keys; None where all take part.
-    """
+    """The rows of B scenes one after another, without those that fill the batch up."""
 
     def __init__(
         self, parts: Sequence[Tensor], counts: Sequence[Sequence[int]] | None = None
     ) -> None:
-        """Take the parts of a batch side by side.
+        """Take the parts (B, N) of a batch side by side: true for rows that take part in attention.
 
-        Args:
-            parts: (B, N) each, true for the rows that take part in attention.
-            counts: By part how many rows of each scene do not fill up; None where all do not.
+        `counts` are by part how many rows of each scene do not fill up; None where all do not.
         """
         valid = torch.cat(list(parts), dim=1)
         self.present = torch.ones_like(valid)  # (B, N of all parts)
@@ -106,9 +98,9 @@ class Scenes:
             numbers = [torch.arange(part.shape[1], device=valid.device) for part in parts]
             before = [number < count for number, count in zip(numbers, each, strict=True)]
             self.present = torch.cat(before, dim=1)
-        self.counts: list[int] = self.present.sum(dim=1).tolist()
-        self.valid = self.pack(valid)
-        self.masks = [
+        self.counts: list[int] = self.present.sum(dim=1).tolist()  # rows of each scene
+        self.valid = self.pack(valid)  # (T,) rows that take part in attention
+        self.masks = [  # by scene (1, 1, 1, count) logits added to its keys; None where all do
             None if bool(keys.all()) else key_mask(keys)[None].to(valid.device)
             for keys in self.split(self.valid.cpu())
         ]

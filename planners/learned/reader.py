@@ -47,11 +47,7 @@ class _StandIn:
 
 
 def read_contents(path: Path) -> Contents:
-    """Tensors and plain values of a torch or safetensors file.
-
-    Raises:
-        CheckpointError: It is neither, it is damaged, or it holds more than torch reads safely.
-    """
+    """Tensors and plain values of a torch or safetensors file; else a CheckpointError."""
     try:
         with path.open("rb") as file:
             head = file.read(_HEADER_BYTES)

@@ -8,28 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from shiftsim.edits import spec
 from shiftsim.edits.builder import ScenarioBuilder
 from shiftsim.edits.density import fill_lanes
 from shiftsim.edits.interplan.build import InterplanEditor
 from shiftsim.edits.interplan.path import DrivenLanes
 from shiftsim.edits.places import require_on_map
 from shiftsim.edits.route import reroute
-from shiftsim.edits.spec import (
-    KIND_CODES,
-    LIGHT_CODES,
-    MANNERS,
-    At,
-    Block,
-    Edit,
-    Light,
-    Place,
-    Remove,
-    Slow,
-    Spawn,
-    Stop,
-    Walk,
-    digest_of,
-)
 from shiftsim.errors import ConfigError, ShiftsimError
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.events import CAUTIOUS, FOLLOW, OFF, STOPPED, ScriptedPedestrian
@@ -48,7 +33,9 @@ SIZES = {  # length, width [m]
 _BEHAVIORS = {"idm": FOLLOW, "stopped": STOPPED, "cautious": CAUTIOUS}
 
 
-def apply_edit(scenario: Scenario, edit: Edit, driven_lanes: DrivenLanes | None = None) -> Scenario:
+def apply_edit(
+    scenario: Scenario, edit: spec.Edit, driven_lanes: DrivenLanes | None = None
+) -> Scenario:
     """The scenario that an edit makes of a recorded one.
 
     Codes of interPlan need `driven_lanes`, such as `metrics.interplan.driven_lanes`.
@@ -60,20 +47,18 @@ def apply_edit(scenario: Scenario, edit: Edit, driven_lanes: DrivenLanes | None 
         if not edit.code:
             return _apply_tables(scenario, edit)
         if driven_lanes is None:
-            raise ConfigError(
-                f"the code {edit.code!r} is applied in runs only",
-                hint='write it into a file with profile = "interplan", and run that',
-            )
+            what = f"the code {edit.code!r} is applied in runs only"
+            raise ConfigError(what, 'write it into a file with profile = "interplan", and run that')
         return InterplanEditor(scenario, edit, driven_lanes).result()
     except ShiftsimError as error:
         text = f"edit {edit.name!r} of scenario {scenario.token!r}: {error.message}"
         raise ConfigError(text, error.hint) from error
 
 
-def _apply_tables(scenario: Scenario, edit: Edit) -> Scenario:
+def _apply_tables(scenario: Scenario, edit: spec.Edit) -> Scenario:
     seed = edit.seed  # of what is drawn
     if seed is None:
-        seed = int(digest_of([scenario.token, edit.name])[:12], 16)
+        seed = int(spec.digest_of([scenario.token, edit.name])[:12], 16)
     builder, speed = ScenarioBuilder(scenario, edit, seed), edit.speed
     if edit.window_s is not None:
         _set_window(builder, edit.window_s)
@@ -99,20 +84,22 @@ def _apply_tables(scenario: Scenario, edit: Edit) -> Scenario:
     tokens = builder.tracks.tokens
     return builder.finish(
         edit.type or scenario.scenario_type,
-        MANNERS.index(edit.agents) if edit.agents else OFF,
+        spec.MANNERS.index(edit.agents) if edit.agents else OFF,
         pedestrians=tuple(replace(x, track=tokens.index(name)) for name, x in walkers.items()),
         seed=seed,
     )
 
 
-def _pose_of(builder: ScenarioBuilder, place: Place | Spawn | Block, what: str) -> FloatArray:
+def _pose_of(
+    builder: ScenarioBuilder, place: spec.Place | spec.Spawn | spec.Block, what: str
+) -> FloatArray:
     """(3,) pose of a place."""
     pose = builder.path.pose(place.at) if place.at else np.array(place.pose, np.float64)
     require_on_map(builder.recorded.map, pose, what)
     return pose
 
 
-def _remove(builder: ScenarioBuilder, remove: Remove) -> None:
+def _remove(builder: ScenarioBuilder, remove: spec.Remove) -> None:
     chosen = builder.which(remove.kinds, remove.tokens)
     if remove.near:
         x, y, radius = remove.near
@@ -135,7 +122,7 @@ def _change_motion(builder: ScenarioBuilder) -> None:
     if edit.speed and edit.speed.tracks != 1.0:
         if edit.speed.tracks > 1.0:
             raise ConfigError("speed: tracks is above 1", "a recording cannot be sped up")
-        slows.append(Slow(edit.speed.tracks, kinds=("vehicle",)))
+        slows.append(spec.Slow(edit.speed.tracks, kinds=("vehicle",)))
     seconds = builder.seconds
     for slow in slows:
         late = np.maximum(seconds - slow.from_s, 0.0)
@@ -147,7 +134,7 @@ def _change_motion(builder: ScenarioBuilder) -> None:
             _stop(builder, track, stop)
 
 
-def _stop(builder: ScenarioBuilder, track: int, stop: Stop) -> None:
+def _stop(builder: ScenarioBuilder, track: int, stop: spec.Stop) -> None:
     seconds = builder.seconds
     row = min(int(np.searchsorted(seconds, stop.from_s)), len(seconds) - 1)
     speed = float(np.hypot(*np.nan_to_num(builder.tracks.velocities[row, track])))
@@ -157,8 +144,8 @@ def _stop(builder: ScenarioBuilder, track: int, stop: Stop) -> None:
     _warp(builder, track, np.minimum(seconds, stop.from_s) + late - 0.5 * late**2 / needed)
 
 
-def _spawn(builder: ScenarioBuilder, spawn: Spawn) -> None:
-    kind, name = KIND_CODES[spawn.kind], builder.name(spawn.kind)
+def _spawn(builder: ScenarioBuilder, spawn: spec.Spawn) -> None:
+    kind, name = spec.KIND_CODES[spawn.kind], builder.name(spawn.kind)
     what = f"spawned {spawn.kind.replace('_', ' ')}"
     pose, size = _pose_of(builder, spawn, what), np.array(spawn.size_m or SIZES[spawn.kind])
     if kind == AgentKind.VEHICLE and spawn.behavior != "stopped":
@@ -168,7 +155,7 @@ def _spawn(builder: ScenarioBuilder, spawn: Spawn) -> None:
     builder.add([name], kind, size, pose[None], behaviors=STOPPED)
 
 
-def _block_lane(builder: ScenarioBuilder, block: Block) -> None:
+def _block_lane(builder: ScenarioBuilder, block: spec.Block) -> None:
     pose, size = _pose_of(builder, block, "closed lane"), np.array(SIZES[block.kind])
     spacing = max(block.spacing_m, 0.5)
     ahead = spacing * np.arange(int(block.length_m / spacing) + 1)
@@ -180,7 +167,9 @@ def _block_lane(builder: ScenarioBuilder, block: Block) -> None:
         ahead = np.concatenate([-block.taper_m * rest, ahead])
     poses = np.array(
         [
-            builder.path.pose(At(block.at.ahead_m + along, block.at.left_m + aside, block.at.turn))
+            builder.path.pose(
+                spec.At(block.at.ahead_m + along, block.at.left_m + aside, block.at.turn)
+            )
             if block.at
             else _ahead_of(pose, along, aside)
             for along, aside in zip(ahead.tolist(), left.tolist(), strict=True)
@@ -188,10 +177,10 @@ def _block_lane(builder: ScenarioBuilder, block: Block) -> None:
     )
     builder.require_free(poses, size, f"{block.kind.replace('_', ' ')} of a closed lane")
     names = [builder.name(block.kind) for _ in poses]
-    builder.add(names, KIND_CODES[block.kind], size, poses, behaviors=STOPPED)
+    builder.add(names, spec.KIND_CODES[block.kind], size, poses, behaviors=STOPPED)
 
 
-def _add_walker(builder: ScenarioBuilder, walk: Walk) -> tuple[str, ScriptedPedestrian] | None:
+def _add_walker(builder: ScenarioBuilder, walk: spec.Walk) -> tuple[str, ScriptedPedestrian] | None:
     """Add a pedestrian; its token, and how it walks, where it waits for the ego."""
     size = np.array(SIZES["pedestrian"])
     start, end = (_pose_of(builder, place, "pedestrian") for place in (walk.start, walk.end))
@@ -281,7 +270,7 @@ def _warp(builder: ScenarioBuilder, track: int, recorded: FloatArray) -> None:
     builder.touched.append(tracks.tokens[track])
 
 
-def _set_lights(builder: ScenarioBuilder, light: Light) -> None:
+def _set_lights(builder: ScenarioBuilder, light: spec.Light) -> None:
     scenario = builder.scenario
     road, lights = scenario.map, scenario.traffic_lights
     names: Iterable[str] = light.connectors
@@ -307,7 +296,7 @@ def _set_lights(builder: ScenarioBuilder, light: Light) -> None:
             ids.append(name)
             blank = np.full((len(status), 1), LightStatus.ABSENT, np.int8)
             status = np.concatenate([status, blank], axis=1)
-        status[during, columns[0]] = LIGHT_CODES[light.status]
+        status[during, columns[0]] = spec.LIGHT_CODES[light.status]
         for column in columns[1:]:  # nuPlan rule 429: an id listed twice would show both
             status[during, column] = LightStatus.ABSENT
     builder.change(traffic_lights=TrafficLights(tuple(ids), status))

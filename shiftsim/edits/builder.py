@@ -28,27 +28,16 @@ EGO_SIZE = np.array([PACIFICA.length, PACIFICA.width])
 
 
 class ScenarioBuilder:
-    """A scenario while it is edited.
-
-    Attributes:
-        recorded: As it was recorded.
-        edit: What is asked for.
-        draws: Random numbers of everything that is drawn.
-        scenario: As edited so far, but for its tracks.
-        tracks: The tracks so far; in arrays that may be written once they are copied.
-        behaviors: (N,) their behaviours, as in `RolloutEvents`.
-        touched: Tokens of tracks that were made or changed.
-        termination: Where a rollout ends before its time.
-    """
+    """A scenario while it is edited."""
 
     def __init__(self, recorded: Scenario, edit: Edit, seed: int | str) -> None:
-        """`seed` is that of the draws."""
-        self.recorded = self.scenario = recorded
+        """`seed` is that of everything that is drawn."""
+        self.recorded = self.scenario = recorded  # the latter as edited so far, but for its tracks
         self.edit, self.draws = edit, random.Random(seed)
-        self.tracks = recorded.tracks
+        self.tracks = recorded.tracks  # in arrays that may be written once they are copied
         self.behaviors: IntArray = np.full(recorded.tracks.num_tracks, FOLLOW, np.int64)
-        self.touched: list[str] = []
-        self.termination: TerminationCondition | None = None
+        self.touched: list[str] = []  # tokens of tracks that were made or changed
+        self.termination: TerminationCondition | None = None  # where a rollout ends early
         self.now = int(recorded.iteration_rows[0])  # row of the first iteration
         self._count: dict[str, int] = {}
 
@@ -106,11 +95,7 @@ class ScenarioBuilder:
         self.change(ego=ego)
 
     def which(self, kinds: Iterable[str], tokens: Iterable[str]) -> IntArray:
-        """Indices of the tracks of these kinds and of these tokens; of all where empty.
-
-        Raises:
-            ConfigError: There is no such track.
-        """
+        """Indices of the tracks of these kinds and tokens, or a ConfigError; of all where empty."""
         wanted, codes = list(tokens), [AgentKind[kind.upper()] for kind in kinds]
         if lost := [token for token in wanted if token not in self.tracks.tokens]:
             there = self.tracks.valid[self.now]
@@ -132,25 +117,15 @@ class ScenarioBuilder:
     def add(
         self,
         tokens: Sequence[str],
-        kind: int,
-        sizes: FloatArray,
-        poses: FloatArray,
+        kind: int,  # AgentKind code
+        sizes: FloatArray,  # (N, 2) length, width [m]; or (2,) of all
+        poses: FloatArray,  # (R, N, 3) of their centres; or (N, 3) at all times
         *,
-        valid: BoolArray | bool = True,
-        velocities: FloatArray | float = 0.0,
-        behaviors: IntArray | int = FOLLOW,
+        valid: BoolArray | bool = True,  # (R, N) when they are there
+        velocities: FloatArray | float = 0.0,  # (R, N, 2) in the map frame [m/s]
+        behaviors: IntArray | int = FOLLOW,  # (N,) as in `RolloutEvents`
     ) -> None:
-        """Add N tracks of one kind.
-
-        Args:
-            tokens: Their tokens.
-            kind: Their AgentKind code.
-            sizes: (N, 2) length, width [m]; or (2,) of all.
-            poses: (R, N, 3) poses of their centres; or (N, 3) at all times.
-            valid: (R, N) when they are there.
-            velocities: (R, N, 2) in the map frame [m/s].
-            behaviors: Behaviour of each, or of all, as in `RolloutEvents`.
-        """
+        """Add N tracks of one kind."""
         shape = (len(self.scenario.time_us), len(tokens))
         blank = np.where(np.broadcast_to(valid, shape), 0.0, np.nan)[..., None]
         new = Tracks(
@@ -176,11 +151,7 @@ class ScenarioBuilder:
         self.touched += tokens
 
     def require_free(self, poses: FloatArray, size: FloatArray, what: str) -> None:
-        """Refuse boxes at poses (N, 3) that touch the ego or a track at the first iteration.
-
-        Raises:
-            ConfigError: One does.
-        """
+        """A ConfigError where boxes at poses (N, 3) touch the ego or a track at the start."""
         now, tracks = self.now, self.tracks
         there = np.flatnonzero(tracks.valid[now])
         others = np.concatenate([self.center[None], tracks.poses[now, there]])
@@ -205,8 +176,7 @@ class ScenarioBuilder:
     ) -> None:
         """Add a vehicle that drives from the first iteration on; until then it came along its lane.
 
-        Raises:
-            ConfigError: It is on no lane, or on something.
+        Raises ConfigError: it is on no lane, or on something.
         """
         road = self.scenario.map
         start = find_start(road, pose)

@@ -40,8 +40,7 @@ class Slot(NamedTuple):
 def fill_lanes(builder: ScenarioBuilder, density: Density) -> None:
     """Add vehicles that drive; those for which there is no space are left out.
 
-    Raises:
-        ConfigError: The ego is on no lane.
+    Raises ConfigError: the ego is on no lane.
     """
     road, center = builder.scenario.map, builder.center
     start = find_start(road, center)
@@ -60,27 +59,17 @@ def fill_lanes(builder: ScenarioBuilder, density: Density) -> None:
 
 def draw_slots(
     road: VectorMap,
-    ego_edge: int,
-    center: FloatArray,
-    gap: tuple[float, float],
-    also_at: tuple[tuple[float, float], ...],
+    ego_edge: int,  # lane or connector of the ego
+    center: FloatArray,  # (3,) centre of the ego
+    gap: tuple[float, float],  # least and largest distance between two vehicles [m]
+    also_at: tuple[tuple[float, float], ...],  # points whose roadblocks are filled, too [m]
     draws: random.Random,
     *,
-    reach: float = 50.0,
+    reach: float = 50.0,  # how far beyond the ego the lanes are filled [m]
 ) -> tuple[list[Slot], float | None]:
     """Places of vehicles in all lanes, and the speed of the ego where it takes one of them.
 
-    Args:
-        road: The map.
-        ego_edge: Lane or connector of the ego.
-        center: (3,) centre of the ego.
-        gap: Least and largest distance between two vehicles [m].
-        also_at: Points (x, y) whose roadblocks are filled, too [m].
-        draws: What is drawn from.
-        reach: How far beyond the ego the lanes are filled [m].
-
-    Raises:
-        ConfigError: A point is in no roadblock, or the lanes of a line do not meet.
+    Raises ConfigError: a point is in no roadblock, or the lanes of a line do not meet.
     """
     block = int(road.block_of[ego_edge])
     lanes = road.block_edges.at(block).tolist()
@@ -130,10 +119,8 @@ def draw_slots(
 def safe_speed(lead: float, distance: float, reaction: float) -> float:
     """Speed at which a vehicle can stop behind one that brakes [m/s].
 
-    Args:
-        lead: Speed of the vehicle ahead [m/s].
-        distance: To it [m].
-        reaction: Time before it brakes, too [s].
+    `lead` is the speed of that one [m/s], at a `distance` [m], `reaction` the time before the
+    vehicle brakes, too [s].
     """
     root = math.sqrt(reaction**2 + 4 * _ALPHA * (_ALPHA * lead**2 + distance))
     return min(distance / 2, (-reaction + root) / (2 * _ALPHA))
@@ -168,11 +155,7 @@ def extended(road: VectorMap, lane: int, center: FloatArray, reach: float) -> li
 
 
 def lane_line(road: VectorMap, edges: list[int]) -> shapely.LineString:
-    """The centre lines of edges as one line.
-
-    Raises:
-        ConfigError: They do not meet.
-    """
+    """The centre lines of edges as one line; a ConfigError where they do not meet."""
     lines = [shapely.LineString(road.baselines.at(edge)) for edge in edges]
     line = shapely.line_merge(shapely.MultiLineString(lines))
     if not isinstance(line, shapely.LineString):

@@ -108,11 +108,7 @@ def nearest_edge(road: VectorMap, x: float, y: float, heading: float) -> int | N
 
 
 def require_on_map(road: VectorMap, pose: FloatArray, what: str) -> None:
-    """Refuse a place that is far from every lane.
-
-    Raises:
-        ConfigError: It is.
-    """
+    """Refuse a place that is far from every lane, with a ConfigError."""
     _, distance = road.edges.nearest(float(pose[0]), float(pose[1]))
     if not distance <= _OFF_MAP:
         raise ConfigError(

@@ -30,8 +30,7 @@ _MIN_LENGTH = 5.0  # m
 def reroute(builder: ScenarioBuilder, wanted: Reroute, *, ends: bool) -> None:
     """Change route, goal and expert; the expert drives evenly along the lanes of the new route.
 
-    Raises:
-        ConfigError: There is no such route.
+    Raises ConfigError: there is no such route.
     """
     road, center = builder.scenario.map, builder.center
     start = find_start(road, center)
@@ -94,11 +93,7 @@ def _drive(builder: ScenarioBuilder, line: FloatArray, total: float) -> FloatArr
 
 
 def edge_at(road: VectorMap, x: float, y: float) -> int:
-    """The lane at a point, else its only connector, else the nearest lane.
-
-    Raises:
-        ConfigError: Several connectors hold it.
-    """
+    """The lane at a point, else its only connector (or a ConfigError), else the nearest lane."""
     edges = road.lanes_at(x, y) or road.connectors_at(x, y)
     if len(edges) > 1:
         raise ConfigError(f"goal ({x:.1f}, {y:.1f}) is on {len(edges)} lanes or connectors")

@@ -27,29 +27,16 @@ _TURNING = 0.4  # rad, a pedestrian crosses where the path is straighter than th
 
 
 def sample_edits(
-    kind: str,
+    kind: str,  # one of `KINDS`
     count: int,
     seed: int,
-    scenarios: Sequence[str],
+    scenarios: Sequence[str],  # tokens that are drawn from
     read: Callable[[str], Scenario],
-    grade: Callable[[Scenario], str],
+    grade: Callable[[Scenario], str],  # how hard one is, of `GRADES`; empty where it is not wanted
     *,
-    even: bool = False,
+    even: bool = False,  # whether there are as many of every grade, the last ones perhaps fewer
 ) -> Iterator[dict[str, Any]]:
-    """Tables of `[[edit]]`, named and graded; the same seed gives the same edits.
-
-    Args:
-        kind: One of `KINDS`.
-        count: How many.
-        seed: Of all draws.
-        scenarios: Tokens that are drawn from.
-        read: Reads one of them.
-        grade: How hard an edited scenario is, of `GRADES`; empty where it is not wanted.
-        even: Whether there are as many of every grade, the last ones fewer where `count` is odd.
-
-    Raises:
-        ConfigError: No plausible edit is found.
-    """
+    """Tables of `[[edit]]`, named and graded, or a ConfigError; one seed gives the same edits."""
     draws, make = random.Random(f"{kind} {seed}"), KINDS[kind]
     found, most = Counter[str](), -(-count // len(GRADES)) if even else count
     for number in range(count):
@@ -70,10 +57,8 @@ def sample_edits(
                 yield table | {"type": f"{kind}_{hardness}"}
                 break
         else:
-            raise ConfigError(
-                f"no plausible {kind} was found in {_MOST_DRAWS} draws",
-                hint="choose scenarios in which the ego drives, with --split",
-            )
+            what = f"no plausible {kind} was found in {_MOST_DRAWS} draws"
+            raise ConfigError(what, "choose scenarios in which the ego drives, with --split")
 
 
 def graded(scenario_type: str) -> tuple[str, str]:

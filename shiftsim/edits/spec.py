@@ -259,10 +259,8 @@ def make_edit(table: Mapping[str, Any], where: str) -> Edit:
     where = f"{where} {edit.name!r}"
     good = edit.name and len(edit.name) <= _MAX_NAME and edit.name.replace("_", "").isalnum()
     if not good or not edit.name.isascii():
-        raise ConfigError(
-            f"{where}: name is not of up to {_MAX_NAME} letters, digits and underscores",
-            hint='for example name = "closed_lane"',
-        )
+        what = f"{where}: name is not of up to {_MAX_NAME} letters, digits and underscores"
+        raise ConfigError(what, 'for example name = "closed_lane"')
     for what, hint in _contradictions(edit):
         raise ConfigError(f"{where}{what}", hint)
     return edit

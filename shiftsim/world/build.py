@@ -9,7 +9,7 @@ import shapely
 from shiftsim.errors import MapError
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.layers import Layer, make_layer, make_lists, make_polylines
-from shiftsim.world.map import NONE, VectorMap
+from shiftsim.world.map import LAYERS, NONE, VectorMap
 
 
 @dataclass(frozen=True)
@@ -65,12 +65,7 @@ def build_map(
     edges: Sequence[EdgeSpec],
     blocks: Sequence[BlockSpec],
     epsg: int = 0,
-    intersections: Sequence[AreaSpec] = (),
-    stop_polygons: Sequence[AreaSpec] = (),
-    crosswalks: Sequence[AreaSpec] = (),
-    walkways: Sequence[AreaSpec] = (),
-    car_parks: Sequence[AreaSpec] = (),
-    drivable_areas: Sequence[AreaSpec] = (),
+    **areas: Sequence[AreaSpec],
 ) -> VectorMap:
     """A map from its parts. References to unknown ids are left out and counted in `flaws`.
 
@@ -79,12 +74,9 @@ def build_map(
         edges: Lanes and lane connectors; the order within each kind is kept.
         blocks: Roadblocks and roadblock connectors; the order within each kind is kept.
         epsg: Code of the metric coordinate system; 0 for a local frame.
-        intersections: Areas, `kind` = intersection type.
-        stop_polygons: Areas, `kind` = stop polygon type.
-        crosswalks: Areas.
-        walkways: Areas.
-        car_parks: Areas.
-        drivable_areas: All polygons whose union is drivable.
+        areas: By name of another layer of the map: `intersections` and `stop_polygons`, whose
+            `kind` is their type, `crosswalks`, `walkways`, `car_parks`, and `drivable_areas`, all
+            polygons whose union is drivable.
 
     Raises:
         MapError: An id occurs twice, or a baseline has fewer than two vertices.
@@ -93,8 +85,11 @@ def build_map(
     blocks = sorted(blocks, key=lambda spec: spec.is_connector)
     edge_index = _index_ids([spec.id for spec in edges], name, "lane or connector")
     block_index = _index_ids([spec.id for spec in blocks], name, "roadblock")
-    stop_index = {spec.id: i for i, spec in enumerate(stop_polygons)}
-    intersection_index = {spec.id: i for i, spec in enumerate(intersections)}
+    others = {layer: areas.pop(layer, ()) for layer in LAYERS[2:]}
+    if areas:
+        raise TypeError(f"map {name!r}: there is no layer {next(iter(areas))!r}")
+    stop_index = {spec.id: i for i, spec in enumerate(others["stop_polygons"])}
+    intersection_index = {spec.id: i for i, spec in enumerate(others["intersections"])}
     flaws: dict[str, int] = {}
 
     def known(index: dict[str, int], ids: Sequence[str | None], flaw: str) -> list[int]:
@@ -130,7 +125,7 @@ def build_map(
     return VectorMap(
         name=name,
         epsg=epsg,
-        edges=make_layer([s.id for s in edges], [s.polygon for s in edges]),
+        edges=_layer(edges),
         num_lanes=sum(not s.is_connector for s in edges),
         baselines=make_polylines([s.baseline for s in edges]),
         left_boundaries=make_polylines([nothing if s.left is None else s.left for s in edges]),
@@ -150,24 +145,19 @@ def build_map(
         intersection_of=to_one(intersection_index, "intersection_id", "intersection"),
         turn_type=np.array([s.turn_type for s in edges], np.int64),
         is_bike=np.array([s.is_bike for s in edges], np.bool_),
-        blocks=make_layer([s.id for s in blocks], [s.polygon for s in blocks]),
+        blocks=_layer(blocks),
         num_roadblocks=sum(not s.is_connector for s in blocks),
         block_edges=make_lists(members),
         block_incoming=make_lists(to_blocks("incoming")),
         block_outgoing=make_lists(to_blocks("outgoing")),
-        intersections=_area_layer(intersections),
-        intersection_kinds=np.array([s.kind for s in intersections], np.int64),
-        stop_polygons=_area_layer(stop_polygons),
-        stop_kinds=np.array([s.kind for s in stop_polygons], np.int64),
-        crosswalks=_area_layer(crosswalks),
-        walkways=_area_layer(walkways),
-        car_parks=_area_layer(car_parks),
-        drivable_areas=_area_layer(drivable_areas),
+        intersection_kinds=np.array([s.kind for s in others["intersections"]], np.int64),
+        stop_kinds=np.array([s.kind for s in others["stop_polygons"]], np.int64),
         flaws=flaws,
+        **{layer: _layer(specs) for layer, specs in others.items()},
     )
 
 
-def _area_layer(specs: Sequence[AreaSpec]) -> Layer:
+def _layer(specs: Sequence[EdgeSpec] | Sequence[BlockSpec] | Sequence[AreaSpec]) -> Layer:
     return make_layer([s.id for s in specs], [s.polygon for s in specs])
 
 

@@ -16,25 +16,15 @@ CROSSING_SIZE = (0.9000033778444835, 0.7913900336773054)  # length, width of a p
 
 @dataclass(frozen=True, slots=True)
 class ScriptedPedestrian:
-    """A pedestrian that sets off once, and stands at the end of its way.
+    """A pedestrian that sets off once, and stands at the end of its way."""
 
-    Attributes:
-        track: Its track.
-        start: (3,) where it stands first: x [m], y [m], heading [rad].
-        end: (2,) where it goes [m].
-        size: (2,) length, width [m].
-        speed: How fast [m/s].
-        ego_within: Distance of the ego's centre that sets it off [m].
-        visible: Whether it is there before.
-    """
-
-    track: int
-    start: FloatArray
-    end: FloatArray
-    size: FloatArray
-    speed: float
-    ego_within: float
-    visible: bool
+    track: int  # its track
+    start: FloatArray  # (3,) where it stands first: x [m], y [m], heading [rad]
+    end: FloatArray  # (2,) where it goes [m]
+    size: FloatArray  # (2,) length, width [m]
+    speed: float  # how fast [m/s]
+    ego_within: float  # distance of the ego's centre that sets it off [m]
+    visible: bool  # whether it is there before
 
     def walk(
         self, seconds: FloatArray, start_time: float
@@ -57,36 +47,22 @@ class ScriptedPedestrian:
 
 @dataclass(frozen=True, slots=True)
 class Crossing:
-    """A pedestrian of interPlan: not there until it sets off, and slower the later it does.
+    """A pedestrian of interPlan: not there until it sets off, and slower the later it does."""
 
-    Attributes:
-        token: Its token.
-        start: (3,) where it sets off: x [m], y [m], heading [rad].
-        end: (2,) where it goes [m].
-        iteration: When it sets off; 0 where the ego decides.
-        track: Its track.
-    """
-
-    token: str
-    start: FloatArray
-    end: FloatArray
-    iteration: int
-    track: int = -1
+    token: str  # its token
+    start: FloatArray  # (3,) where it sets off: x [m], y [m], heading [rad]
+    end: FloatArray  # (2,) where it goes [m]
+    iteration: int  # when it sets off; 0 where the ego decides
+    track: int = -1  # its track
 
 
 @dataclass(frozen=True, slots=True)
 class TerminationCondition:
-    """A line that ends a rollout: the ego is beyond `progress` on a path.
+    """A line that ends a rollout: the ego is beyond `progress` on a path."""
 
-    Attributes:
-        line: (K, 2) the path [m].
-        progress: Arc length on it [m].
-        block: Roadblock in which the ego must be; -1 for any.
-    """
-
-    line: FloatArray
-    progress: float
-    block: int = -1
+    line: FloatArray  # (K, 2) the path [m]
+    progress: float  # arc length on it [m]
+    block: int = -1  # roadblock in which the ego must be; -1 for any
 
     def is_reached(self, road: VectorMap, x: float, y: float) -> bool:
         """Whether the ego's centre is beyond the line."""
@@ -98,40 +74,24 @@ class TerminationCondition:
 
 @dataclass(frozen=True, slots=True)
 class RolloutEvents:
-    """What an edit asks of a rollout.
+    """What an edit asks of a rollout."""
 
-    Attributes:
-        base: Token of the recorded scenario.
-        name: Name of the edit.
-        digest: Digest of the edit.
-        words: What was edited, one line each.
-        tokens: Tokens of the tracks that the edit made or changed.
-        behaviors: (N,) FOLLOW, STOPPED or CAUTIOUS of each track; LOGGED where it is not driven.
-        yielding: How reactive agents treat the ego: ASSERTIVE, WARY, MIXED or DEFAULT as those of
-            interPlan do, OFF as nuPlan's do.
-        pedestrians: Pedestrians that move by themselves.
-        termination: Where a rollout ends before its time; None where it does not.
-        seed: Of what is drawn during a rollout.
-        profile: `shiftsim`, or `interplan` where its oddities are kept.
-        crossings: Pedestrians of interPlan.
-        sorts: What a scenario of interPlan is about, such as `stopped_vehicle`; else empty.
-        obstacles: (M, 2) where that is [m].
-    """
-
-    base: str
-    name: str
-    digest: str
-    words: tuple[str, ...]
-    tokens: tuple[str, ...]
-    behaviors: IntArray
+    base: str  # token of the recorded scenario
+    name: str  # name of the edit
+    digest: str  # digest of the edit
+    words: tuple[str, ...]  # what was edited, one line each
+    tokens: tuple[str, ...]  # tracks that the edit made or changed
+    behaviors: IntArray  # (N,) FOLLOW, STOPPED or CAUTIOUS; LOGGED where a track is not driven
+    # how reactive agents treat the ego: ASSERTIVE, WARY, MIXED or DEFAULT as those of interPlan do,
+    # OFF as nuPlan's do
     yielding: int = OFF
-    pedestrians: tuple[ScriptedPedestrian, ...] = ()
-    termination: TerminationCondition | None = None
-    seed: int = 0
-    profile: str = "shiftsim"
-    crossings: tuple[Crossing, ...] = ()
-    sorts: str = ""
-    obstacles: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    pedestrians: tuple[ScriptedPedestrian, ...] = ()  # those that move by themselves
+    termination: TerminationCondition | None = None  # where a rollout ends before its time
+    seed: int = 0  # of what is drawn during a rollout
+    profile: str = "shiftsim"  # or `interplan`, where its oddities are kept
+    crossings: tuple[Crossing, ...] = ()  # pedestrians of interPlan
+    sorts: str = ""  # what a scenario of interPlan is about, such as `stopped_vehicle`; else empty
+    obstacles: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))  # (M, 2) of that [m]
 
     @property
     def stopped(self) -> BoolArray:

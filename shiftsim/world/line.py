@@ -201,10 +201,8 @@ def route_line(
     ways = find_ways(road, blocks)
     lanes = [lane for level in ways for lane in level] or list(range(len(road.edges)))
     if not lanes or (pose is None and not ways):
-        raise MapError(
-            f"map {road.name!r} has no lane for the line to begin in",
-            hint="give the pose of the ego where the scenario has no route",
-        )
+        what = f"map {road.name!r} has no lane for the line to begin in"
+        raise MapError(what, "give the pose of the ego where the scenario has no route")
     progress = 0.0
     if pose is None:
         chain = [min(ways[0], key=lambda lane: ways[0][lane])]

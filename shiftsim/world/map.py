@@ -5,74 +5,29 @@ order of the source tables), so that one integer names a piece of road everywher
 for roadblocks and roadblock connectors (*blocks*). Ids are strings at the boundary only.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Generic, TypeVar
+from functools import lru_cache
 
 import numpy as np
 import shapely
 
 from shiftsim.errors import MapError, one_of
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, readonly
-from shiftsim.world.layers import (
-    Layer,
-    Lists,
-    Polylines,
-    project_on_line,
-)
+from shiftsim.world import layers
 
 NONE = -1  # "no such object" in index arrays
 LAYERS = (
-    "edges",
-    "blocks",
-    "intersections",
-    "stop_polygons",
-    "crosswalks",
-    "walkways",
-    "car_parks",
-    "drivable_areas",
+    *("edges", "blocks", "intersections", "stop_polygons"),
+    *("crosswalks", "walkways", "car_parks", "drivable_areas"),
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class VectorMap:
     """A semantic map. E edges, B blocks; objects are numbered, and `Layer.index` has their ids.
 
-    Attributes:
-        name: Map (city) name.
-        epsg: Code of the metric coordinate system; 0 for a local frame.
-        edges: Lanes, then lane connectors: ids and polygons.
-        num_lanes: How many of the edges are lanes.
-        baselines: E centre lines in the direction of travel.
-        left_boundaries: E lines; empty where unknown.
-        right_boundaries: E lines; empty where unknown.
-        boundary_ids: E pairs of boundary ids, left and right.
-        speed_limits: (E,) [m/s], NaN where the map has none.
-        lane_index: (E,) position in the roadblock, 0 leftmost, NONE for connectors.
-        left_lane: (E,) neighbour lane on the left, or NONE.
-        right_lane: (E,) neighbour lane on the right, or NONE.
-        incoming: Edges that lead into an edge.
-        outgoing: Edges an edge leads to.
-        block_of: (E,) block of an edge, NONE where the source names an unknown one.
-        has_traffic_lights: (E,) whether lights govern the edge.
-        stop_lines: Stop polygons of an edge.
-        intersection_of: (E,) intersection of a connector, or NONE.
-        turn_type: (E,) 0 straight, 1 left, 2 right, 3 u-turn, 4 unknown.
-        is_bike: (E,) whether the edge is a bicycle lane.
-        blocks: Roadblocks, then roadblock connectors: ids and polygons.
-        num_roadblocks: How many of the blocks are roadblocks.
-        block_edges: Edges of a block, in the order of the edges.
-        block_incoming: Blocks that lead into a block.
-        block_outgoing: Blocks a block leads to.
-        intersections: Ids and polygons.
-        intersection_kinds: Type number of each intersection.
-        stop_polygons: Ids and polygons.
-        stop_kinds: Type number of each stop polygon.
-        crosswalks: Ids and polygons.
-        walkways: Ids and polygons.
-        car_parks: Ids and polygons.
-        drivable_areas: Road segments, intersections, generic drivable areas, car parks.
-        flaws: Count by kind of what the source got wrong and nuPlan tolerates.
+    docs/vector_map.md shows what its arrays are good for. Maps are told apart by identity.
 
     Example:
         ```python
@@ -82,40 +37,41 @@ class VectorMap:
         ```
     """
 
-    name: str
-    epsg: int
-    edges: Layer
-    num_lanes: int
-    baselines: Polylines
-    left_boundaries: Polylines
-    right_boundaries: Polylines
-    boundary_ids: tuple[tuple[str, str], ...]
-    speed_limits: FloatArray
-    lane_index: IntArray
-    left_lane: IntArray
-    right_lane: IntArray
-    incoming: Lists
-    outgoing: Lists
-    block_of: IntArray
-    has_traffic_lights: BoolArray
-    stop_lines: Lists
-    intersection_of: IntArray
-    turn_type: IntArray
-    is_bike: BoolArray
-    blocks: Layer
-    num_roadblocks: int
-    block_edges: Lists
-    block_incoming: Lists
-    block_outgoing: Lists
-    intersections: Layer
-    intersection_kinds: IntArray
-    stop_polygons: Layer
-    stop_kinds: IntArray
-    crosswalks: Layer
-    walkways: Layer
-    car_parks: Layer
-    drivable_areas: Layer
-    flaws: dict[str, int] = field(default_factory=dict, compare=False)
+    name: str  # map (city) name
+    epsg: int  # code of the metric coordinate system; 0 for a local frame
+    edges: layers.Layer  # lanes, then lane connectors: ids and polygons
+    num_lanes: int  # how many of the edges are lanes
+    baselines: layers.Polylines  # E centre lines in the direction of travel
+    left_boundaries: layers.Polylines  # E lines; empty where unknown
+    right_boundaries: layers.Polylines  # E lines; empty where unknown
+    boundary_ids: tuple[tuple[str, str], ...]  # E pairs of boundary ids, left and right
+    speed_limits: FloatArray  # (E,) [m/s], NaN where the map has none
+    lane_index: IntArray  # (E,) position in the roadblock, 0 leftmost, NONE for connectors
+    left_lane: IntArray  # (E,) neighbour lane on the left, or NONE
+    right_lane: IntArray  # (E,) neighbour lane on the right, or NONE
+    incoming: layers.Lists  # edges that lead into an edge
+    outgoing: layers.Lists  # edges an edge leads to
+    block_of: IntArray  # (E,) block of an edge, NONE where the source names an unknown one
+    has_traffic_lights: BoolArray  # (E,) whether lights govern the edge
+    stop_lines: layers.Lists  # stop polygons of an edge
+    intersection_of: IntArray  # (E,) intersection of a connector, or NONE
+    turn_type: IntArray  # (E,) 0 straight, 1 left, 2 right, 3 u-turn, 4 unknown
+    is_bike: BoolArray  # (E,) whether the edge is a bicycle lane
+    blocks: layers.Layer  # roadblocks, then roadblock connectors: ids and polygons
+    num_roadblocks: int  # how many of the blocks are roadblocks
+    block_edges: layers.Lists  # edges of a block, in the order of the edges
+    block_incoming: layers.Lists  # blocks that lead into a block
+    block_outgoing: layers.Lists  # blocks a block leads to
+    intersections: layers.Layer  # ids and polygons
+    intersection_kinds: IntArray  # type number of each intersection
+    stop_polygons: layers.Layer  # ids and polygons
+    stop_kinds: IntArray  # type number of each stop polygon
+    crosswalks: layers.Layer  # ids and polygons
+    walkways: layers.Layer  # ids and polygons
+    car_parks: layers.Layer  # ids and polygons
+    drivable_areas: layers.Layer  # road segments, intersections, generic drivable areas, car parks
+    # count by kind of what the source got wrong and nuPlan tolerates
+    flaws: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -183,29 +139,15 @@ class VectorMap:
         """
         return self._layer(layer).meeting(area)
 
-    def _layer(self, name: str) -> Layer:
-        found: Layer = getattr(self, one_of("map layer", name, LAYERS))
+    def _layer(self, name: str) -> layers.Layer:
+        found: layers.Layer = getattr(self, one_of("map layer", name, LAYERS))
         return found
 
     def progress_on(self, edge: int, x: float, y: float) -> float:
         """Arc length of the projection of a point on the baseline of an edge [m]."""
-        return float(project_on_line(self.baselines, edge, x, y))
+        return float(layers.project_on_line(self.baselines, edge, x, y))
 
 
-MAPS_KEPT = 4  # per kind of arrays; a run rarely visits more maps at a time
-Arrays = TypeVar("Arrays")
-
-
-class PerMap(Generic[Arrays]):
-    """Arrays that depend on the map only: built once per map, kept for the latest few maps."""
-
-    def __init__(self, build: Callable[[VectorMap], Arrays]) -> None:
-        self._build = build
-        self._kept: list[tuple[VectorMap, Arrays]] = []
-
-    def __call__(self, road: VectorMap) -> Arrays:
-        """The arrays of a map; maps are told apart by identity."""
-        found = [item for item in self._kept if item[0] is road] or [(road, self._build(road))]
-        others = [item for item in self._kept if item[0] is not road]
-        self._kept = [*found, *others][:MAPS_KEPT]
-        return found[0][1]
+# makes a function of arrays that depend on the map only: they are built once per map, and kept for
+# the latest few, as a run rarely visits more maps at a time
+PerMap = lru_cache(maxsize=4)

@@ -206,7 +206,8 @@ SETTINGS: Table = {
     **_same("max_lane_distance, route_extension", 0, 1e6, "m"),
     **_same("max_lane_angle", 0, 10, "rad"),
     **_same("min_drivable_share", 0, 1),
-    **_same("route_extension_blocks, max_per_window", 0, _COUNT),
+    **_same("route_extension_blocks", 0, _COUNT),
+    **_same("max_per_window", 1, _COUNT),
 }
 FORMATS: Mapping[str, Table] = {
     "OpenDRIVE": {**OPENDRIVE, **MAP_EXTENT},

@@ -128,15 +128,7 @@ class Scenario:
 def scenario_of_rows(
     token: str, road: VectorMap, time_us: IntArray, ego: FloatArray, tracks: Tracks
 ) -> Scenario:
-    """A scenario whose iterations are all rows, without lights, route and goal.
-
-    Args:
-        token: Id of the scenario.
-        road: The map.
-        time_us: (R,) time stamps [us].
-        ego: (R, 11) ego states, columns of `state.STATE_COLUMNS`.
-        tracks: Tracks over the rows.
-    """
+    """A scenario whose iterations are all R rows, without lights, route and goal."""
     return Scenario(
         token=token,
         scenario_type="unknown",
@@ -156,11 +148,7 @@ def scenario_of_rows(
 
 
 def require_scenario(what: str, given: object) -> None:
-    """Refuse what is no scenario, with how to get one.
-
-    Raises:
-        ConfigError: It is none.
-    """
+    """Refuse what is no scenario, with a ConfigError that says how to get one."""
     if not isinstance(given, Scenario):
         raise ConfigError(
             f"{what}() needs a scenario first, not {type(given).__name__}",

@@ -21,17 +21,8 @@ STEERING, STEERING_RATE = 7, 8  # rad, rad/s
 YAW_RATE, YAW_ACCEL = 9, 10  # rad/s, rad/s^2
 NUM_STATE = 11
 STATE_COLUMNS = (
-    "x",
-    "y",
-    "heading",
-    "vx",
-    "vy",
-    "ax",
-    "ay",
-    "steering_angle",
-    "steering_rate",
-    "yaw_rate",
-    "yaw_accel",
+    *("x", "y", "heading", "vx", "vy", "ax", "ay"),
+    *("steering_angle", "steering_rate", "yaw_rate", "yaw_accel"),
 )
 
 
@@ -169,13 +160,10 @@ class Tracks:
 def tracks_of_boxes(
     boxes: FloatArray, kinds: Sequence[int] | IntArray, tokens: Sequence[str]
 ) -> Tracks:
-    """Tracks of what is known of them row by row.
+    """Tracks of what is known of them row by row; `kinds` (N,) are AgentKind codes.
 
-    Args:
-        boxes: (T, N, 7) box centre x [m], y [m], heading [rad], velocity x, y in the map frame
-            [m/s], length, width [m]; x is NaN where a track is absent.
-        kinds: (N,) AgentKind codes.
-        tokens: N ids.
+    `boxes` (T, N, 7) are centre x [m], y [m], heading [rad], velocity x, y in the map frame [m/s],
+    length, width [m]; x is NaN where a track is absent.
     """
     return Tracks(
         valid=~np.isnan(boxes[..., 0]),

@@ -34,7 +34,7 @@ from doc_pages import (
     table_below,
 )
 from open_data_files import write_commonroad
-from track_files import table_of, write_tracks
+from track_files import table_of, write_demo, write_tracks
 
 import shiftsim
 from shiftsim.benchmarks import load_track
@@ -91,7 +91,7 @@ TYPES = {
 def material(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The demo store, recordings, logs, tables and maps that the pages speak of."""
     folder = tmp_path_factory.mktemp("material")
-    synthetic.write_demo(folder / "towns")
+    write_demo(folder / "towns")
     synthetic.demo_store(folder / "shiftsim-data" / "demo")
     (folder / "dsc3d").mkdir()
     (folder / "towns" / "junction").rename(folder / "dsc3d" / "sindelfingen")

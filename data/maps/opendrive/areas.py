@@ -8,14 +8,6 @@ import shapely
 from shiftsim.data.maps.opendrive import records
 from shiftsim.data.maps.opendrive.curves import ReferenceLine
 from shiftsim.data.maps.opendrive.graph import Connector
-from shiftsim.data.maps.opendrive.records import (
-    OpenDrive,
-    Outline,
-    Repeat,
-    Road,
-    RoadObject,
-    Signal,
-)
 from shiftsim.data.maps.opendrive.shapes import Shapes, lane_polygon
 from shiftsim.data.polygons import largest_part, shared_areas
 from shiftsim.kernels import FloatArray, IntArray
@@ -74,7 +66,7 @@ def merge_closed(polygons: Iterable[shapely.Polygon], radius: float) -> shapely.
     return closed if isinstance(closed, shapely.Polygon) else largest_part(union.convex_hull)
 
 
-def lane_areas(od: OpenDrive, shapes: Shapes) -> dict[str, list[shapely.Polygon]]:
+def lane_areas(od: records.OpenDrive, shapes: Shapes) -> dict[str, list[shapely.Polygon]]:
     """Areas of all lanes that cars do not follow: those `paved`, `walked` and for `parking`."""
     areas: dict[str, list[shapely.Polygon]] = {"paved": [], "walked": [], "parking": []}
     for road in od.roads.values():
@@ -138,7 +130,7 @@ def _parts(shape: shapely.Geometry) -> list[shapely.Polygon]:
     return sorted((p for p in parts if p.area > 1e-4), key=lambda p: p.bounds)
 
 
-def is_crosswalk(thing: RoadObject) -> bool:
+def is_crosswalk(thing: records.RoadObject) -> bool:
     """Whether an object marks a crosswalk, by type or by name (nuPlan rule 515)."""
     if thing.type == "crosswalk":
         return True
@@ -148,22 +140,25 @@ def is_crosswalk(thing: RoadObject) -> bool:
     return any(word in words for word in _CROSSWALK_WORDS)
 
 
-def is_stop_line(thing: RoadObject) -> bool:
+def is_stop_line(thing: records.RoadObject) -> bool:
     """Whether an object is a stop line, by any of its names."""
     return any("stopline" in text.lower() for text in (thing.type, thing.name, thing.subtype))
 
 
-def object_rings(line: ReferenceLine, thing: RoadObject) -> list[FloatArray]:
+def object_rings(line: ReferenceLine, thing: records.RoadObject) -> list[FloatArray]:
     """Outlines (V, 2) of an object and its copies, as the file draws them [m]."""
     places = _repeated(thing.repeats[-1]) if thing.repeats else [(thing.s, thing.t)]
     length, width = (thing.length or 0.0) / 2, (thing.width or 0.0) / 2
     corners = [[length, width], [-length, width], [-length, -width], [length, -width]]
-    outlines = thing.outlines or (Outline(on_road=False, corners=np.array(corners)),)
+    outlines = thing.outlines or (records.Outline(on_road=False, corners=np.array(corners)),)
     return [_place_ring(line, thing, outline, s, t) for s, t in places for outline in outlines]
 
 
 def rings_of(
-    roads: Iterable[Road], shapes: Shapes, is_wanted: Callable[[RoadObject], bool], least: int = 3
+    roads: Iterable[records.Road],
+    shapes: Shapes,
+    is_wanted: Callable[[records.RoadObject], bool],
+    least: int = 3,
 ) -> list[FloatArray]:
     """Outlines of all objects of a kind that are finite and have at least some corners [m]."""
     return [
@@ -176,7 +171,7 @@ def rings_of(
     ]
 
 
-def _repeated(repeat: Repeat) -> list[tuple[float, float]]:
+def _repeated(repeat: records.Repeat) -> list[tuple[float, float]]:
     count = int(min(repeat.length / repeat.distance, 1000)) + 1 if repeat.distance > 0 else 1
     share = np.arange(count) * repeat.distance / repeat.length if repeat.length > 0 else np.zeros(1)
     s = repeat.s + share * repeat.length
@@ -185,7 +180,7 @@ def _repeated(repeat: Repeat) -> list[tuple[float, float]]:
 
 
 def _place_ring(
-    line: ReferenceLine, thing: RoadObject, outline: Outline, s: float, t: float
+    line: ReferenceLine, thing: records.RoadObject, outline: records.Outline, s: float, t: float
 ) -> FloatArray:
     if outline.on_road:
         return line.evaluate(outline.corners[:, 0] + (s - thing.s)).offset(outline.corners[:, 1])
@@ -196,7 +191,7 @@ def _place_ring(
     return origin + outline.corners @ np.array([[cos, sin], [-sin, cos]])
 
 
-def crosswalk_polygons(od: OpenDrive, shapes: Shapes) -> list[shapely.Polygon]:
+def crosswalk_polygons(od: records.OpenDrive, shapes: Shapes) -> list[shapely.Polygon]:
     """All crosswalks that enclose an area."""
     rings = rings_of(od.roads.values(), shapes, is_crosswalk)
     signals = [(road.id, signal) for road in od.roads.values() for signal in road.signals]
@@ -205,7 +200,7 @@ def crosswalk_polygons(od: OpenDrive, shapes: Shapes) -> list[shapely.Polygon]:
     return [polygon for polygon in polygons if polygon.area > 0.1]
 
 
-def _is_crosswalk_signal(signal: Signal) -> bool:
+def _is_crosswalk_signal(signal: records.Signal) -> bool:
     return (
         not signal.reference
         and not signal.dynamic
@@ -214,7 +209,7 @@ def _is_crosswalk_signal(signal: Signal) -> bool:
     )
 
 
-def _signal_ring(road: str, signal: Signal, shapes: Shapes) -> FloatArray:
+def _signal_ring(road: str, signal: records.Signal, shapes: Shapes) -> FloatArray:
     """A crosswalk given as a signal: its width lies across the road, its value along it."""
     half_width = (signal.width or 0.0) / 2
     half_depth = (signal.value if signal.value and signal.value > 0 else 4.0) / 2
@@ -222,7 +217,7 @@ def _signal_ring(road: str, signal: Signal, shapes: Shapes) -> FloatArray:
     return shapes.line(road).evaluate(s).offset(signal.t + half_width * np.array([-1, 1, 1, -1]))
 
 
-def parking_spaces(od: OpenDrive, shapes: Shapes) -> list[shapely.Polygon]:
+def parking_spaces(od: records.OpenDrive, shapes: Shapes) -> list[shapely.Polygon]:
     """Areas of parkingSpace objects."""
     rings = rings_of(od.roads.values(), shapes, lambda thing: thing.type == "parkingSpace")
     return [largest_part(shapely.Polygon(ring)) for ring in rings]

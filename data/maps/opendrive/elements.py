@@ -67,10 +67,8 @@ class Reader:
     def _rescued(self, element: Any, name: str, text: str) -> float:
         found = _LEADING_NUMBER.match(text.replace(",", ".", 1))
         if found is None:
-            raise self.error(
-                f"{element.tag} (line {element.sourceline}) has {name}={text[:40]!r}",
-                "write a number with a decimal point there",
-            )
+            what = f"{element.tag} (line {element.sourceline}) has {name}={text[:40]!r}"
+            raise self.error(what, "write a number with a decimal point there")
         self.warn("badly written number")
         return float(found[1])
 

@@ -73,11 +73,7 @@ def build_road_map(
 
 
 def require_lanes(od: OpenDrive, built: BuiltMap) -> None:
-    """See that a map has lanes.
-
-    Raises:
-        ConversionError: It has none; the message says why.
-    """
+    """A ConversionError where a map has no lanes; the message says why."""
     if built.road.num_lanes:
         return
     reasons = Counter({kind: n for kind, n in built.warnings.items() if "road left out" in kind})
@@ -101,8 +97,7 @@ def require_lanes(od: OpenDrive, built: BuiltMap) -> None:
 def _prepare(od: records.OpenDrive, warnings: Counter[str]) -> records.OpenDrive:
     """The file in the frame of its header, without roads that cannot be drawn; counts them.
 
-    Raises:
-        MapError: The file has more road than one map can hold.
+    Raises MapError: the file has more road than one map can hold.
     """
     roads = {}
     fast: list[str] = []  # roads of towns with limits that cannot be meant

@@ -281,10 +281,8 @@ def _read_section(element: Any, end: float, reader: Reader) -> records.LaneSecti
     for child in element.iter("lane"):
         number = reader.integer(child, "id")
         if number is None:
-            raise reader.error(
-                f"lane (line {child.sourceline}) has id={child.get('id', '')[:40]!r}",
-                "number the lanes",
-            )
+            what = f"lane (line {child.sourceline}) has id={child.get('id', '')[:40]!r}"
+            raise reader.error(what, "number the lanes")
         if number == 0:
             continue
         if number in lanes:

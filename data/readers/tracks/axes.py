@@ -6,12 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shiftsim.data.readers.motion import (
-    contradiction,
-    fitted_velocities,
-    track_medians,
-    unit_vectors,
-)
+from shiftsim.data.readers import motion
 from shiftsim.data.readers.tracks.map_fit import Fit
 from shiftsim.data.readers.tracks.table import TrackTable
 from shiftsim.geometry.boxes import wrap_angles
@@ -59,8 +54,8 @@ def check_headings(table: TrackTable, fit: Fit, out: Diagnostics) -> None:
     if not len(rows):
         return
     column = table.columns.found["heading"]
-    motion = fit.turned(table.derived[rows])
-    direction = np.arctan2(motion[:, 1], motion[:, 0])
+    driven = fit.turned(table.derived[rows])
+    direction = np.arctan2(driven[:, 1], driven[:, 0])
     heading, quarter = table.headings[rows], np.pi / 2
     given = quarter - heading if column.unit == "compass" else heading
     degrees = np.deg2rad(given) if column.unit == "rad" else given
@@ -109,14 +104,14 @@ def check_velocities(table: TrackTable, fit: Fit, out: Diagnostics) -> None:
         return
     moving = np.unique(table.track[rows])
     derived = fit.turned(table.derived)
-    wrong = contradiction(stored, derived, table.time, table.track)[0][moving]
+    wrong = motion.contradiction(stored, derived, table.time, table.track)[0][moving]
     share = out.figures["contradicting_share"] = float(wrong.mean())
     rows = rows[np.isfinite(stored[rows]).all(axis=1)]
     rows = rows[np.isin(table.track[rows], moving[wrong])]
     if not len(rows) or share <= LEAST_CONTRADICTING:
         return  # these few velocities are derived
-    given, motion = stored[rows], derived[rows]
-    speed = np.hypot(*motion.T)
+    given, driven = stored[rows], derived[rows]
+    speed = np.hypot(*driven.T)
     ratio = float(np.median(np.hypot(*given.T) / speed))
     roles = ("vx", "vy") if "vx" in table.columns.found else ("speed",)
     names = [table.columns.found[role].name for role in roles]
@@ -134,12 +129,12 @@ def check_velocities(table: TrackTable, fit: Fit, out: Diagnostics) -> None:
             f"the first looks mirrored: [columns] vx = '-{x}'": given * [-1, 1],
         }
         if np.isfinite(table.headings[rows]).all():
-            cos, sin = unit_vectors(table.headings[rows]).T
+            cos, sin = motion.unit_vectors(table.headings[rows]).T
             along, across = given.T
             in_map = np.column_stack([along * cos - across * sin, along * sin + across * cos])
             guesses[f"they look like those along and across the vehicle; {leave_out}"] = in_map
     guesses["scaled"] = given / max(ratio, 1e-9)
-    _, errors = _best_guess(guesses, lambda velocities: np.hypot(*(velocities - motion).T) / speed)
+    _, errors = _best_guess(guesses, lambda velocities: np.hypot(*(velocities - driven).T) / speed)
     is_uniform = errors.pop("scaled") < _MAX_VELOCITY
     best = min(errors, key=lambda guess: errors[guess])
     is_known = best != "" and errors[best] < _MAX_VELOCITY
@@ -174,14 +169,14 @@ def check_reference(table: TrackTable, out: Diagnostics) -> None:
     track, fast = table.track[rows], fast[rows]
     angle = np.column_stack([np.cumsum(_turns(table, rows)), np.zeros(len(rows))])
     numbers = np.unique(track, return_inverse=True)[1]
-    rate = fitted_velocities(angle, table.time[rows], numbers, table.period)[:, 0]
-    cos, sin = unit_vectors(table.headings[rows]).T
+    rate = motion.fitted_velocities(angle, table.time[rows], numbers, table.period)[:, 0]
+    cos, sin = motion.unit_vectors(table.headings[rows]).T
     sideways = table.derived[rows, 1] * cos - table.derived[rows, 0] * sin
     used = fast & (np.abs(rate) > _TURNING)
     weight = np.bincount(track[used], rate[used] ** 2, number)
     moment = np.bincount(track[used], (sideways * rate)[used], number)
     turn = np.bincount(track[used], np.abs(rate[used]) * table.period, number)
-    length = track_medians(table.sizes[:, 0], table.track)
+    length = motion.track_medians(table.sizes[:, 0], table.track)
     enough = (turn > _LEAST_TURN) & (length > 0)
     if enough.sum() < 3:
         return

@@ -1,8 +1,8 @@
 """Which column of a file is what, and in which unit: recognised by name, or named in a TOML file.
 
-A column of ours has a name (`ROLES`), the names that others give it, and a quantity, whose unit the
-name may end in: `x_m`, `heading_deg`, `timestamp_ms`, `v [km/h]`. Formats that are known by their
-columns (`_LAYOUTS`) say what a TOML file would have to.
+A column of ours has a name, the names that others give it, and a quantity, whose unit the name may
+end in: `x_m`, `heading_deg`, `timestamp_ms`, `v [km/h]`. Formats that are known by their columns
+(`_LAYOUTS`) say what a TOML file would have to.
 """
 
 import re
@@ -15,36 +15,26 @@ import numpy as np
 from shiftsim.data.readers.codes import KINDS, SAME, normalise_category
 from shiftsim.errors import ConfigError, ConversionError, nearest, one_of
 
-# our name -> quantity, and names in other files, the surest first
-_ROLES = {
-    "time": (
-        "time",
-        "time timestamp timestampus t timesteptime globaltime seconds simtime localtime",
-    ),
-    "frame": ("frame", "frame frameid row framenumber frameindex timestep step"),
-    "id": (
-        "",
-        "trackid track objectid objid agentid vehicleid tracktoken participantid actorid carid id",
-    ),
-    "kind": (
-        "",
-        "kind category class agenttype objecttype objectclass vehicleclass vehicletype vclass type"
-        " label",
-    ),
-    "x": ("position", "xcenter centerx x positionx posx translationx vehiclex localx utmx easting"),
-    "y": (
-        "position",
-        "ycenter centery y positiony posy translationy vehicley localy utmy northing",
-    ),
-    "heading": ("heading", "heading yaw psi orientation hdg theta headingangle vehicleangle angle"),
-    "length": ("size", "length vehiclelength len dimensionx l vlength"),
-    "width": ("size", "width vehiclewidth dimensiony w vwidth"),
-    "vx": ("velocity", "vx xvelocity velocityx velx xspeed speedx"),
-    "vy": ("velocity", "vy yvelocity velocityy vely yspeed speedy"),
-    "speed": ("velocity", "speed v vel velocity vvel absvelocity vehiclespeed"),
+# our name -> names in other files, the surest first
+_NAMES = {
+    "time": "time timestamp timestampus t timesteptime globaltime seconds simtime localtime",
+    "frame": "frame frameid row framenumber frameindex timestep step",
+    "id": "trackid track objectid objid agentid vehicleid tracktoken participantid actorid carid"
+    " id",
+    "kind": "kind category class agenttype objecttype objectclass vehicleclass vehicletype vclass"
+    " type label",
+    "x": "xcenter centerx x positionx posx translationx vehiclex localx utmx easting",
+    "y": "ycenter centery y positiony posy translationy vehicley localy utmy northing",
+    "heading": "heading yaw psi orientation hdg theta headingangle vehicleangle angle",
+    "length": "length vehiclelength len dimensionx l vlength",
+    "width": "width vehiclewidth dimensiony w vwidth",
+    "vx": "vx xvelocity velocityx velx xspeed speedx",
+    "vy": "vy yvelocity velocityy vely yspeed speedy",
+    "speed": "speed v vel velocity vvel absvelocity vehiclespeed",
 }
-ROLES = tuple(_ROLES)
-QUANTITIES = {role: quantity for role, (quantity, _) in _ROLES.items()}
+_OF = {"x": "position", "y": "position", "length": "size", "width": "size", "id": "", "kind": ""}
+_OF |= dict.fromkeys(("vx", "vy", "speed"), "velocity")
+QUANTITIES = {role: _OF.get(role, role) for role in _NAMES}  # our name -> quantity
 # what a unit is multiplied by to become ours
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3},  # to us
@@ -141,8 +131,9 @@ def recognise(names: Sequence[str], overrides: Mapping[str, Any], where: str) ->
     given = _LAYOUTS[layout][1] if layout else {}
     usual = _USUAL | given.get("units", {})
     found = {}
-    for role, (quantity, known) in _ROLES.items():
-        surest, units = known.split(), UNITS.get(quantity, {})
+    for role, known in _NAMES.items():
+        quantity, surest = QUANTITIES[role], known.split()
+        units = UNITS.get(quantity, {})
         fitting = [s for s in split if s[0] in surest and (not s[1] or s[1] in units)]
         if fitting:
             _, unit, name = min(fitting, key=lambda one: surest.index(one[0]))
@@ -158,10 +149,8 @@ def recognise(names: Sequence[str], overrides: Mapping[str, Any], where: str) ->
     _require_columns(found, names, where)
     for column in found.values():
         if names.count(column.name) > 1:
-            raise ConversionError(
-                f"{where} has {names.count(column.name)} columns {column.name!r}",
-                "give each a name of its own",
-            )
+            what = f"{where} has {names.count(column.name)} columns {column.name!r}"
+            raise ConversionError(what, "give each a name of its own")
     shift = overrides.get("shift_m", (0.0, 0.0))
     if not isinstance(shift, list | tuple) or [_within(v, 1e9) for v in shift] != [True, True]:
         raise ConfigError(f"shift_m is {shift!r}", "shift_m = [x, y] in metres")
@@ -198,7 +187,7 @@ def _named_columns(
 ) -> dict[str, Column]:
     out = {}
     for role, text in overrides.items():
-        one_of("column", role, ROLES)
+        one_of("column", role, _NAMES)
         usual = units.get(QUANTITIES[role], "")
         if text.startswith("="):
             out[role] = Column("", usual, constant=text[1:])

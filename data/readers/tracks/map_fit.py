@@ -4,12 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shiftsim.data.readers.placement import (
-    are_drivable,
-    containing_polygons,
-    direction_at,
-    place_on_map,
-)
+from shiftsim.data.readers import placement
 from shiftsim.data.readers.tracks.columns import UNITS
 from shiftsim.kernels import FloatArray
 from shiftsim.world.map import VectorMap
@@ -126,7 +121,7 @@ def fit_map(
         for shifted in (False, True):
             for name, axes in _AXES.items():
                 placed = points @ (scale * axes).T
-                shift = place_on_map(road, placed, 1.1).shift if shifted else np.zeros(2)
+                shift = placement.place_on_map(road, placed, 1.1).shift if shifted else np.zeros(2)
                 shares = _shares(road, placed + shift, ways @ axes.T)[:2]
                 guess = Guess(name, unit, shift, *shares)
                 found = guess.share * guess.along
@@ -145,15 +140,15 @@ def _shares(
     Speed limits [m/s] are 0 where there is none.
     """
     points = np.ascontiguousarray(points)
-    edges = containing_polygons(road.edges.polygons, points, _MAX_EDGES)
+    edges = placement.containing_polygons(road.edges.polygons, points, _MAX_EDGES)
     limits, is_along = np.zeros(len(points)), np.zeros(len(points), np.bool_)
     for index, place in np.argwhere(edges >= 0).tolist():
         edge = int(edges[index, place])
-        dx, dy = direction_at(road.baselines, edge, *points[index].tolist())
+        dx, dy = placement.direction_at(road.baselines, edge, *points[index].tolist())
         if dx * ways[index, 0] + dy * ways[index, 1] > 0.0:
             is_along[index] = True
             limits[index] = max(limits[index], np.nan_to_num(road.speed_limits[edge]))
     on_lane, along = float((edges[:, 0] >= 0).sum()), float(is_along.sum())
     count = max(1, len(points))
-    drivable = float(are_drivable(road, points).sum())
+    drivable = float(placement.are_drivable(road, points).sum())
     return drivable / count, along / on_lane if on_lane > 0.1 * count else 1.0, limits

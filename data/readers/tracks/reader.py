@@ -33,29 +33,19 @@ from shiftsim.world.map import VectorMap
 class TracksReader(Reader):
     """Tracks and map, read, and what cannot be right about them: a source of one recording.
 
-    Args:
-        tracks: CSV or Parquet file, one row per object and time; several make one recording.
-        map_path: OpenDRIVE file.
-        city: Name of the map in the store; that of the file by default.
-        overrides: Names, units and kinds (`columns.recognise`).
-        hz: Frames per second, for time given in frames.
-        config: Thresholds.
-
-    Raises:
-        ConversionError: A file cannot be read.
-        ConfigError: An override does not fit the file.
+    It is a ConversionError if a file cannot be read, a ConfigError if an override does not fit it.
     """
 
     egos: Sequence[str] | None = None  # ids of the egos; None for every vehicle that can be one
 
     def __init__(
         self,
-        tracks: Path | Sequence[Path],
-        map_path: Path,
+        tracks: Path | Sequence[Path],  # CSV or Parquet, one row per object and time
+        map_path: Path,  # OpenDRIVE file
         *,
-        city: str | None = None,
-        overrides: Mapping[str, Any] | None = None,
-        hz: float | None = None,
+        city: str | None = None,  # name of the map in the store; that of the file by default
+        overrides: Mapping[str, Any] | None = None,  # names, units and kinds (`recognise`)
+        hz: float | None = None,  # frames per second, for time given in frames
         config: ConversionConfig | None = None,
     ) -> None:
         self.config = config = config or ConversionConfig(ego_categories=EGO_CATEGORIES)
@@ -144,14 +134,8 @@ def convert_tracks(
 ) -> ConversionReport:
     """Add tracks to a store, made if needed; what it held of the recording is replaced.
 
-    Args:
-        reader: Tracks and map.
-        store: Folder of the store.
-        egos: Ids of the egos; every vehicle that can be one by default.
-
-    Raises:
-        ConversionError: Something cannot be right, or no scenario is left.
-        DataError: The store has another map of that name.
+    `egos` are the ids of the egos; every vehicle that can be one by default. It is a DataError if
+    something cannot be right, no scenario is left, or the store has another map of that name.
     """
     errors, road = reader.diagnostics.errors, reader.road
     if errors:

@@ -16,21 +16,9 @@ import pyarrow.csv as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from shiftsim.data.readers.build import (
-    dictionary_codes,
-    find_twice,
-    full_headings,
-    full_sizes,
-    index_ids,
-)
+from shiftsim.data.readers import build, motion
 from shiftsim.data.readers.codes import KINDS, normalise_category
 from shiftsim.data.readers.files import SourceFile
-from shiftsim.data.readers.motion import (
-    fitted_velocities,
-    track_ends,
-    track_medians,
-    unit_vectors,
-)
 from shiftsim.data.readers.tracks.columns import QUANTITIES, Column, Columns, recognise
 from shiftsim.errors import ConfigError, ConversionError
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
@@ -73,7 +61,7 @@ class TrackTable:
     @cached_property
     def ends(self) -> IntArray:
         """(N + 1,) first row of every object, and the number of rows."""
-        return track_ends(self.track)
+        return motion.track_ends(self.track)
 
     def is_of(self, kind: AgentKind) -> BoolArray:
         """(A,) whether a row is of an object of a kind."""
@@ -88,7 +76,7 @@ class TrackTable:
     @cached_property
     def derived(self) -> FloatArray:
         """(A, 2) velocities by the positions [m/s]."""
-        return fitted_velocities(self.xy, self.time, self.track, self.period)
+        return motion.fitted_velocities(self.xy, self.time, self.track, self.period)
 
     @cached_property
     def speed(self) -> FloatArray:
@@ -98,7 +86,7 @@ class TrackTable:
     @cached_property
     def vehicle_size(self) -> tuple[float, float] | None:
         """Length and width of the median vehicle [m], where vehicles have sizes."""
-        known = track_medians(self.sizes, self.track)[np.unique(self.track[self.is_vehicle])]
+        known = motion.track_medians(self.sizes, self.track)[np.unique(self.track[self.is_vehicle])]
         known = known[(known > 0).all(axis=1)]
         if not len(known):
             return None
@@ -114,25 +102,19 @@ class TrackTable:
 def read_tracks(
     path: Path | Sequence[Path],
     *,
-    overrides: Mapping[str, Any] | None = None,
-    hz: float | None = None,
+    overrides: Mapping[str, Any] | None = None,  # as of `columns.recognise`
+    hz: float | None = None,  # frames per second, for time given in frames
 ) -> TrackTable:
     """The rows of a CSV or Parquet file, or of several that are one recording.
 
-    Args:
-        path: The file; `*Meta.csv` files of levelXdata beside it are read too.
-        overrides: Names, units and kinds that the user gives (`columns.recognise`).
-        hz: Frames per second, for time given in frames.
-
-    Raises:
-        ConversionError: The file cannot be read, a column is missing or holds something else.
-        ConfigError: An override does not fit the file.
+    `*Meta.csv` files of levelXdata beside it are read too. It is a ConversionError if a file cannot
+    be read, a column is missing or holds something else, a ConfigError if an override does not fit.
     """
     paths = [path] if isinstance(path, Path) else path
     file = _TableFile(paths, {**(overrides or {}), **({"hz": hz} if hz is not None else {})})
     columns = file.columns_of
     time_us, rate = file.times()
-    track_ids, track = index_ids(file.ids())
+    track_ids, track = build.index_ids(file.ids())
     category, categories = file.categories(track_ids, track)
     order = np.lexsort((time_us, track))
 
@@ -144,7 +126,7 @@ def read_tracks(
 
     headings, velocities = stacked("heading")[:, 0], stacked("vx", "vy")
     if np.isnan(velocities).all():
-        velocities = stacked("speed") * unit_vectors(headings)
+        velocities = stacked("speed") * motion.unit_vectors(headings)
     table = TrackTable(
         paths[0].name.partition(".")[0],
         columns,
@@ -166,17 +148,17 @@ def read_tracks(
 def _centers(table: TrackTable) -> FloatArray:
     """(A, 2) middles of the boxes, of whose positions the columns tell which point they are [m]."""
     reference, found = table.columns.reference, table.columns.found
-    twice = find_twice(table.track_ids, table.track, table.time)
+    twice = build.find_twice(table.track_ids, table.track, table.time)
     if reference in ("", "center") or twice:
         return table.xy
     names = [table.categories[code] for code in table.category[table.ends[:-1]].tolist()]
     kinds = np.array([KINDS.get(name, AgentKind.VEHICLE) for name in names], np.int64)
-    sizes = full_sizes(table.sizes, names, kinds, table.track, Counter())[table.track]
+    sizes = build.full_sizes(table.sizes, names, kinds, table.track, Counter())[table.track]
     if reference == "corner":  # the one with the least numbers in the file
         return table.xy + 0.5 * sizes * [found["x"].sign, found["y"].sign]
-    headings = full_headings(table.headings, table.derived, table.track, Counter())
+    headings = build.full_headings(table.headings, table.derived, table.track, Counter())
     back = -0.5 if reference == "front" else 0.5
-    return table.xy + back * sizes[:, :1] * unit_vectors(headings)
+    return table.xy + back * sizes[:, :1] * motion.unit_vectors(headings)
 
 
 class _TableFile(SourceFile):
@@ -320,10 +302,8 @@ class _TableFile(SourceFile):
         role = "frame" if is_frame else "time"
         column = found[role]
         if is_frame and not rate:
-            raise self.fault(
-                f"time is given in frames ({column.name!r}) only",
-                "say how many there are per second: --hz 25",
-            )
+            what = f"time is given in frames ({column.name!r}) only"
+            raise self.fault(what, "say how many there are per second: --hz 25")
         if not column.name:
             raise ConfigError(f"{role} is the same for all rows", f"name a column: {role} = 'NAME'")
         values = self.table[column.name]
@@ -392,7 +372,7 @@ class _TableFile(SourceFile):
             values = self.table[column.name]
             if not pa.types.is_dictionary(values.type):
                 values = self._cast(column.name, pa.string(), "texts in UTF-8")
-            found, codes = dictionary_codes(values)
+            found, codes = build.dictionary_codes(values)
             names = [*map(str, found.to_pylist()), ""]
         plain = [normalise_category(name) for name in names]
         known = [self.columns_of.kinds.get(name, name) for name in plain]

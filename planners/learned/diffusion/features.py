@@ -115,8 +115,10 @@ class FeatureBuilder:
     def __call__(self, seen: Observation, noise: Single) -> Features:
         """Features of an observation and the start noise that goes with them."""
         anchor = np.array(seen.history.ego[-1, :3])
-        road = self._road
-        edges = lanes_around(road, self._lanes.connectors, anchor)
+        (x, y, _), areas = anchor.tolist(), self._road.edges.polygons
+        square = square_around(x, y, RADIUS)
+        near = lanes_in_square(areas, self._lanes.connectors, self._road.num_lanes, square)
+        edges = nearest_lanes(near, areas, self._road.baselines, x, y, LANES)
         route = self._corrector.at(anchor) if self._corrector else None
         agents, objects, chosen = agent_features(seen.history.tracks, anchor)
         lights = _LIGHT_COLUMN[self._lights.at(seen.lights)[edges]]
@@ -129,14 +131,6 @@ class FeatureBuilder:
             agents=chosen,
             route=route,
         )
-
-
-def lanes_around(road: VectorMap, connectors: shapely.STRtree, anchor: FloatArray) -> IntArray:
-    """Edges seen from a rear axle (3,), nearest first; `connectors` as in `LaneLines`."""
-    x, y = float(anchor[0]), float(anchor[1])
-    areas, square = road.edges.polygons, square_around(x, y, RADIUS)
-    near = lanes_in_square(areas, connectors, road.num_lanes, square)
-    return nearest_lanes(near, areas, road.baselines, x, y, LANES)
 
 
 def lanes_in_square(

@@ -31,13 +31,8 @@ from shiftsim.world.state import Trajectory
 
 NOISE_SHAPE = (11, 80, 4)  # ego and neighbours, steps, x, y, cos, sin
 INPUTS = (
-    "neighbor_agents_past",
-    "ego_current_state",
-    "static_objects",
-    "lanes",
-    "lanes_speed_limit",
-    "lanes_has_speed_limit",
-    "route_lanes",
+    *("neighbor_agents_past", "ego_current_state", "static_objects"),
+    *("lanes", "lanes_speed_limit", "lanes_has_speed_limit", "route_lanes"),
 )
 
 _lanes_of = PerMap(lane_lines)

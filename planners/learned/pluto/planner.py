@@ -24,15 +24,7 @@ from shiftsim.planners.learned.features import (
     stack_scenes,
 )
 from shiftsim.planners.learned.map_features import LightLookup, RoadFeatures, road_features
-from shiftsim.planners.learned.pluto import reference, world
-from shiftsim.planners.learned.pluto.scoring import (
-    Place,
-    Scores,
-    brake,
-    must_brake,
-    nearest_line,
-    score,
-)
+from shiftsim.planners.learned.pluto import reference, scoring, world
 from shiftsim.planners.proposals.tracker import STEP_US, STEPS
 from shiftsim.planners.routes.correction import RouteCorrector
 from shiftsim.sim.planner import Observation, SceneInfo
@@ -89,7 +81,7 @@ class Choice:
     poses: FloatArray  # (P, 81, 3) proposals
     learned: FloatArray  # (P,) their scores by the network
     agents: world.Agents  # the agents, now and predicted
-    scores: Scores  # of the proposals
+    scores: scoring.Scores  # of the proposals
     best: int  # number of the best one
     braked: bool  # whether the emergency brake replaces it
 
@@ -157,7 +149,9 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         if not choice.braked:
             return _plan(choice.poses[choice.best, 1:], observation)
         ego, fault_time = history.ego[-1].copy(), choice.scores.fault_times[choice.best]
-        states = brake(choice.poses[choice.best], ego, float(fault_time), self._scene.vehicle)
+        states = scoring.brake(
+            choice.poses[choice.best], ego, float(fault_time), self._scene.vehicle
+        )
         return Trajectory(observation.time_us + STEP_US * np.arange(len(states)), states)
 
     def _choose(self, output: Output, observation: Observation) -> Choice:
@@ -184,12 +178,12 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         footprint = boxes_to_corners(observation.ego.center, size)
         lights = world.red_lights(scene.map, route, observation)
         hazards = world.make_world(surroundings.static, agents, lights, footprint)
-        line = nearest_line(surroundings.lines, ego)
-        place = Place(surroundings.drivable, scene.map.edges.polygons, line)
-        scores = score(poses, learned, ego, hazards, place, scene.vehicle)
+        line = scoring.nearest_line(surroundings.lines, ego)
+        place = scoring.Place(surroundings.drivable, scene.map.edges.polygons, line)
+        scores = scoring.score(poses, learned, ego, hazards, place, scene.vehicle)
         best = int(np.argmax(scores.total))  # the first one on ties
         speed = float(np.hypot(ego[VX], ego[VY]))
-        braked = must_brake(speed, float(scores.fault_times[best]))
+        braked = scoring.must_brake(speed, float(scores.fault_times[best]))
         return Choice(poses, learned, agents, scores, best, braked)
 
 

@@ -20,15 +20,7 @@ from shiftsim.edits.spec import LEVELS, MANNERS, Edit
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.kernels import FloatArray
-from shiftsim.world.events import (
-    CAUTIOUS,
-    CROSSING_SIZE,
-    FOLLOW,
-    LOGGED,
-    STOPPED,
-    Crossing,
-    TerminationCondition,
-)
+from shiftsim.world import events
 from shiftsim.world.lanes import nearest_heading, poses_on_edge, start_on
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
@@ -58,7 +50,7 @@ class Vehicle:
     pose: FloatArray  # (3,) centre
     size: FloatArray  # (2,) length, width [m]
     velocity: FloatArray  # (2,) [m/s]; nuPlan rule 705: of new ones in the body frame
-    behavior: int = LOGGED
+    behavior: int = events.LOGGED
 
     @cached_property
     def corridor(self) -> shapely.Geometry:
@@ -76,15 +68,7 @@ class Vehicle:
 
 
 class InterplanEditor:
-    """What a code makes of a recorded scenario.
-
-    Attributes:
-        changes: What the code asks for.
-        ego_edge: Lane or connector of the ego.
-        ego_speed: Where it takes a place in its lane, of that place [m/s].
-        vehicles: At iteration 0.
-        plan: Route, lanes, goal and expert.
-    """
+    """What a code makes of a recorded scenario; `vehicles` are those at iteration 0."""
 
     def __init__(self, scenario: Scenario, edit: Edit, driven_lanes: DrivenLanes) -> None:
         self.builder = builder = ScenarioBuilder(scenario, edit, scenario.token)
@@ -99,7 +83,7 @@ class InterplanEditor:
         self.ego_speed = float(np.hypot(*self.ego_velocity))
         self.bodies: list[Vehicle] = []  # removed vehicles, for new ones to take
         self.cones: dict[str, FloatArray] = {}  # pose by token
-        self.crossings: list[Crossing] = []
+        self.crossings: list[events.Crossing] = []
         tracks = scenario.tracks
         logged = np.flatnonzero(tracks.valid[now] & (tracks.kinds == AgentKind.VEHICLE)).tolist()
         arrays = (tracks.poses[now], tracks.sizes[now], tracks.velocities[now])
@@ -124,7 +108,7 @@ class InterplanEditor:
         sorts = SORTS.get(self.scenario_type, "")
         obstacles = {
             "construction_zone": [pose[:2] for pose in self.cones.values()],
-            "stopped_vehicle": [v.pose[:2] for v in self.vehicles if v.behavior == STOPPED],
+            "stopped_vehicle": [v.pose[:2] for v in self.vehicles if v.behavior == events.STOPPED],
             "jaywalking_pedestrian": [crossing.end for crossing in self.crossings],
         }.get(sorts, [])
         letter = self.changes.get("observation", "")
@@ -170,7 +154,7 @@ class InterplanEditor:
         slots, speed = draw_slots(road, self.ego_edge, builder.center, gap, points, builder.draws)
         self.ego_speed = self.ego_speed if speed is None else speed
         for slot in slots:
-            self._add(slot.pose, slot.speed, FOLLOW)
+            self._add(slot.pose, slot.speed, events.FOLLOW)
         for x, y, extra_speed, *more in details.get("extra_agents_to_spawn") or ():
             options = more[0] if more else {}
             pose = np.array([x, y, 0.0])
@@ -180,18 +164,20 @@ class InterplanEditor:
                     raise ConfigError(f"an extra agent at ({x}, {y}) is on no lane")
                 pose = start_on(road, edges[0], x, y).pose
             is_default = bool(more) and options["behavior"] == "default"
-            self._add(pose, extra_speed, FOLLOW if is_default else CAUTIOUS)
+            self._add(pose, extra_speed, events.FOLLOW if is_default else events.CAUTIOUS)
 
     def _add_special(self) -> None:
         for pose in self.special.get("stopped_vehicle", ()):
-            self._add(np.array(pose, np.float64), 0.0, STOPPED)
+            self._add(np.array(pose, np.float64), 0.0, events.STOPPED)
         for pose in self.special.get("stopped_bus", ()):
-            self._add(np.array(pose, np.float64), 0.0, STOPPED, BUS)
+            self._add(np.array(pose, np.float64), 0.0, events.STOPPED, BUS)
         if not self.crossings:
             for x0, y0, x1, y1, iteration in self.special.get("pedestrian", ()):
                 heading = wrap_angle(float(np.arctan2(y1 - y0, x1 - x0)))
                 start, end = np.array([x0, y0, heading]), np.array([x1, y1])
-                self.crossings.append(Crossing(self._new_token(), start, end, iteration or 0))
+                self.crossings.append(
+                    events.Crossing(self._new_token(), start, end, iteration or 0)
+                )
         if not self.cones:
             # nuPlan rule 707: interPlan leaves these headings to numpy's global state
             turns = np.random.RandomState(0)
@@ -222,11 +208,11 @@ class InterplanEditor:
         corridors = [other.corridor for other in self.vehicles]
         meets = shapely.intersects(new.corridor, corridors).tolist()
         met = {other.token for other, is_met in zip(self.vehicles, meets, strict=True) if is_met}
-        if met and behavior == STOPPED:
+        if met and behavior == events.STOPPED:
             self.vehicles = [
                 other
                 for other in self.vehicles
-                if other.token not in met or other.behavior == STOPPED
+                if other.token not in met or other.behavior == events.STOPPED
             ]
         elif met:
             blocks = blocks_at(self.road, float(pose[0]), float(pose[1]))
@@ -246,7 +232,7 @@ class InterplanEditor:
             builder.add(list(self.cones), AgentKind.TRAFFIC_CONE, CONE, poses)
         if self.crossings:
             tokens, starts = zip(*((w.token, w.start) for w in self.crossings), strict=True)
-            size, poses = np.array(CROSSING_SIZE), np.array(starts)
+            size, poses = np.array(events.CROSSING_SIZE), np.array(starts)
             builder.add(tokens, AgentKind.PEDESTRIAN, size, poses, valid=False)
         ego, later = np.array(scenario.ego), scenario.iteration_rows[1:]
         if "goal" in self.changes:
@@ -254,7 +240,7 @@ class InterplanEditor:
             ego[later, :3] = rear_poses(plan.centers[1:])
         ego[builder.now] = initial
         builder.change(ego=ego, route=plan.route, mission_goal=plan.goal)
-        builder.termination = TerminationCondition(plan.line[:, :2], plan.end)
+        builder.termination = events.TerminationCondition(plan.line[:, :2], plan.end)
 
     def _add_vehicles(self, draws: random.Random) -> None:
         """The vehicles at iteration 0, and before it where they were with noise."""
@@ -270,7 +256,7 @@ class InterplanEditor:
         poses[:] = [vehicle.pose for vehicle in vehicles]
         poses[rows[known]] = past[known]
         valid[rows[known]] = valid[builder.now] = True
-        valid[builder.now :, behaviors == STOPPED] = True
+        valid[builder.now :, behaviors == events.STOPPED] = True
         builder.add(
             [vehicle.token for vehicle in vehicles],
             AgentKind.VEHICLE,

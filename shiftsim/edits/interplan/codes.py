@@ -25,11 +25,7 @@ DETAILS = "modification_details_dictionary"
 
 
 def parse_code(code: str) -> dict[str, Any]:
-    """What a code asks for, by the long name of its letters.
-
-    Raises:
-        ConfigError: A letter is unknown, or has no value.
-    """
+    """What a code asks for, by the long name of its letters; else a ConfigError."""
     out: dict[str, Any] = {}
     at = 0
     while at < len(code):
@@ -57,8 +53,7 @@ def edits_agents(changes: Mapping[str, Any]) -> bool:
 def changes_of(code: str, details: Mapping[str, Any]) -> dict[str, Any]:
     """What a code asks for; a special scenario may have a code of its own, which replaces all.
 
-    Raises:
-        ConfigError: The code is wrong, or the special scenario is not described.
+    Raises ConfigError: the code is wrong, or the special scenario is not described.
     """
     changes = parse_code(code)
     number = changes.get("special_scenario")
@@ -69,20 +64,14 @@ def changes_of(code: str, details: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def special_of(changes: Mapping[str, Any], details: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The description of a special scenario; empty where it is none.
-
-    Raises:
-        ConfigError: It is one, and is not described.
-    """
+    """The description of a special scenario, or a ConfigError; empty where it is none."""
     number = changes.get("special_scenario")
     if number is None:
         return {}
     known = details.get("special_scenario") or {}
     if number not in known:
-        raise ConfigError(
-            f"special scenario {number!r} is not described in the modifications",
-            hint=f"there are: {', '.join(known) or 'none'}",
-        )
+        what = f"special scenario {number!r} is not described in the modifications"
+        raise ConfigError(what, f"there are: {', '.join(known) or 'none'}")
     found: Mapping[str, Any] = known[number]
     return found
 
@@ -102,8 +91,7 @@ def scenario_type(changes: Mapping[str, Any], details: Mapping[str, Any]) -> str
 def group_names(names: Iterable[str]) -> dict[str, list[str]]:
     """Codes by token, of names such as `2d62c3139aa95007-s0`, in their order.
 
-    Raises:
-        ConfigError: Some names have codes and others have none.
+    Raises ConfigError: some names have codes and others have none.
     """
     listed = list(names)
     if len({"-" in name for name in listed}) > 1:

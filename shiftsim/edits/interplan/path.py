@@ -9,14 +9,7 @@ import shapely
 
 from shiftsim.edits.builder import EGO_SIZE
 from shiftsim.edits.interplan.codes import COMMANDS
-from shiftsim.edits.route import (
-    TOLERANCE,
-    by_command,
-    cut_by_time,
-    edge_at,
-    plan_lanes,
-    plan_line,
-)
+from shiftsim.edits.route import TOLERANCE, by_command, cut_by_time, edge_at, plan_lanes, plan_line
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.polylines import vertex_headings
@@ -52,8 +45,7 @@ def make_plan(
 ) -> Plan:
     """Route, lanes, goal and expert; the ego starts in the state `initial` (11,).
 
-    Raises:
-        ConfigError: interPlan finds none.
+    Raises ConfigError: interPlan finds none.
     """
     road, center = scenario.map, center_poses(initial[None, :3])[0]
     expert = center_poses(scenario.expert[:, :3])

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from shiftsim.data.readers.annotations import read_recording
 from shiftsim.data.readers.dsc3d import convert_dsc3d, open_site
-from shiftsim.data.readers.windows import ConversionConfig
+from shiftsim.data.readers.windows import ConversionConfig, make_config
 from shiftsim.data.store.check import survey_store
 from shiftsim.errors import ConfigError, ConversionError
 
@@ -140,7 +140,7 @@ def test_a_missing_map_is_one_error_and_leaves_no_store(tmp_path):
 )
 def test_settings_of_a_wrong_type_are_refused(values):
     with pytest.raises(ConfigError):
-        ConversionConfig(**values)
+        make_config(values)
 
 
 _boxes = st.lists(

@@ -2,6 +2,7 @@ import hashlib
 
 import numpy as np
 import pytest
+from track_files import write_demo
 
 from shiftsim.benchmarks import known_sets
 from shiftsim.benchmarks.speed.city import bench_scene
@@ -12,7 +13,7 @@ from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.data.synthetic.layouts import random_town
 from shiftsim.data.synthetic.roads import STEP
 from shiftsim.data.synthetic.routes import RandomRoutes, Route, make_path
-from shiftsim.data.synthetic.store import demo_store, write_demo
+from shiftsim.data.synthetic.store import demo_store
 from shiftsim.data.synthetic.town import Turn
 from shiftsim.metrics import compute_metrics
 from shiftsim.planners.registry import load_planner

@@ -7,12 +7,12 @@ from functools import partial
 import numpy as np
 import pytest
 from stores import write_toy_store
+from track_files import write_demo
 from worlds import cruise_scenario, standing_tracks, straight_road
 
 import shiftsim
 from shiftsim.data.readers.dsc3d import convert_dsc3d
 from shiftsim.data.store.reading import open_store
-from shiftsim.data.synthetic.store import write_demo
 from shiftsim.metrics import compute_metrics
 from shiftsim.planners.contract import check_planner
 from shiftsim.planners.registry import load_planner
