@@ -74,7 +74,8 @@ for _kind in (Scenario, VectorMap):
 def _missing(self: Any, name: str) -> Any:
     """`__getattr__` of what has no such attribute: says what may be meant."""
     owners = [kind.__name__ for kind in type(self).__mro__]
-    names = (other for other in dir(self) if other[0] != "_")
+    # `dir` itself asks for attributes that begin like that
+    names = [] if name[0] == "_" else [other for other in dir(self) if other[0] != "_"]
     raise no_attribute(f"{type(self).__name__!r} object", owners, name, names)
 
 
