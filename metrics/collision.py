@@ -20,9 +20,9 @@ from shiftsim.metrics.result import (
     Collision,
     MetricPart,
     MetricRow,
-    Statistic,
     Thresholds,
     Violation,
+    metric_part,
 )
 from shiftsim.world.state import (
     LAST_AGENT_KIND,
@@ -157,27 +157,19 @@ def evaluate(collisions: tuple[Collision, ...], thresholds: Thresholds) -> Metri
     if at_fault:
         worst = at_fault[0]
         violation = Violation(worst.iteration, worst.time_us, worst.token, worst.delta_v)
-    statistics = [
-        Statistic(NAME, NAME, "boolean", "BOOLEAN", float(total == 0)),
-        Statistic(NAME, "number_of_all_at_fault_collisions", "count", "COUNT", float(total)),
-    ]
-    for group, number in counts.items():
-        name = f"number_of_at_fault_collisions_with_{group}"
-        statistics.append(Statistic(NAME, name, "count", "COUNT", float(number)))
+    energies = []
     for group, kinds in GROUPS.items():
-        statistics += _energies(group, [c.delta_v for c in at_fault if c.kind in kinds])
-    row = MetricRow(NAME, score, float(total), "count", 0.0, violation)
-    return MetricPart(row, tuple(statistics))
-
-
-def _energies(group: str, values: list[float]) -> list[Statistic]:
-    if not values:
-        return []
-    unit = "meters_per_second"
-    return [
-        Statistic(NAME, f"{how}_collision_energy_with_{group}", unit, how.upper(), float(value))
-        for how, value in (("max", max(values)), ("min", min(values)), ("mean", np.mean(values)))
-    ]
+        if values := [c.delta_v for c in at_fault if c.kind in kinds]:
+            for how, value in ("max", max(values)), ("min", min(values)), ("mean", np.mean(values)):
+                name = f"{how}_collision_energy_with_{group}"
+                energies.append((name, "meters_per_second", how.upper(), float(value)))
+    return metric_part(
+        MetricRow(NAME, score, float(total), "count", 0.0, violation),
+        (NAME, "boolean", "BOOLEAN", total == 0),
+        ("number_of_all_at_fault_collisions", "count", "COUNT", total),
+        *((f"number_of_at_fault_collisions_with_{g}", "count", "COUNT", counts[g]) for g in counts),
+        *energies,
+    )
 
 
 @kernel

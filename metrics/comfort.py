@@ -16,10 +16,10 @@ from shiftsim.metrics.result import (
     MetricPart,
     MetricRow,
     Series,
-    Statistic,
     Thresholds,
     Violation,
     first_violation,
+    metric_part,
 )
 from shiftsim.world.state import (
     AX,
@@ -176,7 +176,7 @@ def evaluate(
     score = float(not violations)
     first = min(violations, key=lambda violation: violation.iteration, default=None)
     row = MetricRow(NAME, score, float(len(violations)), "count", 0.0, first)
-    return parts, MetricPart(row, (Statistic(NAME, NAME, "boolean", "BOOLEAN", score),))
+    return parts, metric_part(row, (NAME, "boolean", "BOOLEAN", score))
 
 
 def _part(
@@ -190,13 +190,12 @@ def _part(
     nearest = low if value - low < high - value else high
     row = MetricRow(metric, None, value, unit, nearest, violation)
     kinds = (("max", "MAX"), ("min", "MIN"), ("avg", "MEAN"), ("p90", "P90"))
-    statistics = [
-        Statistic(metric, f"{name}_{metric}", unit, kind, figure)
-        for (name, kind), figure in zip(kinds, others, strict=True)
-    ]
-    within = f"abs_{metric}_within_bounds"
-    statistics.append(Statistic(metric, within, "boolean", "BOOLEAN", float(violation is None)))
-    return MetricPart(row, tuple(statistics), Series(unit, values))
+    return metric_part(
+        row,
+        *((f"{n}_{metric}", unit, kind, v) for (n, kind), v in zip(kinds, others, strict=True)),
+        (f"abs_{metric}_within_bounds", "boolean", "BOOLEAN", violation is None),
+        series=Series(unit, values),
+    )
 
 
 def _percentiles_90(values: FloatArray) -> FloatArray:

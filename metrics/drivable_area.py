@@ -10,9 +10,9 @@ from shiftsim.metrics.result import (
     MetricPart,
     MetricRow,
     Series,
-    Statistic,
     Thresholds,
     first_violation,
+    metric_part,
 )
 from shiftsim.metrics.route import EdgeLists
 from shiftsim.world.layers import Polygons, in_any
@@ -50,16 +50,14 @@ def evaluate(
     first = first_violation(far, furthest, time_us)
     score = float(first is None)
     row = MetricRow(NAME, score, float(furthest.max()), "meters", bound, first)
-    compliance = MetricPart(row, (Statistic(NAME, NAME, "boolean", "BOOLEAN", score),))
+    compliance = metric_part(row, (NAME, "boolean", "BOOLEAN", score))
     outside = np.any(area.outside, axis=1)
     first = first_violation(outside, furthest, time_us)
-    inside = float(first is None)
-    corners = MetricPart(
+    return compliance, metric_part(
         MetricRow(CORNERS_NAME, None, float(outside.sum()), "count", 0.0, first),
-        (Statistic(CORNERS_NAME, CORNERS_NAME, "boolean", "BOOLEAN", inside),),
-        Series("boolean", np.where(outside, 0.0, 1.0)),
+        (CORNERS_NAME, "boolean", "BOOLEAN", first is None),
+        series=Series("boolean", np.where(outside, 0.0, 1.0)),
     )
-    return compliance, corners
 
 
 @kernel

@@ -3,7 +3,7 @@
 Only scenarios edited by a code of interPlan have them; the metrics of nuPlan stay as they are.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,7 @@ from shiftsim.kernels import FloatArray
 from shiftsim.metrics.progress import NAME as PROGRESS
 from shiftsim.metrics.result import MetricRow, Statistic
 from shiftsim.metrics.route import EdgeLists, driven_route
-from shiftsim.metrics.score import MULTIPLIERS, WEIGHTS, MetricResult
+from shiftsim.metrics.score import MULTIPLIERS, WEIGHTS, MetricResult, closed_loop_score
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.events import RolloutEvents
 from shiftsim.world.map import NONE, VectorMap
@@ -68,19 +68,9 @@ def role_of(metric: str, sorts: str) -> tuple[str, float | None]:
     return "weighted", WEIGHTS.get(metric, 1.0)
 
 
-def interplan_score(scores: dict[str, float | None], sorts: str) -> float:
-    """Product of the multipliers times the weighted mean of the others."""
-    product, total, weights = 1.0, 0.0, 0.0
-    for metric, score in scores.items():
-        if score is None:
-            continue
-        _, weight = role_of(metric, sorts)
-        if weight is None:
-            product *= score
-        else:
-            total += weight * score
-            weights += weight
-    return product * (total / weights if weights > 0.0 else 0.0)
+def interplan_score(scores: Mapping[str, float | None], sorts: str) -> float:
+    """Product of the multipliers times the weighted mean of the others, as `role_of` says."""
+    return closed_loop_score(scores, lambda metric: role_of(metric, sorts)[1])
 
 
 def final_score(types: Sequence[tuple[int, float]], weights: Sequence[float]) -> float:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shiftsim.kernels import BoolArray, IntArray, kernel
-from shiftsim.metrics.result import MetricPart, MetricRow, Statistic, Thresholds
+from shiftsim.metrics.result import MetricPart, MetricRow, Thresholds, metric_part
 from shiftsim.metrics.route import EdgeLists, has
 from shiftsim.world.layers import Lists
 from shiftsim.world.map import VectorMap
@@ -44,22 +44,18 @@ def lane_changes(map: VectorMap, corners: EdgeLists) -> LaneChanges:
 
 def evaluate(lanes: LaneChanges, time_us: IntArray, thresholds: Thresholds) -> MetricPart:
     """Number and duration of the lane changes, and the share that failed."""
-    count = len(lanes.start)
-    statistics = [Statistic(NAME, f"number_of_{NAME}", "count", "COUNT", float(count))]
-    ratio = 0.0
+    count, ratio, bound = len(lanes.start), 0.0, thresholds.max_lane_change_fail_rate
+    statistics = [(f"number_of_{NAME}", "count", "COUNT", float(count))]
     if count:
         durations = (time_us[lanes.end] - time_us[lanes.start]) * 1e-6
         ratio = float(lanes.failed.sum()) / count
         statistics += [
-            Statistic(NAME, f"max_{NAME}_duration", "seconds", "MAX", float(durations.max())),
-            Statistic(NAME, f"avg_{NAME}_duration", "seconds", "MEAN", float(np.mean(durations))),
-            Statistic(NAME, f"ratio_of_failed_{NAME}", "ratio", "RATIO", ratio),
+            (f"max_{NAME}_duration", "seconds", "MAX", durations.max()),
+            (f"avg_{NAME}_duration", "seconds", "MEAN", float(np.mean(durations))),
+            (f"ratio_of_failed_{NAME}", "ratio", "RATIO", ratio),
         ]
-    within = ratio <= thresholds.max_lane_change_fail_rate
-    name = f"{NAME}_fail_rate_below_threshold"
-    statistics.append(Statistic(NAME, name, "boolean", "BOOLEAN", float(within)))
-    bound = thresholds.max_lane_change_fail_rate
-    return MetricPart(MetricRow(NAME, None, ratio, "ratio", bound, None), tuple(statistics))
+    statistics.append((f"{NAME}_fail_rate_below_threshold", "boolean", "BOOLEAN", ratio <= bound))
+    return metric_part(MetricRow(NAME, None, ratio, "ratio", bound, None), *statistics)
 
 
 @kernel

@@ -14,9 +14,9 @@ from shiftsim.metrics.result import (
     MetricPart,
     MetricRow,
     Series,
-    Statistic,
     Thresholds,
     first_violation,
+    metric_part,
 )
 from shiftsim.metrics.route import EdgeLists, driven_route
 from shiftsim.world.layers import Polygons, Polylines, contains, project_on_line
@@ -90,23 +90,17 @@ def evaluate(progress: Progress, thresholds: Thresholds) -> tuple[MetricPart, Me
     ratio = 1.0
     if progress.has_route:
         ratio = 0.0 if ego < -floor else min(1.0, max(ego, floor) / max(expert, floor))
-    statistics = [
-        Statistic(NAME, "expert_total_progress_along_route", "meters", "VALUE", expert),
-        Statistic(NAME, "ego_total_progress_along_route", "meters", "VALUE", ego),
-        Statistic(NAME, "ego_expert_progress_along_route_ratio", "ratio", "RATIO", ratio),
-    ]
-    if not progress.has_route:
-        del statistics[1]
-    series = Series("meters", progress.ego) if progress.has_route else None
-    along = MetricPart(
-        MetricRow(NAME, ratio, ratio, "ratio", None, None), tuple(statistics), series
+    own = [("ego_total_progress_along_route", "meters", "VALUE", ego)]
+    along = metric_part(
+        MetricRow(NAME, ratio, ratio, "ratio", None, None),
+        ("expert_total_progress_along_route", "meters", "VALUE", expert),
+        *(own if progress.has_route else []),
+        ("ego_expert_progress_along_route_ratio", "ratio", "RATIO", ratio),
+        series=Series("meters", progress.ego) if progress.has_route else None,
     )
     score = float(ratio >= thresholds.min_progress)
-    making = MetricPart(
-        MetricRow(MAKING_NAME, score, ratio, "ratio", thresholds.min_progress, None),
-        (Statistic(MAKING_NAME, MAKING_NAME, "boolean", "BOOLEAN", score),),
-    )
-    return along, making
+    row = MetricRow(MAKING_NAME, score, ratio, "ratio", thresholds.min_progress, None)
+    return along, metric_part(row, (MAKING_NAME, "boolean", "BOOLEAN", score))
 
 
 def lane_progress(map: VectorMap, route: EdgeLists, centers: FloatArray) -> FloatArray:
@@ -131,25 +125,19 @@ def evaluate_direction(
 ) -> MetricPart:
     """Score 1, 0.5 or 0 by the largest regress within a window."""
     horizon = thresholds.driving_direction_horizon
-    sums = windowed(progress, time_us, horizon)
-    lowest = float(sums.min())
-    regress = abs(lowest)
-    score = 0.0
-    if regress < thresholds.driving_direction_compliance:
-        score = 1.0
-    elif regress < thresholds.driving_direction_violation:
-        score = 0.5
     compliance = thresholds.driving_direction_compliance
+    sums = windowed(progress, time_us, horizon)
+    regress = abs(float(sums.min()))
+    score = 0.5 if regress < thresholds.driving_direction_violation else 0.0
+    score = 1.0 if regress < compliance else score
     violation = first_violation(-sums >= compliance, -sums, time_us)
     seconds = f"{horizon:g}"
     lowest_name = f"min_progress_along_driving_direction_in_{seconds}_second_interval"
-    return MetricPart(
+    return metric_part(
         MetricRow(DIRECTION_NAME, score, regress, "meters", compliance, violation),
-        (
-            Statistic(DIRECTION_NAME, f"{DIRECTION_NAME}_score", "value", "VALUE", score),
-            Statistic(DIRECTION_NAME, lowest_name, "meters", "MIN", -regress),
-        ),
-        Series(f"progress_along_driving_direction_in_last_{seconds}_seconds_[m]", sums),
+        (f"{DIRECTION_NAME}_score", "value", "VALUE", score),
+        (lowest_name, "meters", "MIN", -regress),
+        series=Series(f"progress_along_driving_direction_in_last_{seconds}_seconds_[m]", sums),
     )
 
 

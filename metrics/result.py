@@ -119,8 +119,16 @@ class MetricPart:
     """What one metric contributes to the result."""
 
     row: MetricRow
-    statistics: tuple[Statistic, ...] = ()
-    series: Series | None = None
+    statistics: tuple[Statistic, ...]
+    series: Series | None
+
+
+def metric_part(
+    row: MetricRow, *statistics: tuple[str, str, str, float], series: Series | None = None
+) -> MetricPart:
+    """A row with statistics of its metric, each a name, unit, kind and value, and its series."""
+    named = (Statistic(row.metric, *about, float(value)) for *about, value in statistics)
+    return MetricPart(row, tuple(named), series)
 
 
 class Collision(NamedTuple):

@@ -4,7 +4,7 @@ What depends on geometry and on no threshold is measured once; any number of thr
 be applied to the result.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -208,20 +208,25 @@ def nuplan_columns(result: MetricResult, metric: str) -> dict[str, Any]:
     }
 
 
-def closed_loop_score(scores: Mapping[str, float | None]) -> float:
+def weight_of(metric: str) -> float | None:
+    """Weight of a metric, 1 for one that is not listed; None for a multiplier."""
+    return None if metric in MULTIPLIERS else WEIGHTS.get(metric, 1.0)
+
+
+def closed_loop_score(
+    scores: Mapping[str, float | None], weigh: Callable[[str], float | None] = weight_of
+) -> float:
     """Product of the multipliers times the weighted mean of the other metrics.
 
-    A metric without a score is left out of numerator and weights; one that is not listed has
-    weight 1.
+    A metric without a score is left out of numerator and weights.
     """
     product, total, weights = 1.0, 0.0, 0.0
     for metric, score in scores.items():
         if score is None:
             continue
-        if metric in MULTIPLIERS:
+        if (weight := weigh(metric)) is None:
             product *= score
         else:
-            weight = WEIGHTS.get(metric, 1.0)
             total += weight * score
             weights += weight
     return product * (total / weights if weights > 0.0 else 0.0)

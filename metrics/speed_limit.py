@@ -8,9 +8,9 @@ from shiftsim.metrics.result import (
     MetricPart,
     MetricRow,
     Series,
-    Statistic,
     Thresholds,
     first_violation,
+    metric_part,
 )
 from shiftsim.metrics.route import EdgeLists, Lanes, lanes_of
 from shiftsim.world.map import VectorMap
@@ -50,14 +50,12 @@ def evaluate(over: FloatArray, time_us: IntArray, thresholds: Thresholds) -> Met
             score = max(0.0, 1.0 - loss / worst)
     highest = float(over.max())
     row = MetricRow(NAME, score, highest, "meters_per_second", thresholds.max_overspeed, violation)
-    statistics = (
-        Statistic(NAME, NAME, "boolean", "BOOLEAN", float(violation is None)),
-        *_violations(over, time_us),
-    )
-    return MetricPart(row, statistics, Series("over_speeding[meters_per_second]", over))
+    is_kept = (NAME, "boolean", "BOOLEAN", violation is None)
+    series = Series("over_speeding[meters_per_second]", over)
+    return metric_part(row, is_kept, *_violations(over, time_us), series=series)
 
 
-def _violations(over: FloatArray, time_us: IntArray) -> list[Statistic]:
+def _violations(over: FloatArray, time_us: IntArray) -> list[tuple[str, str, str, float]]:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], over > 0.0, [False]])))
     if len(edges) == 0:
         return []
@@ -73,10 +71,10 @@ def _violations(over: FloatArray, time_us: IntArray) -> list[Statistic]:
     mean = weighted / total if total > 0 else float("nan")
     unit = "meters_per_second"
     return [
-        Statistic(NAME, f"number_of_violations_of_{NAME}", "count", "COUNT", float(len(peaks))),
-        Statistic(NAME, f"max_violation_of_{NAME}", unit, "MAX", max(peaks)),
-        Statistic(NAME, f"min_violation_of_{NAME}", unit, "MIN", min(peaks)),
-        Statistic(NAME, f"mean_violation_of_{NAME}", unit, "MEAN", mean),
+        (f"number_of_violations_of_{NAME}", "count", "COUNT", len(peaks)),
+        (f"max_violation_of_{NAME}", unit, "MAX", max(peaks)),
+        (f"min_violation_of_{NAME}", unit, "MIN", min(peaks)),
+        (f"mean_violation_of_{NAME}", unit, "MEAN", mean),
     ]
 
 

@@ -7,22 +7,15 @@ import numpy as np
 from shiftsim.geometry.boxes import AHEAD, BEHIND, bearing_cosine
 from shiftsim.geometry.rings import SLACK
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.metrics.collision import (
-    BOX_SIZE,
-    Contacts,
-    Ego,
-    FlatTracks,
-    collide,
-    set_box,
-)
+from shiftsim.metrics.collision import BOX_SIZE, Contacts, Ego, FlatTracks, collide, set_box
 from shiftsim.metrics.result import (
     Collision,
     MetricPart,
     MetricRow,
     Series,
-    Statistic,
     Thresholds,
     first_violation,
+    metric_part,
 )
 from shiftsim.world.layers import Polygons, in_any
 from shiftsim.world.map import VectorMap
@@ -73,13 +66,11 @@ def evaluate(ttc: TimeToCollision, time_us: IntArray, thresholds: Thresholds) ->
     within = float(violation is None)
     if violation is not None and (partner := ttc.partners[violation.iteration]) >= 0:
         violation = violation._replace(partner=ttc.tokens[partner])
-    return MetricPart(
+    return metric_part(
         MetricRow(NAME, within, lowest, "seconds", bound, violation),
-        (
-            Statistic(NAME, "min_time_to_collision", "seconds", "MIN", lowest),
-            Statistic(NAME, NAME, "boolean", "BOOLEAN", within),
-        ),
-        Series(f"time_to_collision_under_{HORIZON}_seconds [s]", ttc.values),
+        ("min_time_to_collision", "seconds", "MIN", lowest),
+        (NAME, "boolean", "BOOLEAN", within),
+        series=Series(f"time_to_collision_under_{HORIZON}_seconds [s]", ttc.values),
     )
 
 

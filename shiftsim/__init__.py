@@ -46,35 +46,6 @@ _PUBLIC = {
 
 __all__ = list(_PUBLIC)
 
-# what is asked for by the names of other tools -> what it is called here
-_WORDS = {
-    "AbstractPlanner": "Planner; one written for nuPlan drives as nuplan:package.module:Class",
-    "Map": "shiftsim.world.map.VectorMap",
-    "Noise": "NoiseModel",
-    "ScenarioStore": "open_store",
-    "Store": "open_store",
-    "VectorMap": "shiftsim.world.map.VectorMap",
-    "compare": "open_run(…).compare(other)",
-    "convert": "convert_nuplan, convert_dsc3d, convert_tracks, convert_dataset",
-    "diff": "open_run(…).diff(other)",
-    "evaluate": "run, or score for one rollout",
-    "frenet": "line.to_frenet(poses), of line = scene.route_line()",
-    "list_planners": "shiftsim.planners.table.PLANNERS",
-    "load_run": "open_run",
-    "load_scenario": "open_store(…)[token]",
-    "load_store": "open_store",
-    "noises": "shiftsim.sim.noise.NOISE_NAMES",
-    "plot": "open_run(…).plot(token), or scenario.plot()",
-    "register_planner": "run(YourPlanner): nothing has to be registered",
-    "replay": "show, or open_run(…).view(token)",
-    "report": "open_run(…).report(folder)",
-    "rescore": "open_run(…).rescore(thresholds)",
-    "rollout": "simulate",
-    "table": "open_run(…).table(name)",
-    "train": "import shiftsim.env, or shiftsim.train",
-    "view": "show, or open_run(…).view(token)",
-}
-
 # Names that earlier documentation printed, for one version more: module path -> where it is now,
 # with all modules in it, and `module:name` -> the same. Remove them with the next version.
 _DEPRECATED = {
@@ -94,13 +65,9 @@ _DEPRECATED = {
 
 def __getattr__(name: str) -> Any:
     if name not in _PUBLIC:
-        what = f"module 'shiftsim' has no attribute {name!r}"
-        if not name.startswith("_"):
-            from shiftsim.errors import nearest
+        from shiftsim.errors import no_attribute
 
-            meant = _WORDS.get(name) or nearest(name, _PUBLIC)
-            what += f"; what you mean may be: {meant}" if meant else ""
-        raise AttributeError(what)
+        raise no_attribute("module 'shiftsim'", ("shiftsim",), name, _PUBLIC)
     globals()[name] = value = _load(_PUBLIC[name])
     return value
 

@@ -1,8 +1,10 @@
 """The exception tree. A message says what is wrong, where, and what to do about it."""
 
 import difflib
+import tomllib
 from collections.abc import Iterable, Sequence
 from importlib import import_module
+from pathlib import Path
 from types import ModuleType
 
 FAILED = "failed check: "  # begins what a report says of a map that cannot be right
@@ -139,3 +141,20 @@ def beginning(where: str, what: str, text: str, choices: Iterable[str]) -> str:
 def nearest(value: str, choices: Iterable[str]) -> str:
     """The choice that a mistyped value most likely means; empty where none is near."""
     return next(iter(difflib.get_close_matches(value, list(choices), n=1, cutoff=0.5)), "")
+
+
+def no_attribute(
+    what: str, owners: Iterable[str], name: str, names: Iterable[str]
+) -> AttributeError:
+    """The error where something has no attribute; it says what is most likely meant.
+
+    That is what `synonyms.toml` says in the tables of the `owners`, or the nearest of `names`.
+    """
+    meant = ""
+    if not name.startswith("_"):
+        tables = tomllib.loads(Path(__file__).with_name("synonyms.toml").read_text("utf-8"))
+        known = [pair for owner in owners for pair in tables.get(owner, {}).items()]
+        meant = next((here for keys, here in known if name in keys.split(", ")), "")
+        meant = meant or nearest(name, names)
+    more = f"; what you mean may be: {meant}" if meant else ""
+    return AttributeError(f"{what} has no attribute {name!r}{more}")

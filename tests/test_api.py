@@ -5,6 +5,7 @@ import pickle
 import re
 import shutil
 import sys
+import tomllib
 
 import numpy as np
 import pytest
@@ -277,15 +278,17 @@ def test_no_hint_is_said_twice():
 
 
 def test_what_other_tools_call_otherwise_is_answered_with_the_name_here(run, scenario, store, log):
-    from shiftsim.api.notebook import WORDS
-
+    tables = tomllib.loads((PACKAGE / "synonyms.toml").read_text("utf-8"))
+    words_of = {
+        kind: {name: here for names, here in table.items() for name in names.split(", ")}
+        for kind, table in tables.items()
+    }
     result = shiftsim.score(log, scenario)
     scene, seen = scene_info(scenario), observe_log(scenario, 3)
     plan = shiftsim.Trajectory.from_poses([0, 1.0], [seen.ego.pose] * 2)
     asked = run, scenario, store, log, result, scene, seen, seen.ego, seen.tracks, plan
     for thing in (*asked, scenario.map):
-        words = next(words for kind, words in WORDS.items() if isinstance(thing, kind))
-        for name, meant in words.items():
+        for name, meant in words_of[type(thing).__name__].items():
             with pytest.raises(AttributeError, match=f"no attribute '{name}'") as caught:
                 getattr(thing, name)
             assert meant in str(caught.value)
@@ -294,7 +297,7 @@ def test_what_other_tools_call_otherwise_is_answered_with_the_name_here(run, sce
     with pytest.raises(AttributeError, match="may be: tracks"):
         _ = scenario.track
     assert not hasattr(scenario, "_private")
-    for name, meant in shiftsim._WORDS.items():
+    for name, meant in words_of["shiftsim"].items():
         if f"shiftsim.{name}" in sys.modules:  # a package that something has imported
             continue
         with pytest.raises(AttributeError) as caught:

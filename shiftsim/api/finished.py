@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from shiftsim.api.notebook import answer
 from shiftsim.errors import ConfigError, listed, one_of
 from shiftsim.runs import results
 from shiftsim.sim.log import SimulationLog
@@ -271,18 +270,3 @@ class Run(results.Run):
 
     def _repr_html_(self) -> str:
         return str(self.table(format="html", allow_partial=True))
-
-
-answer(
-    Run,
-    """results: scores, metrics and tasks
-        summary: table()
-        failures: tasks, where `status` is not ok
-        planners: manifest["config"]["planners"]
-        scenarios, tokens: scores["token"]; shiftsim.open_store(…)[token] is a scenario
-        rollouts, log: rollout(token)
-        show: view(token)
-        score: scores
-        to_pandas: table(format="pandas"), or scores.to_pandas()
-        save, folder: path; it is on disk already""",
-)

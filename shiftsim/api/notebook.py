@@ -4,12 +4,12 @@ And what they answer when they are asked for something by another name.
 """
 
 import html
-from collections.abc import Callable, Mapping
 from typing import Any
 
 from shiftsim.data.store.reading import ScenarioStore
-from shiftsim.errors import MissingExtraError, nearest
+from shiftsim.errors import MissingExtraError, no_attribute
 from shiftsim.metrics import MetricResult
+from shiftsim.runs.results import Run
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.map import VectorMap
@@ -70,96 +70,17 @@ def _plot(self: Scenario | VectorMap) -> Any:
 for _kind in (Scenario, VectorMap):
     setattr(_kind, "plot", _plot)  # noqa: B010
 
-# what is asked for by names of other tools: what it is called here
-_SYNONYMS: dict[type, str] = {
-    Scenario: """agents, objects, boxes: tracks
-        id, name: token
-        type: scenario_type
-        log: log_name
-        dt, times: iteration_times
-        lights: traffic_lights
-        goal: mission_goal
-        view: plot(); shiftsim.show(scenario, name=log) replays rollouts
-        vector_map: map
-        map_name: city
-        length: num_iterations
-        simulate: shiftsim.simulate(scenario, "idm")""",
-    ScenarioStore: """scenarios: iteration, as in `for scenario in store`
-        get, load, get_scenario: store[token]
-        maps: cities, and map(city)
-        types: summary()["type"]
-        splits: path / "splits"
-        to_pandas: summary().to_pandas()""",
-    Observation: """agents, objects: tracks
-        time, time_s: time_us
-        ego_state: ego
-        step: iteration
-        map, route: those of the scene that reset(scene) is given""",
-    SceneInfo: """vector_map: map
-        route_ids, route_roadblock_ids, roadblocks: route
-        mission_goal: goal
-        scenario: expert, for a planner with `sees_recording = True`
-        lanes: route_lanes, or map.edges""",
-    EgoState: """position, xy: pose[:2]
-        yaw: heading
-        rear_axle: pose
-        v: speed
-        vx: velocity[0]
-        steering: steering_angle
-        time: time_us""",
-    Tracks: """positions, xy: poses[..., :2]
-        headings: poses[..., 2]
-        ids: tokens
-        types, categories: kinds
-        mask: valid
-        lengths: sizes[..., 0]
-        speeds: velocities, whose length it is""",
-    SimulationLog: """score, scores, metrics: shiftsim.score(log, scenario)
-        plot, show: shiftsim.show(scenario, name=log)
-        states: ego
-        times: time_us
-        agents: tracks
-        trajectory: ego; what was planned: plans""",
-    Trajectory: """poses: states[:, :3]
-        times: time_us
-        from_xy: from_poses
-        from_states: Trajectory(time_us, states)""",
-    MetricResult: """cls, total: score
-        metrics: scores, and rows
-        violations: rows, each with its violation""",
-    VectorMap: """lanes: edges
-        roadblocks: blocks
-        lane_at: lanes_at(x, y)""",
-}
+
+def _missing(self: Any, name: str) -> Any:
+    """`__getattr__` of what has no such attribute: says what may be meant."""
+    owners = [kind.__name__ for kind in type(self).__mro__]
+    # `dir` itself asks for attributes that begin like that
+    names = [] if name[0] == "_" else [other for other in dir(self) if other[0] != "_"]
+    raise no_attribute(f"{type(self).__name__!r} object", owners, name, names)
 
 
-def _words(text: str) -> dict[str, str]:
-    """The name here for each name of a list of synonyms."""
-    lines = (line.strip().partition(": ") for line in text.splitlines())
-    return {name: meant for names, _, meant in lines for name in names.split(", ")}
-
-
-WORDS: dict[type, dict[str, str]] = {}
-
-
-def _answer(words: Mapping[str, str]) -> Callable[[Any, str], Any]:
-    """`__getattr__` of a class: there is no such attribute, and what may be meant."""
-
-    def __getattr__(self: Any, name: str) -> Any:
-        what = f"{type(self).__name__!r} object has no attribute {name!r}"
-        if not name.startswith("_"):
-            meant = words.get(name) or nearest(name, (n for n in dir(self) if n[0] != "_"))
-            what += f"; what you mean may be: {meant}" if meant else ""
-        raise AttributeError(what)
-
-    return __getattr__
-
-
-def answer(kind: type, text: str) -> None:
-    """Let objects of a class answer to names of other tools, each with the name here."""
-    WORDS[kind] = _words(text)
-    setattr(kind, "__getattr__", _answer(WORDS[kind]))  # noqa: B010
-
-
-for _asked, _text in _SYNONYMS.items():
-    answer(_asked, _text)
+for _kind in (
+    *(Scenario, ScenarioStore, Observation, SceneInfo, EgoState, Tracks),
+    *(SimulationLog, Trajectory, MetricResult, VectorMap, Run),
+):
+    setattr(_kind, "__getattr__", _missing)  # noqa: B010

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument, Option, echo
 
+import shiftsim
 from shiftsim import cli
 from shiftsim.cli import Json, Quiet, new_app, plural, print_json, print_result, progress_bar
-from shiftsim.errors import ConfigError, ConversionError, MissingExtraError, one_of
+from shiftsim.errors import ConfigError, ConversionError, MissingExtraError
 from shiftsim.files import read_toml, store_path
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from shiftsim.data.readers.convert import ConversionReport
-    from shiftsim.data.readers.reader import Reader
     from shiftsim.data.readers.scenarios import RecordingSummary
     from shiftsim.data.readers.tracks.reader import TracksReader
     from shiftsim.data.readers.windows import ConversionConfig
@@ -32,8 +32,27 @@ Overlap = Annotated[float | None, Option(help="Overlap of windows [s]. [6]")]
 History = Annotated[float | None, Option(help="Part of a window before iteration 0 [s]. [3]")]
 Source = Annotated[Path, Argument(metavar="FOLDER", help="Folder of the data set.")]
 Egos = Annotated[
-    str, Option(help="recorded: the recording car; vehicles: each vehicle that drives.")
+    str,
+    Option(
+        help="recorded: the recording car; vehicles: each vehicle that drives, always so of "
+        "commonroad."
+    ),
 ]
+_DATASETS = {
+    "av2": """Convert scenes of Argoverse 2 motion forecasting, train or val.
+
+    A broken scene is skipped and named, and the exit code is 3. A conversion that was stopped goes
+    on when it is started again. That holds for py123d and commonroad as well.
+    """,
+    "py123d": """Convert logs that py123d wrote: Waymo, nuScenes, Argoverse 2 Sensor, nuPlan.
+
+    FOLDER holds logs/ and, for data sets with one map per city, maps/.
+    """,
+    "commonroad": """Convert CommonRoad scenarios in XML: NGSIM, INTERACTION, inD, highD and others.
+
+    The files have no recording car: each vehicle that drives is an ego.
+    """,
+}
 
 
 @app.command()
@@ -54,7 +73,6 @@ def nuplan(
     as_json: Json = False,
 ) -> None:
     """Convert scenarios of nuPlan logs (.db) and maps (map.gpkg)."""
-    from shiftsim import convert_nuplan
     from shiftsim.data.nuplan.scenarios import parse_mapping
 
     folder = store_path(store)
@@ -65,7 +83,7 @@ def nuplan(
         "filter_file": filter_file,
     }
     with progress_bar(quiet=quiet or as_json) as advance:
-        report = convert_nuplan(logs, maps, folder, **filters, progress=advance)
+        report = shiftsim.convert_nuplan(logs, maps, folder, **filters, progress=advance)
     failed = list(report.failed.items())
     lines = [
         *(f" tolerated: {flaw} ({count})" for flaw, count in report.flaws.items()),
@@ -125,8 +143,6 @@ def dsc3d(
     Planners need 2 s of history. A recording too short for that is converted with a made-up one,
     of constant velocity: --window-s 4.9 --overlap-s 0 --history-s 0 --padding-s 2.2
     """
-    from shiftsim.data.readers.dsc3d import Dsc3dReader
-
     for word in category or ():
         name, _, known = word.partition("=")
         if not (name and known):
@@ -137,9 +153,10 @@ def dsc3d(
         **cli.given(category_map=dict(word.split("=", 1) for word in category or ()) or None),
     }
     options = _options(config, flags)
-    reader = Dsc3dReader(source, site=site, map_path=map_path, config=options)
+    where = {"site": site, "map_path": map_path}
+    make = partial(shiftsim.convert_dsc3d, source, **where, **settings, **vars(options))
     lines = partial(_site_lines, is_short=options.is_short)
-    _convert(reader, store, settings, "site", lines, quiet=quiet, as_json=as_json)
+    _convert(make, store, "site", lines, quiet=quiet, as_json=as_json)
 
 
 @app.command()
@@ -232,77 +249,31 @@ def _draw_tracks(path: Path, inspection: "TracksReader", store: Path | None) -> 
         echo(f" picture: {path}", err=True)
 
 
-@app.command()
-@cli.with_settings("workers")
-def av2(
-    folder: Source,
-    store: Store,
-    egos: Egos = "recorded",
-    *,
-    settings: cli.Settings,
-    quiet: Quiet = False,
-    as_json: Json = False,
-) -> None:
-    """Convert scenes of Argoverse 2 motion forecasting, train or val.
+def _add_dataset(kind: str, text: str) -> None:
+    """The command that converts one of the data sets of `shiftsim.convert_dataset`."""
 
-    A broken scene is skipped and named, and the exit code is 3. A conversion that was stopped goes
-    on when it is started again. That holds for py123d and commonroad as well.
-    """
-    from shiftsim.data.readers.av2 import Av2Reader
-
-    reader = Av2Reader(folder, vehicles=_are_vehicles(egos))
-    _convert(reader, store, settings, "dataset", _scene_lines, quiet=quiet, as_json=as_json)
+    @app.command(kind, help=text)
+    @cli.with_settings("workers")
+    def convert(
+        folder: Source,
+        store: Store,
+        egos: Egos = "recorded",
+        *,
+        settings: cli.Settings,
+        quiet: Quiet = False,
+        as_json: Json = False,
+    ) -> None:
+        make = partial(shiftsim.convert_dataset, kind, folder, egos=egos, **settings)
+        _convert(make, store, "dataset", _scene_lines, quiet=quiet, as_json=as_json)
 
 
-@app.command()
-@cli.with_settings("workers")
-def py123d(
-    folder: Source,
-    store: Store,
-    egos: Egos = "recorded",
-    *,
-    settings: cli.Settings,
-    quiet: Quiet = False,
-    as_json: Json = False,
-) -> None:
-    """Convert logs that py123d wrote: Waymo, nuScenes, Argoverse 2 Sensor, nuPlan.
-
-    FOLDER holds logs/ and, for data sets with one map per city, maps/.
-    """
-    from shiftsim.data.readers.py123d import Py123dReader
-
-    reader = Py123dReader(folder, vehicles=_are_vehicles(egos))
-    _convert(reader, store, settings, "dataset", _scene_lines, quiet=quiet, as_json=as_json)
-
-
-@app.command()
-@cli.with_settings("workers")
-def commonroad(
-    folder: Source,
-    store: Store,
-    *,
-    settings: cli.Settings,
-    quiet: Quiet = False,
-    as_json: Json = False,
-) -> None:
-    """Convert CommonRoad scenarios in XML: NGSIM, INTERACTION, inD, highD and others.
-
-    The files have no recording car: each vehicle that drives is an ego.
-    """
-    from shiftsim.data.readers.commonroad import CommonRoadReader
-
-    reader = CommonRoadReader(folder)
-    _convert(reader, store, settings, "dataset", _scene_lines, quiet=quiet, as_json=as_json)
-
-
-def _are_vehicles(egos: str) -> bool:
-    return one_of("egos", egos, ("recorded", "vehicles")) == "vehicles"
+for _kind, _text in _DATASETS.items():
+    _add_dataset(_kind, _text)
 
 
 def _convert(
-    reader: "Reader",
+    make: "Callable[..., ConversionReport]",
     store: str,
-    settings: cli.Settings,
     kind: str,
     lines: "Callable[[ConversionReport, Path], Iterator[str]]",
     *,
@@ -310,11 +281,9 @@ def _convert(
     as_json: bool,
 ) -> None:
     """Convert a source over processes, print the report, and leave with the code for it."""
-    from shiftsim.api.stores import convert_reader
-
     folder = store_path(store)
     with progress_bar(quiet=quiet or as_json) as advance:
-        report = convert_reader(reader, folder, settings.get("workers", 0), advance)
+        report = make(store=folder, on_progress=advance)
     following = f" next: shiftsim filter {store}, then shiftsim run --planner idm --store {store}"
     printed = [*lines(report, folder), following]
     print_result({kind: report.name, **_contents(report)}, printed, as_json=as_json)

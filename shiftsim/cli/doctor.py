@@ -3,7 +3,6 @@
 import os
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from time import perf_counter
@@ -74,8 +73,8 @@ def doctor(
             kernels = compile_kernels(advance)
     with progress_bar(quiet=quiet or as_json) as advance:
         found = examine(advance, kernels)
-    print_result(asdict(found), found.lines(), as_json=as_json)
-    if not found.is_well:
+    print_result(found, diagnosis_lines(found), as_json=as_json)
+    if found["mismatches"] or not found["cases"]:
         raise typer.Exit(cli.DATA)
 
 
@@ -86,47 +85,9 @@ _COMPILED = (
 )
 
 
-@dataclass(frozen=True)
-class Diagnosis:
-    """What was found."""
-
-    versions: dict[str, str]  # of Python and the packages that matter
-    torch: str  # what learned planners would run on
-    cores: int  # cores this process may use
-    memory: int  # memory of the machine [bytes], 0 where unknown
-    workers: int  # suggested number of worker processes
-    kernel_cache: str  # folder of compiled kernels
-    seconds: float  # how long the checks took, compilation included [s]
-    cases: int  # reference values compared
-    mismatches: tuple[str, ...]  # those that differ, in words
-    kernels: dict[str, Any] | None  # of `compile_kernels`, where it was asked for
-
-    @property
-    def is_well(self) -> bool:
-        """Whether results can be trusted."""
-        return self.cases > 0 and not self.mismatches
-
-    def lines(self) -> list[str]:
-        """As text."""
-        packages = "  ".join(f"{name} {version}" for name, version in self.versions.items())
-        memory = f"{self.memory / 1e9:.1f} GB memory" if self.memory else "memory unknown"
-        equal = self.cases - len(self.mismatches)
-        more = len(self.mismatches) - _MAX_NAMED
-        return [
-            f" {packages}",
-            f" torch: {self.torch}",
-            f" {self.cores} cores, {memory}, suggested workers {self.workers}",
-            f" kernel cache: {self.kernel_cache}",
-            *([_COMPILED.format(**self.kernels)] if self.kernels else []),
-            f" reference checks {equal}/{self.cases} equal in {self.seconds:.1f} s",
-            *(f" MISMATCH {line}" for line in self.mismatches[:_MAX_NAMED]),
-            *([f" and {more} more mismatches: --json lists them"] if more > 0 else []),
-        ]
-
-
 def examine(
     advance: Advance = lambda *progress: None, kernels: dict[str, Any] | None = None
-) -> Diagnosis:
+) -> dict[str, Any]:
     """Examine this installation; compiles the kernels that are not in the cache yet."""
     from shiftsim.kernels import CACHE_FOLDER
     from shiftsim.runs.config import default_workers
@@ -141,18 +102,34 @@ def examine(
         advance(number, len(CHECKS) + 1, name)
         check_reference(name, report)
     advance(len(CHECKS) + 1, len(CHECKS) + 1)
-    return Diagnosis(
-        versions=versions(),
-        torch=torch,
-        cores=default_workers(memory_each=1.0),
-        memory=_memory(),
-        workers=default_workers(),
-        kernel_cache=CACHE_FOLDER or "none can be written",
-        seconds=perf_counter() - began,
-        cases=report.num_cases,
-        mismatches=tuple(report.mismatches),
-        kernels=kernels,
-    )
+    return {
+        "versions": versions(),  # of Python and the packages that matter
+        "torch": torch,  # what learned planners would run on
+        "cores": default_workers(memory_each=1.0),  # that this process may use
+        "memory": _memory(),  # of the machine [bytes], 0 where unknown
+        "workers": default_workers(),  # suggested number of worker processes
+        "kernel_cache": CACHE_FOLDER or "none can be written",
+        "seconds": perf_counter() - began,  # that the checks took, compilation included
+        "cases": report.num_cases,  # reference values compared
+        "mismatches": list(report.mismatches),  # those that differ, in words
+        "kernels": kernels,  # of `compile_kernels`, where it was asked for
+    }
+
+
+def diagnosis_lines(found: dict[str, Any]) -> Iterator[str]:
+    """What `examine` found, as text."""
+    wrong, cases = found["mismatches"], found["cases"]
+    memory = f"{found['memory'] / 1e9:.1f} GB memory" if found["memory"] else "memory unknown"
+    yield f" {'  '.join(f'{name} {version}' for name, version in found['versions'].items())}"
+    yield f" torch: {found['torch']}"
+    yield f" {found['cores']} cores, {memory}, suggested workers {found['workers']}"
+    yield f" kernel cache: {found['kernel_cache']}"
+    if found["kernels"]:
+        yield _COMPILED.format(**found["kernels"])
+    yield f" reference checks {cases - len(wrong)}/{cases} equal in {found['seconds']:.1f} s"
+    yield from (f" MISMATCH {line}" for line in wrong[:_MAX_NAMED])
+    if len(wrong) > _MAX_NAMED:
+        yield f" and {len(wrong) - _MAX_NAMED} more mismatches: --json lists them"
 
 
 def _memory() -> int:

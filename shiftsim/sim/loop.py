@@ -14,6 +14,7 @@ from typing import Any, ParamSpec, TypeAlias, TypeVar, cast
 import numpy as np
 
 from shiftsim.errors import ConfigError, DataError, InvalidTrajectoryError, PlannerError, one_of
+from shiftsim.kernels import FloatArray
 from shiftsim.sim.dynamics.bicycle import command_and_step
 from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
 from shiftsim.sim.dynamics.perfect import KEPT_US, follow_perfectly, sample_poses
@@ -180,13 +181,10 @@ class Rollout:
         """The plan in log time; its poses are noted."""
         iteration, row = self.iteration, self._start + self.iteration
         now_us, next_us = self._time_us[row : row + 2].tolist()
-        fault = find_fault(plan, now_us, next_us)
-        if fault is not None:
-            raise InvalidTrajectoryError(f"iteration {iteration}: {fault.message}", fault.hint)
+        plan = executable(plan, now_us, next_us, f"iteration {iteration}: ")
         if isinstance(plan, Command):
             return plan
-        plan, poses = plan.starting_at(now_us), self._plans[iteration]
-        plan = Trajectory(contiguous(plan.time_us), contiguous(plan.states))
+        poses = self._plans[iteration]
         sample_poses(plan.time_us, plan.states, now_us, KEPT_US, poses)
         if iteration == 0 and self.setting.controller == "lqr":
             self.warning = find_warning(plan, poses[0], self._ego[row])
@@ -201,22 +199,15 @@ class Rollout:
         controller = self.setting.controller
         if plan is None or controller == "log-playback":
             after[:] = self.scenario.ego[self.scenario.iteration_rows[iteration + 1]]
+        elif controller == "lqr":
+            follow(plan, now_us, next_us, state, after, command, accel, rate)
         elif isinstance(plan, Command):
-            if controller == "perfect":
-                raise ConfigError(
-                    "perfect tracking needs a planner that returns a trajectory, not a command",
-                    hint="use the controller 'lqr', which sends commands to the motion model",
-                )
-            command[:] = plan.acceleration, plan.steering_rate
-            command_and_step(now_us, next_us, state, command, accel, rate, after)
-        elif controller == "perfect":
-            follow_perfectly(plan, next_us, after)
-        else:
-            times, states = plan.time_us, plan.states
-            status = track_and_step(
-                now_us, next_us, state, times, states, accel, rate, after, command
+            raise ConfigError(
+                "perfect tracking needs a planner that returns a trajectory, not a command",
+                hint="use the controller 'lqr', which sends commands to the motion model",
             )
-            raise_for_status(status, now_us, times)
+        else:
+            follow_perfectly(plan, next_us, after)
 
     def log(self) -> SimulationLog:
         """The finished rollout."""
@@ -238,26 +229,49 @@ class Rollout:
         )
 
 
+def executable(plan: Any, now_us: int, next_us: int, where: str = "") -> Trajectory | Command:
+    """A planner's answer in log time, as kernels take it.
+
+    Raises:
+        InvalidTrajectoryError: It cannot be executed from one time stamp to the next [us].
+    """
+    fault = find_fault(plan, now_us, next_us)
+    if fault is not None:
+        raise InvalidTrajectoryError(f"{where}{fault.message}", fault.hint)
+    if isinstance(plan, Command):
+        return plan
+    plan = plan.starting_at(now_us)
+    return Trajectory(contiguous(plan.time_us), contiguous(plan.states))
+
+
+def follow(
+    plan: Trajectory | Command,
+    now_us: int,
+    next_us: int,
+    state: FloatArray,  # (11,) of the vehicle
+    after: FloatArray,  # (11,) receives the next state
+    command: FloatArray,  # (2,) receives the clean command
+    accel: float = 0.0,  # noise of the command [m/s^2]
+    rate: float = 0.0,  # the same [rad/s]
+) -> None:
+    """Move a vehicle by an executable plan: tracker and kinematic bicycle, or that alone.
+
+    Raises:
+        InvalidTrajectoryError: The tracker cannot follow the plan.
+    """
+    if isinstance(plan, Command):
+        command[:] = plan.acceleration, plan.steering_rate
+        command_and_step(now_us, next_us, state, command, accel, rate, after)
+        return
+    times, states = plan.time_us, plan.states
+    status = track_and_step(now_us, next_us, state, times, states, accel, rate, after, command)
+    raise_for_status(status, now_us, times)
+
+
 def simulate(
     scenario: Scenario, planner: Planner | None, setting: Setting = DEFAULT, **changes: Any
 ) -> SimulationLog:
-    """Drive one scenario in closed loop.
-
-    Args:
-        scenario: The scenario.
-        planner: The planner; None only with `log-playback`, which needs none.
-        setting: How it is driven.
-        changes: Fields of `Setting` that differ from it: `noise`, `seed`, `traffic`, `controller`,
-            `strict`.
-
-    Returns:
-        The rollout, K = T - 1 samples.
-
-    Raises:
-        ConfigError: A setting is unknown.
-        DataError: The scenario has fewer than three iterations.
-        PlannerError: The planner returned something that cannot be executed.
-    """
+    """Drive one scenario in closed loop; arguments and errors are those of `shiftsim.simulate`."""
     rollout = Rollout(scenario, planner, setting, **changes)
     log = drive(rollout)
     if rollout.warning:

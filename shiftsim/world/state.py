@@ -397,6 +397,13 @@ def center_velocities(states: FloatArray, vehicle: VehicleParameters = PACIFICA)
     return out
 
 
+def map_velocity(state: FloatArray) -> FloatArray:
+    """(2,) velocity of the box centre in the frame of the map [m/s], from a state (11,)."""
+    (along, aside), heading = center_velocities(state[None])[0], state[HEADING]
+    cos, sin = np.cos(heading), np.sin(heading)
+    return np.array([cos * along - sin * aside, sin * along + cos * aside])
+
+
 def center_accelerations(states: FloatArray, vehicle: VehicleParameters = PACIFICA) -> FloatArray:
     """(..., 2) acceleration at the box centre in the body frame [m/s^2], from (..., 11) states."""
     # nuPlan rule 19: the centripetal and the angular term both go to the longitudinal part, with a

@@ -22,10 +22,9 @@ def test_a_wrong_number_is_found(tmp_path, monkeypatch):
 
     found = doctor.examine()
 
-    assert not found.is_well
-    assert 0 < len(found.mismatches) < found.cases
-    assert 1 <= found.workers <= found.cores
-    text = "\n".join(found.lines())
+    assert 0 < len(found["mismatches"]) < found["cases"]
+    assert 1 <= found["workers"] <= found["cores"]
+    text = "\n".join(doctor.diagnosis_lines(found))
     for word in ("MISMATCH", "suggested workers", "numba", "torch: "):
         assert word in text
 

@@ -5,12 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from shiftsim.errors import InvalidTrajectoryError, TrafficError
+from shiftsim.errors import TrafficError
 from shiftsim.kernels import FloatArray, IntArray
-from shiftsim.sim.dynamics.bicycle import command_and_step
-from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
-from shiftsim.sim.plan_check import contiguous, find_fault
-from shiftsim.sim.planner import ObservationBuilder, Planner, SceneInfo, rollout_rows
+from shiftsim.sim.loop import executable, follow
+from shiftsim.sim.planner import ObservationBuilder, Planner, rollout_rows, scene_info
 from shiftsim.sim.traffic.lanes import CANDIDATES, NO_LANE, choose_lane, lanes_of, next_lane
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import (
@@ -18,10 +16,9 @@ from shiftsim.world.state import (
     PACIFICA,
     VX,
     AgentKind,
-    Command,
     Tracks,
     center_poses,
-    center_velocities,
+    map_velocity,
     rear_poses,
 )
 
@@ -96,7 +93,7 @@ class PlannedTraffic:
             track, state = driver.track, driver.ego[row]
             tracks.valid[row, track] = True
             tracks.poses[row, track] = center_poses(state[None, :3])[0]
-            tracks.velocities[row, track] = _in_map(state)
+            tracks.velocities[row, track] = map_velocity(state)
             tracks.sizes[row, track] = tracks.sizes[row - 1, track]
 
     def _route(self, pose: FloatArray) -> tuple[str, ...]:
@@ -135,19 +132,9 @@ class PlannedTraffic:
         names[track] = "ego"
         seen = replace(tracks.copy(), tokens=tuple(names))
         planner = self._make()
-        times = scenario.iteration_times
-        planner.reset(
-            SceneInfo(
-                map=scenario.map,
-                route=route,
-                goal=None,
-                dt=float(np.diff(times).mean() * 1e-6),
-                times=times,
-                token=f"{scenario.token}:{tracks.tokens[track]}",
-                log_name=scenario.log_name,
-                start=ego[row, :3].copy(),
-            )
-        )
+        token, start = f"{scenario.token}:{tracks.tokens[track]}", ego[row, :3].copy()
+        scene = scene_info(scenario)
+        planner.reset(replace(scene, route=route, goal=None, token=token, start=start))
         driver = _Driver(
             track, planner, ego, seen, ObservationBuilder(self._time_us, ego, seen, self._lights)
         )
@@ -166,28 +153,12 @@ class PlannedTraffic:
         ego = self._seen_ego[row]
         seen.valid[row, track] = True
         seen.poses[row, track] = center_poses(ego[None, :3])[0]
-        seen.velocities[row, track] = _in_map(ego)
+        seen.velocities[row, track] = map_velocity(ego)
         seen.sizes[row, track] = _EGO_SIZE
 
     def _move(self, driver: _Driver, iteration: int, row: int) -> None:
         """Write the next state of a driver."""
         now_us, next_us = self._clock[row - 1], self._clock[row]
-        plan = driver.planner.plan(driver.observations.at(iteration, row - 1))
-        fault = find_fault(plan, now_us, next_us)
-        if fault is not None:
-            raise InvalidTrajectoryError(fault.message, fault.hint)
-        state, after, command = driver.ego[row - 1], driver.ego[row], np.empty(2)
-        if isinstance(plan, Command):
-            command[:] = plan.acceleration, plan.steering_rate
-            command_and_step(now_us, next_us, state, command, 0.0, 0.0, after)
-            return
-        times, states = contiguous(plan.starting_at(now_us).time_us), contiguous(plan.states)
-        status = track_and_step(now_us, next_us, state, times, states, 0.0, 0.0, after, command)
-        raise_for_status(status, now_us, times)
-
-
-def _in_map(state: FloatArray) -> FloatArray:
-    """(2,) velocity of the box centre in the frame of the map [m/s], from an ego state (11,)."""
-    (along, aside), heading = center_velocities(state[None])[0], state[2]
-    cos, sin = np.cos(heading), np.sin(heading)
-    return np.array([cos * along - sin * aside, sin * along + cos * aside])
+        answer = driver.planner.plan(driver.observations.at(iteration, row - 1))
+        plan = executable(answer, now_us, next_us)
+        follow(plan, now_us, next_us, driver.ego[row - 1], driver.ego[row], np.empty(2))

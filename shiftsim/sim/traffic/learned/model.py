@@ -31,7 +31,7 @@ from shiftsim.world.state import (
     AgentKind,
     Tracks,
     center_poses,
-    center_velocities,
+    map_velocity,
 )
 
 HIDDEN = 96
@@ -183,12 +183,7 @@ class LearnedTraffic:
         before = max(row - LAG, 0)
         poses = np.concatenate([tracks.poses[row], center_poses(ego[None, :3])])
         cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-        sideways = center_velocities(ego[None])[0]
-        ego_velocity = [
-            cos[-1] * sideways[0] - sin[-1] * sideways[1],
-            sin[-1] * sideways[0] + cos[-1] * sideways[1],
-        ]
-        velocities = np.nan_to_num(np.concatenate([tracks.velocities[row], [ego_velocity]]))
+        velocities = np.nan_to_num(np.concatenate([tracks.velocities[row], [map_velocity(ego)]]))
         speeds = velocities[:, 0] * cos + velocities[:, 1] * sin
         old = np.nan_to_num(tracks.velocities[before])
         heading = tracks.poses[before, :, 2]
