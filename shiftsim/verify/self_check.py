@@ -1,10 +1,10 @@
 """A few outputs of nuPlan's own code that come with the package, against what is computed here."""
 
-import json
 from zipfile import BadZipFile
 
 import numpy as np
 
+from shiftsim.data.store.map import read_map_file
 from shiftsim.errors import DataError
 from shiftsim.files import PACKAGE
 from shiftsim.metrics import evaluate, measure
@@ -13,9 +13,10 @@ from shiftsim.metrics.result import PROFILES
 from shiftsim.sim.dynamics import lqr
 from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, step_bicycle, step_seconds
 from shiftsim.verify.report import Report
-from shiftsim.verify.rollouts import SCORES, ego_states
+from shiftsim.verify.rollouts import SCORES, ego_states, recorded_log
 from shiftsim.verify.tables import EXACT, TOLERANCE, Named
-from shiftsim.verify.worlds import read_world
+from shiftsim.world.scenario import scenario_of_rows
+from shiftsim.world.state import Tracks
 
 REFERENCE = PACKAGE / "verify" / "reference"
 _SIGNALS = ("heading", "vx", "ax", "ay", "omega", "alpha")
@@ -54,22 +55,24 @@ def _bounds(ends: np.ndarray) -> tuple[list[int], list[int]]:
     return ends[:-1].tolist(), ends[1:].tolist()
 
 
-def _check_metrics(world: Named, report: Report) -> None:
-    measured = measure(*read_world(world))
+def _check_metrics(arrays: Named, report: Report) -> None:
+    road = read_map_file(REFERENCE / "metric_world.arrow")
+    time_us, expert = arrays["time_us"], arrays["expert"]
+    scenario = scenario_of_rows("world", road, time_us, expert, Tracks.empty(len(time_us)))
+    measured = measure(recorded_log(scenario, arrays["ego"]), road)
     for name, profile in PROFILES.items():
-        theirs = world["expected"]["scores_default" if name == "nuplan" else f"scores_{name}"]
         result = evaluate(measured, profile)
         for metric, score in {**result.scores, "score": result.score}.items():
             if score is not None:
-                atol = SCORES.get(metric, EXACT)
-                report.compare(f"score {metric}", name, score, theirs[metric], atol=atol)
+                theirs, atol = arrays[f"{name} {metric}"], SCORES.get(metric, EXACT)
+                report.compare(f"score {metric}", name, score, theirs, atol=atol)
 
 
 CHECKS = {
     "bicycle_steps.npz": _check_bicycle,
     "lqr_commands.npz": _check_tracker,
     "comfort_signals.npz": _check_comfort,
-    "metric_world.json": _check_metrics,
+    "metric_world.npz": _check_metrics,
 }
 
 
@@ -81,11 +84,7 @@ def check_reference(name: str, report: Report) -> None:
     """
     path = REFERENCE / name
     try:
-        if path.suffix == ".json":
-            content = json.loads(path.read_text("utf-8"))
-        else:
-            with np.load(path, allow_pickle=False) as archive:
-                content = dict(archive)
-        CHECKS[name](content, report)
+        with np.load(path, allow_pickle=False) as archive:
+            CHECKS[name](dict(archive), report)
     except (OSError, BadZipFile, LookupError, ValueError) as error:
         raise DataError(f"{path}: {error}", hint="install shiftsim again") from error

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import shapely
 from episodes import expert_account, replay, totals
+from json_worlds import read_world
 from parity_cases import Scenes
 from rollouts import WORLDS, load_world
 
@@ -12,7 +13,6 @@ from shiftsim.data.synthetic.store import demo_store
 from shiftsim.env.driving import DrivingEnv
 from shiftsim.metrics import measure
 from shiftsim.sim.log import as_recorded
-from shiftsim.verify.worlds import read_world
 from shiftsim.world.state import PACIFICA, center_poses
 
 CORNERS = [(0.0, 0.0), (0.9, 0.2), (1.0, -1.0), (-1.0, 1.0)]  # first actions

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from json_worlds import read_world
 from rollouts import WORLDS, boxes, load_world, move_world, with_tracks
 from strategies import OFFSETS, rigid_motions, seeds
 from worlds import join_tracks
 
 from shiftsim.metrics import MetricResult, compute_metrics
-from shiftsim.verify.worlds import read_world
 
 LOADED = {path.stem: load_world(path) for path in WORLDS}
 worlds = st.sampled_from(sorted(LOADED))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import places
 import pytest
+from json_worlds import read_map, read_scenario
 from parity_cases import (
     Cases,
     File,
@@ -32,7 +33,6 @@ from shiftsim.sim.dynamics.perfect import interpolate
 from shiftsim.sim.noise import noise_from_normals, parse_noise
 from shiftsim.sim.traffic.idm.model import IdmTraffic
 from shiftsim.verify.rollouts import EGO_COLUMNS, ego_states
-from shiftsim.verify.worlds import read_map, read_scenario
 from shiftsim.world import state
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import VY, AgentKind, LightStatus, TrafficLights

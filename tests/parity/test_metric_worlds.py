@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import places
 import pytest
+from json_worlds import read_world
 from parity_cases import Cases, change_json, name_unknown, noticed, tracked
 
 from shiftsim.metrics import DEEPPLAN, NUPLAN, Measurements, evaluate, measure
 from shiftsim.metrics.collision import at_fault_counts
 from shiftsim.metrics.comfort import BOUNDED_SIGNALS, within_bounds
 from shiftsim.verify.rollouts import SCORES
-from shiftsim.verify.worlds import read_world
 
 pytestmark = [pytest.mark.golden, pytest.mark.reference("metric_worlds")]
 ATOL = 1e-9

@@ -13,6 +13,7 @@ import numpy as np
 import places
 import pytest
 import shapely
+from json_worlds import kind_of
 from parity_cases import (
     TOLERANCE,
     Cases,
@@ -51,7 +52,6 @@ from shiftsim.planners.routes.graph import centerline, search_cheapest, search_l
 from shiftsim.planners.routes.lead import red_lights
 from shiftsim.sim.planner import observe_log, scene_info
 from shiftsim.verify.rollouts import BOX_COLUMNS, RecordedRun, object_columns
-from shiftsim.verify.worlds import kind_of
 from shiftsim.world.layers import make_layer, make_polygons
 from shiftsim.world.state import (
     HEADING,
