@@ -22,15 +22,9 @@ from shiftsim.errors import ConfigError, DataError
 from shiftsim.files import atomic_write, safe_join
 from shiftsim.runs.journal import Journal
 from shiftsim.runs.results import JOURNAL, Run, open_run, write_manifest
-from shiftsim.runs.rollouts import Task
+from shiftsim.runs.rollouts import Task, files
 from shiftsim.runs.rollouts.columns import decode_rows
-from shiftsim.runs.rollouts.files import (
-    FOLDER,
-    RolloutLocation,
-    RolloutReader,
-    new_file,
-    write_rollouts,
-)
+from shiftsim.runs.rollouts.files import RolloutLocation
 from shiftsim.runs.tables import MISSING, STATUSES, TABLES, TaskResult, stored_results
 
 _WRITE_OPTIONS: dict[str, Any] = {
@@ -74,7 +68,7 @@ class RunWriter:
         """
         self.path = path
         path.mkdir(parents=True, exist_ok=True)
-        self.rollouts = safe_join(path, FOLDER)
+        self.rollouts = safe_join(path, files.FOLDER)
         self._journal = Journal(path / JOURNAL, keep=resume)
         self.ended: dict[Task, TaskRecord] = {}
         self._outdated = set[Path]()
@@ -124,7 +118,7 @@ class RunWriter:
     def _link(self, file: Path) -> Path:
         """Have a file of another run in this one too, without its bytes where the disk can."""
         if file not in self._linked:
-            target = new_file(self.rollouts)
+            target = files.new_file(self.rollouts)
             try:
                 os.link(file, target)
             except OSError:
@@ -198,8 +192,8 @@ class RunWriter:
             for task, record in records
             if record.location and record.location.file not in self._outdated
         }
-        reader = RolloutReader()
-        written = write_rollouts(
+        reader = files.RolloutReader()
+        written = files.write_rollouts(
             self.rollouts,
             (
                 (

@@ -26,14 +26,9 @@ from shiftsim.runs.config import RunConfig
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.rollouts.columns import encode_rows, rollout_rows
 from shiftsim.runs.tables import FAILED, OK, TABLES, TaskResult
+from shiftsim.sim import loop
 from shiftsim.sim.log import SimulationLog
-from shiftsim.sim.loop import (
-    Rollout,
-    Setting,
-    drive,
-    plans_on_recording,
-    simulate_together,
-)
+from shiftsim.sim.loop import Rollout
 from shiftsim.sim.noise import NoiseModel, is_standard
 from shiftsim.sim.planner import Planner
 from shiftsim.sim.traffic import BatchTraffic, Traffic, make_traffic
@@ -106,9 +101,9 @@ class TaskRunner:
         logs: Sequence[SimulationLog | BaseException]
         try:
             if len(batch) > 1:
-                logs = simulate_together(list(rollouts.values()))
+                logs = loop.simulate_together(list(rollouts.values()))
             else:
-                logs = [drive(rollout) for rollout in rollouts.values()]
+                logs = [loop.drive(rollout) for rollout in rollouts.values()]
         except KeyboardInterrupt:
             raise
         except BaseException as error:
@@ -180,14 +175,14 @@ class TaskRunner:
         planner = self._planner(task)
         assert planner is not None
         try:
-            plans = plans_on_recording(scenario, planner, open_loop.EVERY, seed=task.seed)
+            plans = loop.plans_on_recording(scenario, planner, open_loop.EVERY, seed=task.seed)
         finally:
             self._release(task, planner)
         poses = [open_loop.Poses(plan.time_us, plan.states[:, :3]) for plan in plans]
         return open_loop.metric_rows(poses, scenario)
 
-    def _setting(self, task: Task) -> Setting:
-        return Setting(
+    def _setting(self, task: Task) -> loop.Setting:
+        return loop.Setting(
             noise=self.noises[task.noise],
             seed=task.seed,
             traffic=self._make_traffic(),

@@ -16,15 +16,7 @@ from shiftsim.data import open_store
 from shiftsim.env.episode import Episode
 from shiftsim.errors import ShiftsimError
 from shiftsim.kernels import FloatArray
-from shiftsim.planners.learned.carl.planner import (
-    MAX_ACCELERATION,
-    MAX_BRAKING,
-    MAX_STEERING,
-    Action,
-    Carl,
-    CarlFeatures,
-    command_of,
-)
+from shiftsim.planners.learned.carl import planner as carl
 from shiftsim.planners.pdm.planner import PdmClosed
 from shiftsim.sim.dynamics.lqr import NUPLAN, raise_for_status, track
 from shiftsim.sim.loop import Setting
@@ -66,18 +58,20 @@ class Driven(NamedTuple):
     failed: list[str]  # why a scenario was not
 
 
-def encode_action(acceleration: float, steering_rate: float, steering: float, tau: float) -> Action:
+def encode_action(
+    acceleration: float, steering_rate: float, steering: float, tau: float
+) -> carl.Action:
     """(2,) the action in [-1, 1] that stands for a command at a steering angle.
 
     `acceleration` [m/s^2], `steering_rate` [rad/s], `steering` [rad], `tau` [s].
     """
-    most = MAX_ACCELERATION if acceleration >= 0.0 else MAX_BRAKING
+    most = carl.MAX_ACCELERATION if acceleration >= 0.0 else carl.MAX_BRAKING
     angle = steering + tau * steering_rate
-    action = np.array([acceleration / most, angle / MAX_STEERING])
+    action = np.array([acceleration / most, angle / carl.MAX_STEERING])
     return np.clip(action, -1.0, 1.0).astype(np.float32)
 
 
-def brake_at_stand(action: Action, speed: float) -> Action:
+def brake_at_stand(action: carl.Action, speed: float) -> carl.Action:
     """The action, which brakes where a vehicle at `speed` [m/s] is to stand or come to a stand.
 
     Braking at a stand changes nothing, as nobody drives backwards. But a network that is taught
@@ -96,7 +90,7 @@ class Expert:
         self._planner, self._tau = PdmClosed(), tau
         self._planner.reset(scene)
 
-    def act(self, observation: Observation) -> Action:
+    def act(self, observation: Observation) -> carl.Action:
         """What it would do now."""
         plan = self._planner.plan(observation)
         ego: FloatArray = observation.history.ego[-1].copy()
@@ -107,10 +101,10 @@ class Expert:
         return brake_at_stand(action, float(ego[VX]))
 
 
-class PolicyPlanner(Carl):
+class PolicyPlanner(carl.Carl):
     """The network that is trained, as a planner."""
 
-    def set_last_action(self, action: Action) -> None:
+    def set_last_action(self, action: carl.Action) -> None:
         """Take the action of somebody else as its own last one."""
         self._last_action = action
 
@@ -125,8 +119,8 @@ class DrivenScenario:
         policy.reset(self.episode.scene)
         self.expert = Expert(self.episode.scene, job.tau)
         self.states: list[State] = []
-        self.features: CarlFeatures | None = None  # what the network is asked about
-        self.action: Action | None = None  # what is done in this step
+        self.features: carl.CarlFeatures | None = None  # what the network is asked about
+        self.action: carl.Action | None = None  # what is done in this step
 
     @property
     def is_over(self) -> bool:
@@ -154,11 +148,11 @@ class DrivenScenario:
             self.states.append(state)
         self.features = None if is_expert else features
 
-    def advance(self, action: Action) -> None:
+    def advance(self, action: carl.Action) -> None:
         """Drive one step."""
         self.policy.set_last_action(action)
         ego = self.episode.log.ego[self.episode.iteration]
-        self.episode.advance(command_of(action, ego))
+        self.episode.advance(carl.command_of(action, ego))
 
 
 class Driver:

@@ -19,17 +19,9 @@ from shiftsim.env.driving import DrivingEnv, vector_env
 from shiftsim.files import write_text
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.planners.learned.carl.network import CarlNetwork, Policy
-from shiftsim.train import folder
+from shiftsim.train import folder, learning
 from shiftsim.train.folder import OnMessage, Settings, Weights
 from shiftsim.train.jobs import NOISES, Towns
-from shiftsim.train.learning import (
-    UNITS,
-    GradientPool,
-    apply_gradient,
-    from_official,
-    log_density,
-    to_official,
-)
 from shiftsim.train.states import Values, compress_raster, read_raster
 
 ENVS = 8
@@ -81,7 +73,7 @@ def ppo_loss(
 ) -> tuple[Tensor, Tensor]:
     """Loss summed over some steps of a `RolloutBuffer`; (1,) those with a clipped ratio."""
     x = part["actions"].clamp(_EDGE, 1.0 - _EDGE)
-    density = log_density(policy.alpha, policy.beta, x).sum(1)
+    density = learning.log_density(policy.alpha, policy.beta, x).sum(1)
     ratio = (density - part["density"]).exp()
     advantages, clipped_ratio = part["advantages"], ratio.clamp(1.0 - CLIP, 1.0 + CLIP)
     clipped_values = part["values"] + (values - part["values"]).clamp(-CLIP, CLIP)
@@ -112,7 +104,7 @@ def reinforce(
             mean = float(np.mean(recent)) if recent else 0.0
             if len(recent) == RECENT and mean > state["highest"]:
                 best = {name: v.clone() for name, v in trainer.network.state_dict().items()}
-                state |= {"best": to_official(best), "highest": mean}
+                state |= {"best": learning.to_official(best), "highest": mean}
             steps, seconds = trainer.update * ROLLOUT, monotonic() - began
             state["rows"].append({"samples": steps, "return": mean, **result})
             left = seconds / 60.0 / trainer.update * (trainer.total - trainer.update)
@@ -134,12 +126,12 @@ class Trainer:
     def __init__(self, settings: Settings, towns: Towns, weights: Weights, device: str) -> None:
         """`weights` are those of an official network; `towns` are those to train in."""
         self.network = CarlNetwork()
-        self.network.load_state_dict(from_official(weights))
+        self.network.load_state_dict(learning.from_official(weights))
         self.network.to(device)
         self.total = max(1, settings.ppo_samples // ROLLOUT)
         self.update, self.returns = 0, list[float]()
         self._settings, self._device = settings, device
-        self._pool = GradientPool(device, settings.workers)
+        self._pool = learning.GradientPool(device, settings.workers)
         self._optimiser = torch.optim.Adam(self.network.parameters(), lr=RATE, eps=EPSILON)
         tokens = sorted(token for found in towns.trained.values() for token in found)
         write_text(settings.out / TRAINED, "\n".join(tokens) + "\n")
@@ -186,7 +178,7 @@ class Trainer:
                 policy, value = self._evaluate(*_inputs(batch))
                 x = torch.distributions.Beta(policy.alpha, policy.beta).sample()
                 x = x.clamp(_EDGE, 1.0 - _EDGE)
-                density[step] = log_density(policy.alpha, policy.beta, x).sum(1).cpu()
+                density[step] = learning.log_density(policy.alpha, policy.beta, x).sum(1).cpu()
                 actions[step], values[step] = x.cpu(), value.cpu()
                 pictures += [compress_raster(raster) for raster in batch["raster"]]
                 measured[step], critic[step] = batch["measurements"], batch["value_measurements"]
@@ -215,7 +207,7 @@ class Trainer:
         arrays = buffer._asdict()
         pictures = arrays.pop("pictures")
         chosen = {name: torch.from_numpy(values[order]) for name, values in arrays.items()}
-        chosen["measurements"] /= torch.from_numpy(UNITS)
+        chosen["measurements"] /= torch.from_numpy(learning.UNITS)
         gain = chosen["advantages"]
         chosen["advantages"] = (gain - gain.mean()) / (gain.std() + 1e-8)
 
@@ -230,7 +222,9 @@ class Trainer:
         count = len(order)
         found = self._pool.compute(parameters, count, loss_of_rows)
         rate = RATE * (1.0 - self.update / self.total)
-        apply_gradient(self._optimiser, parameters, found, count, clip=CLIP_NORM, rate=rate)
+        learning.apply_gradient(
+            self._optimiser, parameters, found, count, clip=CLIP_NORM, rate=rate
+        )
         return found.loss / count, float(found.numbers[0])
 
     def state(self) -> dict[str, Any]:
@@ -251,7 +245,7 @@ class Trainer:
 
 def _inputs(batch: dict[str, Any]) -> tuple[Values, ...]:
     """What the network reads of observations."""
-    return batch["raster"], batch["measurements"] / UNITS, batch["value_measurements"]
+    return batch["raster"], batch["measurements"] / learning.UNITS, batch["value_measurements"]
 
 
 def _make(settings: Settings, number: int) -> gymnasium.Env[Any, Any]:

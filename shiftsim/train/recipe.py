@@ -16,17 +16,9 @@ from shiftsim.data import open_store
 from shiftsim.planners.learned.checkpoint import resolve_device
 from shiftsim.runs.filter import read_filter_results
 from shiftsim.runs.scenarios import find_split
-from shiftsim.train import folder
+from shiftsim.train import folder, learning
 from shiftsim.train.folder import BEST, LATEST, OnMessage, Settings, Weights
 from shiftsim.train.jobs import RunJobs, Towns, collect, divide, mean_scores, run_jobs
-from shiftsim.train.learning import (
-    BATCH,
-    Learner,
-    StepResult,
-    draw_batch,
-    from_official,
-    to_official,
-)
 from shiftsim.train.states import States, write_part
 
 _WRITE_EVERY, _REPORT_EVERY = 120.0, 10.0  # s
@@ -65,10 +57,10 @@ class Training:
         tokens = find_split(settings.split, store.path, usable).tokens
         self.towns: Towns = divide(store, tokens, settings.seed)
         folder.prepare_folder(settings, store.hash, resume=resume)
-        self.steps = max(1, settings.samples // settings.rounds // BATCH)
+        self.steps = max(1, settings.samples // settings.rounds // learning.BATCH)
         total = self.steps * settings.rounds
-        begin = from_official(self._begin()) if settings.checkpoint else None
-        self.learner = Learner(self.device, settings.workers, total, settings.seed, begin)
+        begin = learning.from_official(self._begin()) if settings.checkpoint else None
+        self.learner = learning.Learner(self.device, settings.workers, total, settings.seed, begin)
         self.progress = Progress()
         if (settings.out / folder.STATE).exists():
             state = folder.read_state(settings.out / folder.STATE)
@@ -146,10 +138,10 @@ class Training:
         states = States([settings.part(number) for number in range(progress.round + 1)])
         self._on_message(f"{self._where} training on {len(states)} states")
         reported = written = monotonic()
-        before, results = progress.done, list[StepResult]()
+        before, results = progress.done, list[learning.StepResult]()
         while progress.done < self.steps:
             key = (settings.seed, 3, progress.round, progress.done)
-            results.append(learner.learn(states, draw_batch(states, key)))
+            results.append(learner.learn(states, learning.draw_batch(states, key)))
             progress.done += 1
             if progress.done % _CURVE_EVERY == 0 or progress.done == self.steps:
                 progress.curve.append(_curve_row(progress.round, learner.step, results))
@@ -158,25 +150,26 @@ class Training:
                     self._write_state()
                     written = monotonic()
             if monotonic() - reported > _REPORT_EVERY:
-                rate = (progress.done - before) * BATCH / (monotonic() - reported)
+                rate = (progress.done - before) * learning.BATCH / (monotonic() - reported)
                 reported, before = monotonic(), progress.done
                 self._report(rate)
 
     def _report(self, rate: float) -> None:
-        left = (self.learner.total - self.learner.step) * BATCH / rate
+        done, total = (n * learning.BATCH for n in (self.learner.step, self.learner.total))
+        left = (total - done) / rate
         row = self.progress.curve[-1] if self.progress.curve else {"loss": float("nan")}
         self._on_message(
-            f"{self._where} {self.learner.step * BATCH} of {self.learner.total * BATCH} samples  "
-            f"{rate:.0f} samples/s  loss {row['loss']:.3f}  {left / 60.0:.0f} min of training left"
+            f"{self._where} {done} of {total} samples  {rate:.0f} samples/s  "
+            f"loss {row['loss']:.3f}  {left / 60.0:.0f} min of training left"
         )
 
     def _test(self) -> None:
         settings, progress = self._settings, self.progress
-        state = to_official(self.learner.driving())
+        state = learning.to_official(self.learner.driving())
         folder.write_network(settings.out / LATEST, state)
         found = self._scores(settings.out / LATEST, self._where)
         seconds = monotonic() - self._began
-        samples = self.learner.step * BATCH
+        samples = self.learner.step * learning.BATCH
         row = {"round": progress.round, "samples": samples, **found, "seconds": seconds}
         before = max((sum_of(row) for row in progress.scores), default=-1.0)
         progress.scores.append(row)
@@ -217,11 +210,11 @@ def sum_of(row: dict[str, Any]) -> float:
     return float(row["none"] + row["ou-high"])
 
 
-def _curve_row(number: int, step: int, results: list[StepResult]) -> dict[str, Any]:
+def _curve_row(number: int, step: int, results: list[learning.StepResult]) -> dict[str, Any]:
     count = len(results)
     return {
         "round": number,
-        "samples": step * BATCH,
+        "samples": step * learning.BATCH,
         "loss": sum(one.loss for one in results) / count,
         "acceleration_error": sum(one.errors[0] for one in results) / count,
         "steering_error": sum(one.errors[1] for one in results) / count,

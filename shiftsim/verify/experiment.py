@@ -19,26 +19,8 @@ from shiftsim.planners.registry import load_planner
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.planner import Observation, Planner, SceneInfo
+from shiftsim.verify import rollouts
 from shiftsim.verify.report import Report
-from shiftsim.verify.rollouts import (
-    CHALLENGES,
-    DERIVED,
-    LOGGED,
-    ORIGINS,
-    REACTIVE,
-    SCORES,
-    SIMULATED,
-    RecordedRun,
-    compare_plans,
-    ego_columns,
-    light_columns,
-    object_columns,
-    origin,
-    plan_at,
-    read_ego,
-    recorded_log,
-    tracks_of,
-)
 from shiftsim.verify.simulation_log import (
     OTHER_VERSION,
     Recorded,
@@ -90,7 +72,7 @@ class Run:
 
     def drive(self, scenario: Scenario, planner: Planner) -> SimulationLog:
         """Simulate it with a planner of ours."""
-        controller, traffic = CHALLENGES[self.challenge]
+        controller, traffic = rollouts.CHALLENGES[self.challenge]
         return simulate(scenario, planner, controller=controller, traffic=traffic)
 
 
@@ -150,8 +132,8 @@ def _compare_results(path: Path, challenge: str, find: FindScenario, report: Rep
                 left_out |= recorded.left_out
                 source = "exported"
                 if not recorded.is_exported:
-                    source = origin(challenge, recorded.ego, recorded.plans)
-                report.remarks.append(f"{run}: {ORIGINS[source]}")
+                    source = rollouts.origin(challenge, recorded.ego, recorded.plans)
+                report.remarks.append(f"{run}: {rollouts.ORIGINS[source]}")
             if recorded and recorded.dropped_us:
                 report.remarks.append(f"{run}: the last sample repeats a time (dt = 0): dropped")
                 if scenario:
@@ -245,7 +227,7 @@ class _Replay:
 
     def plan(self, observation: Observation) -> Trajectory:
         """The plan of this iteration."""
-        return plan_at(self._plans, observation.iteration)
+        return rollouts.plan_at(self._plans, observation.iteration)
 
 
 def _compare_log(run: Run, scenario: Scenario, recorded: Recorded, report: Report) -> SimulationLog:
@@ -266,12 +248,14 @@ def _compare_log(run: Run, scenario: Scenario, recorded: Recorded, report: Repor
     if recorded.facts["scenario_type"] != scenario.scenario_type:
         report.note("scenario types where they differ (convert with the same filter as nuPlan)")
     _compare_derived(where, ego)
-    _match_unordered(where, recorded.lights, light_columns(scenario), "lane_connector_id", EXACT)
-    states = read_ego(ego)
+    _match_unordered(
+        where, recorded.lights, rollouts.light_columns(scenario), "lane_connector_id", EXACT
+    )
+    states = rollouts.read_ego(ego)
     return replace(
-        recorded_log(scenario, states),
+        rollouts.recorded_log(scenario, states),
         time_us=ego["time_us"],
-        tracks=tracks_of(objects, len(states)),
+        tracks=rollouts.tracks_of(objects, len(states)),
     )
 
 
@@ -284,17 +268,17 @@ def _compare_replay(run: Run, scenario: Scenario, recorded: Recorded) -> None:
     _compare_derived(where, plans)
     log = run.drive(scenario, _Replay(plans))
     stamps = dict.fromkeys(("time_us", "ego_time_us"), log.time_us)
-    ours = {"iteration": np.arange(len(log.ego)), **stamps, **ego_columns(log.ego)}
-    ego.match(where, ours, SIMULATED)
+    ours = {"iteration": np.arange(len(log.ego)), **stamps, **rollouts.ego_columns(log.ego)}
+    ego.match(where, ours, rollouts.SIMULATED)
     _compare_objects(run, objects, log.tracks)
     if run.planner in _TWINS:
-        recorded_run = RecordedRun(scenario, ego, objects, run.challenge)
-        compare_plans(where, _TWINS[run.planner], recorded_run, plans)
+        recorded_run = rollouts.RecordedRun(scenario, ego, objects, run.challenge)
+        rollouts.compare_plans(where, _TWINS[run.planner], recorded_run, plans)
 
 
 def _compare_objects(run: Run, theirs: Source, ours: Tracks) -> None:
-    shown = object_columns(ours, *np.nonzero(ours.valid))
-    atol = REACTIVE if run.challenge == "R" else LOGGED
+    shown = rollouts.object_columns(ours, *np.nonzero(ours.valid))
+    atol = rollouts.REACTIVE if run.challenge == "R" else rollouts.LOGGED
     _match_unordered(str(run), theirs, shown, "track_token", atol)
 
 
@@ -309,14 +293,14 @@ def _match_unordered(
 
 def _compare_derived(where: str, recorded: Source) -> None:
     """Compare what follows from ego states, or is the same for all of them."""
-    states = read_ego(recorded)
-    columns = ego_columns(states)
-    ours: dict[str, Any] = {name: columns[name] for name in DERIVED}
+    states = rollouts.read_ego(recorded)
+    columns = rollouts.ego_columns(states)
+    ours: dict[str, Any] = {name: columns[name] for name in rollouts.DERIVED}
     ours |= {"speed": speeds(states), "acceleration": np.hypot(states[:, AX], states[:, AY])}
     sizes = {"length": PACIFICA.length, "width": PACIFICA.width, "height": PACIFICA.height}
     sizes["rear_axle_to_center"] = PACIFICA.rear_axle_to_center
     ours |= {name: np.full(len(states), size) for name, size in sizes.items()}
-    recorded.match(where, ours, {**DERIVED, "": TOLERANCE})
+    recorded.match(where, ours, {**rollouts.DERIVED, "": TOLERANCE})
 
 
 def _compare_result(
@@ -327,7 +311,7 @@ def _compare_result(
         found = {name: score for name, score in result.scores.items() if name in table.table}
         row = {**found, "score": closed_loop_score(found)}
         ours = {name: [np.nan if score is None else score] for name, score in row.items()}
-        table[run.key].match(str(run), ours, SCORES)
+        table[run.key].match(str(run), ours, rollouts.SCORES)
     for metric in (name for name in result.scores if name in metrics):
         row, atol = _metric_row(metric, result)
         theirs = metrics[metric][run.key]
@@ -346,7 +330,7 @@ def _metric_row(metric: str, result: MetricResult) -> tuple[dict[str, Any], dict
     series, row = result.series.get(metric), nuplan_columns(result, metric)
     if row["metric_score"] is None:
         row["metric_score"] = np.nan
-    atol = {"metric_score": SCORES.get(metric, EXACT)}
+    atol = {"metric_score": rollouts.SCORES.get(metric, EXACT)}
     atol["time_series_values"] = EXACT if series and series.unit == "boolean" else TOLERANCE
     for one in (one for one in result.statistics if one.metric == metric):
         atol[f"{one.name}_stat_value"] = EXACT if one.unit in ("boolean", "count") else TOLERANCE

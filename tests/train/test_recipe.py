@@ -42,7 +42,7 @@ def test_a_training_that_was_ended_goes_on_as_if_it_had_not(small, trained, monk
     whole, ended = trained[0], small()
     monkeypatch.setattr(recipe, "_WRITE_EVERY", 0.0)
     monkeypatch.setattr(recipe, "_CURVE_EVERY", 1)
-    learn, steps = recipe.Learner.learn, []
+    learn, steps = recipe.learning.Learner.learn, []
 
     def stopping(learner, *batch):
         steps.append(1)
@@ -50,7 +50,7 @@ def test_a_training_that_was_ended_goes_on_as_if_it_had_not(small, trained, monk
             raise KeyboardInterrupt
         return learn(learner, *batch)
 
-    monkeypatch.setattr(recipe.Learner, "learn", stopping)
+    monkeypatch.setattr(recipe.learning.Learner, "learn", stopping)
     with pytest.raises(KeyboardInterrupt):
         train(ended)
     train(ended, resume=True)

@@ -11,15 +11,8 @@ import pyarrow as pa
 
 from shiftsim.data.store.schema import EGO_COLUMNS
 from shiftsim.errors import DataError
-from shiftsim.runs.rollouts.columns import (
-    COMMAND_COLUMNS,
-    KINDS,
-    NOISE_COLUMNS,
-    stack,
-    stored_kinds,
-    stored_plans,
-    stored_tracks,
-)
+from shiftsim.runs.rollouts import columns
+from shiftsim.runs.rollouts.columns import stack
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.noise import sample_noise
 from shiftsim.world.ranges import RUN, require
@@ -69,20 +62,20 @@ def complete_rollout(
     require(RUN, "state", ego, f"{where}: an ego")
     tracks = scenario.tracks.rows(samples)
     try:
-        plans = stored_plans(rows)
-        if KINDS in rows.schema.names:
-            kinds = stored_kinds(rows)
+        plans = columns.stored_plans(rows)
+        if columns.KINDS in rows.schema.names:
+            kinds = columns.stored_kinds(rows)
             codes = np.array([*kinds.values()], np.int64)
             tracks = replace(tracks, tokens=tuple(kinds), kinds=codes)
         if "track_tokens" in rows.schema.names:
-            stored: dict[str, Any] = stored_tracks(rows, tracks.tokens)
+            stored: dict[str, Any] = columns.stored_tracks(rows, tracks.tokens)
             tracks = replace(tracks, **stored)
     except ValueError as error:
         raise DataError(f"{where} is damaged: {error}", hint="make the run again") from error
-    if rows[NOISE_COLUMNS[0]].null_count:
+    if rows[columns.NOISE_COLUMNS[0]].null_count:
         noise = sample_noise(task.noise, seed=task.seed, token=task.token, num_steps=len(rows))
     else:
-        noise = stack(rows, NOISE_COLUMNS)
+        noise = stack(rows, columns.NOISE_COLUMNS)
     return SimulationLog(
         token=scenario.token,
         time_us=scenario.time_us[samples],
@@ -92,7 +85,7 @@ def complete_rollout(
         expert_time_us=scenario.iteration_times,
         expert_ego=scenario.expert,
         route=scenario.route,
-        commands=stack(rows, COMMAND_COLUMNS),
+        commands=stack(rows, columns.COMMAND_COLUMNS),
         noise=noise,
         plans=plans,
         planning_seconds=rows["planning_seconds"].to_numpy().astype(np.float64),
