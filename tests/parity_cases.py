@@ -15,9 +15,8 @@ from nuplan_logs import read_scenario
 from shiftsim.data.nuplan.scenarios import find_maps, load_map
 from shiftsim.errors import DataError
 from shiftsim.sim.traffic.idm.scene import REPLAYED_KINDS
-from shiftsim.verify.report import Report
+from shiftsim.verify.report import EXACT, TOLERANCE, Groups, Report, Source, Tolerances, read_table
 from shiftsim.verify.rollouts import LOGGED, REACTIVE, SCORES, SIMULATED, object_columns
-from shiftsim.verify.tables import EXACT, TOLERANCE, Groups, Source, Tolerances, read_table
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Tracks

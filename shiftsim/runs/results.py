@@ -12,7 +12,8 @@ import pyarrow.compute as pc
 
 from shiftsim.errors import ConfigError, DataError, listed, one_of
 from shiftsim.files import write_text
-from shiftsim.runs.rollouts import Task, complete_rollout, describe
+from shiftsim.runs.rollouts import Task, describe
+from shiftsim.runs.rollouts.columns import complete_rollout
 from shiftsim.runs.rollouts.files import FOLDER, RolloutLocation, RolloutReader
 from shiftsim.runs.tables import LOCATION, OK, damaged, read_table, stored_location
 from shiftsim.sim.log import SimulationLog

@@ -20,14 +20,22 @@ from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.planner import Observation, Planner, SceneInfo
 from shiftsim.verify import rollouts
-from shiftsim.verify.report import Report
+from shiftsim.verify.report import (
+    DAMAGED,
+    EXACT,
+    TOLERANCE,
+    Groups,
+    Report,
+    Source,
+    Tolerances,
+    read_table,
+)
 from shiftsim.verify.simulation_log import (
     OTHER_VERSION,
     Recorded,
     find_simulation_logs,
     read_simulation_log,
 )
-from shiftsim.verify.tables import DAMAGED, EXACT, TOLERANCE, Groups, Source, Tolerances, read_table
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AX, AY, PACIFICA, Tracks, Trajectory, speeds
 

@@ -16,7 +16,7 @@ from shiftsim.sim.dynamics.lqr import TRACKED, track_and_step
 from shiftsim.sim.dynamics.perfect import interpolate
 from shiftsim.sim.log import SimulationLog, as_recorded
 from shiftsim.sim.planner import Observation, observe_log, scene_info
-from shiftsim.verify.tables import TOLERANCE, Source
+from shiftsim.verify.report import TOLERANCE, Source
 from shiftsim.world import state
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AgentKind, Tracks, Trajectory, tracks_of_boxes

@@ -12,9 +12,8 @@ from shiftsim.metrics.comfort import comfort_signals, within_bounds
 from shiftsim.metrics.result import PROFILES
 from shiftsim.sim.dynamics import lqr
 from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, step_bicycle, step_seconds
-from shiftsim.verify.report import Report
+from shiftsim.verify.report import EXACT, TOLERANCE, Named, Report
 from shiftsim.verify.rollouts import SCORES, ego_states, recorded_log
-from shiftsim.verify.tables import EXACT, TOLERANCE, Named
 from shiftsim.world.scenario import scenario_of_rows
 from shiftsim.world.state import Tracks
 

@@ -27,9 +27,8 @@ from shiftsim.runs.rollouts import Task
 from shiftsim.runs.rollouts.elsewhere import Entry
 from shiftsim.runs.rollouts.elsewhere import Source as Rollouts
 from shiftsim.runs.rollouts.poses import Boxes, Driven
-from shiftsim.verify.report import Report
+from shiftsim.verify.report import DAMAGED, Report, Source
 from shiftsim.verify.rollouts import CENTER_COLUMNS, origin, read_ego, tracks_of
-from shiftsim.verify.tables import DAMAGED, Source
 from shiftsim.world.state import AgentKind, LightStatus, rear_poses
 
 DEVKIT = "nuPlan's devkit 1.2.2"  # whose folders are known here

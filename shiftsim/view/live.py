@@ -17,8 +17,7 @@ import numpy as np
 from shiftsim.report.palette import planner_styles
 from shiftsim.report.words import violations
 from shiftsim.runs.execute import Progress
-from shiftsim.runs.rollouts import complete_rollout
-from shiftsim.runs.rollouts.columns import decode_rows
+from shiftsim.runs.rollouts.columns import complete_rollout, decode_rows
 from shiftsim.runs.tables import OK, TaskResult
 from shiftsim.view.page import framed, replay_page
 from shiftsim.view.scene import ShownRollout

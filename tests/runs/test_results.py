@@ -10,8 +10,14 @@ from shiftsim.errors import ConfigError, DataError
 from shiftsim.planners.registry import load_planner
 from shiftsim.runs.config import make_config
 from shiftsim.runs.derive import rescore
-from shiftsim.runs.rollouts import Task, complete_rollout
-from shiftsim.runs.rollouts.columns import STATES, decode_rows, encode_rows, rollout_rows
+from shiftsim.runs.rollouts import Task
+from shiftsim.runs.rollouts.columns import (
+    STATES,
+    complete_rollout,
+    decode_rows,
+    encode_rows,
+    rollout_rows,
+)
 from shiftsim.runs.task import score_rollout
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.noise import NoiseModel, parse_noise

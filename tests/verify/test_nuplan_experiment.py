@@ -20,13 +20,12 @@ from shiftsim.metrics import compute_metrics
 from shiftsim.runs.rollouts.poses import rollout_of
 from shiftsim.verify import simulation_log
 from shiftsim.verify.experiment import _compare_means, verify_experiment
-from shiftsim.verify.report import Report
+from shiftsim.verify.report import Report, read_table
 from shiftsim.verify.simulation_log import (
     find_simulation_logs,
     log_source,
     read_simulation_log,
 )
-from shiftsim.verify.tables import read_table
 
 pytestmark = pytest.mark.golden
 GOLDEN = places.GOLDEN / "nuplan_experiment"

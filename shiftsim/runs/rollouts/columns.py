@@ -6,13 +6,20 @@ no score depends: they are less the pose of the ego, in single precision.
 """
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from shiftsim.data.store.schema import BOX, EGO_COLUMNS, list_of
+from shiftsim.errors import DataError
+from shiftsim.runs.rollouts import Task
 from shiftsim.sim.log import NUM_KEPT, SimulationLog
+from shiftsim.sim.noise import sample_noise
+from shiftsim.world.ranges import RUN, require
+from shiftsim.world.scenario import Scenario
 
 COMMAND_COLUMNS = ("command_accel_mps2", "command_steering_rate_radps")
 NOISE_COLUMNS = ("noise_accel_mps2", "noise_steering_rate_radps")
@@ -84,6 +91,66 @@ def _lists(lengths: np.ndarray, items: np.ndarray | pa.Array) -> pa.Array:
     return pa.ListArray.from_arrays(offsets, values, type=list_of(values.type))
 
 
+def complete_rollout(
+    rows: pa.RecordBatch, scenario: Scenario, task: Task, *, is_partial: bool = False
+) -> SimulationLog:
+    """The stored rollout of a task, completed by its noise and what its scenario holds already.
+
+    The rows have columns of `STATES`, and of `TRACKS` where they are not those of the log. Where
+    they may end before the scenario, the expert ends with them.
+
+    Raises:
+        DataError: The scenario is not the one that was driven, or the rows are damaged.
+    """
+    time_us = rows["time_us"].to_numpy()
+    if is_partial:
+        shown = scenario.iteration_rows[: len(time_us) + 1]
+        scenario = replace(scenario, iteration_rows=shown)
+    samples = scenario.iteration_rows[:-1]
+    if scenario.script is not None and scenario.script.termination is not None:
+        samples = samples[: len(time_us)]  # it may have ended before its time
+    if not np.array_equal(time_us, scenario.time_us[samples]):
+        raise DataError(
+            f"scenario {scenario.token!r} in the store is not the one that was driven",
+            hint="use the store that the manifest names",
+        )
+    ego = stack(rows, EGO_COLUMNS)
+    where = f"the rollout of scenario {scenario.token!r}"
+    require(RUN, "state", ego, f"{where}: an ego")
+    tracks = scenario.tracks.rows(samples)
+    try:
+        plans = stored_plans(rows)
+        if KINDS in rows.schema.names:
+            names = (rows[name].flatten().to_pylist() for name in (TRACKS.names[0], KINDS))
+            kinds = dict(zip(*names, strict=True))  # in order of appearance
+            codes = np.array([*kinds.values()], np.int64)
+            tracks = replace(tracks, tokens=tuple(kinds), kinds=codes)
+        if "track_tokens" in rows.schema.names:
+            stored: dict[str, Any] = stored_tracks(rows, tracks.tokens)
+            tracks = replace(tracks, **stored)
+    except ValueError as error:
+        raise DataError(f"{where} is damaged: {error}", hint="make the run again") from error
+    if rows[NOISE_COLUMNS[0]].null_count:
+        noise = sample_noise(task.noise, seed=task.seed, token=task.token, num_steps=len(rows))
+    else:
+        noise = stack(rows, NOISE_COLUMNS)
+    return SimulationLog(
+        token=scenario.token,
+        time_us=scenario.time_us[samples],
+        ego=ego,
+        tracks=tracks,
+        traffic_lights=scenario.traffic_lights.rows(samples),
+        expert_time_us=scenario.iteration_times,
+        expert_ego=scenario.expert,
+        route=scenario.route,
+        commands=stack(rows, COMMAND_COLUMNS),
+        noise=noise,
+        plans=plans,
+        planning_seconds=rows["planning_seconds"].to_numpy().astype(np.float64),
+        degraded=np.array(rows["degraded"].to_numpy(zero_copy_only=False)),
+    )
+
+
 def _cells(column: pa.Array, lengths: np.ndarray, name: str) -> pa.Array:
     """The items of lists that have these lengths (K,).
 
@@ -140,12 +207,6 @@ def stored_tracks(rows: pa.RecordBatch, tokens: Sequence[str]) -> dict[str, np.n
         out[name] = np.full((*valid.shape, part.shape[1]), np.nan)
         out[name][row, track] = part
     return out
-
-
-def stored_kinds(rows: pa.RecordBatch) -> dict[str, int]:
-    """AgentKind code by token of the tracks of a rollout with `KINDS`, in order of appearance."""
-    tokens, kinds = (rows[name].flatten().to_pylist() for name in (TRACKS.names[0], KINDS))
-    return dict(zip(tokens, kinds, strict=True))
 
 
 def encode_rows(rows: pa.RecordBatch) -> bytes:

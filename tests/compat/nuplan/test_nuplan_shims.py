@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from worlds import rear_states
 
-from shiftsim.compat.nuplan.bridge.world import (
+from shiftsim.compat.nuplan.bridge.planner import (
     ObservedTracks,
     ego_state,
     traffic_lights,

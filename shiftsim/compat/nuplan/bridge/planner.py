@@ -1,23 +1,178 @@
-"""A planner for shiftsim around one for nuPlan."""
+"""A planner for shiftsim around one for nuPlan, which sees nuPlan's objects."""
 
 import copy
 import hashlib
 import inspect
 import pickle
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
-from nuplan.common.actor_state.state_representation import StateSE2
-from nuplan.planning.simulation.observation.observation_type import DetectionsTracks
-from nuplan.planning.simulation.planner.abstract_planner import PlannerInitialization
-from shiftsim.compat.nuplan.bridge.map import BridgeMap
-from shiftsim.compat.nuplan.bridge.world import HistoryKeeper, to_trajectory
-from shiftsim.errors import ConfigError, PlannerError
-from shiftsim.sim.planner import Observation, SceneInfo
-from shiftsim.world.map import PerMap
-from shiftsim.world.state import Trajectory
+import numpy as np
 
+from nuplan.common.actor_state.agent import Agent
+from nuplan.common.actor_state.ego_state import EgoState
+from nuplan.common.actor_state.oriented_box import OrientedBox
+from nuplan.common.actor_state.scene_object import SceneObjectMetadata
+from nuplan.common.actor_state.state_representation import StateSE2, StateVector2D, TimePoint
+from nuplan.common.actor_state.static_object import StaticObject
+from nuplan.common.actor_state.tracked_objects import TrackedObjects
+from nuplan.common.actor_state.tracked_objects_types import TrackedObjectType
+from nuplan.common.actor_state.vehicle_parameters import VehicleParameters
+from nuplan.common.maps.maps_datatypes import TrafficLightStatusData, TrafficLightStatusType
+from nuplan.planning.simulation.history.simulation_history_buffer import SimulationHistoryBuffer
+from nuplan.planning.simulation.observation.observation_type import DetectionsTracks
+from nuplan.planning.simulation.planner.abstract_planner import PlannerInitialization, PlannerInput
+from nuplan.planning.simulation.simulation_time_controller.simulation_iteration import (
+    SimulationIteration,
+)
+from nuplan.planning.simulation.trajectory.abstract_trajectory import AbstractTrajectory
+from nuplan.planning.simulation.trajectory.interpolated_trajectory import InterpolatedTrajectory
+from shiftsim.compat.nuplan.bridge.map import BridgeMap
+from shiftsim.errors import ConfigError, PlannerError
+from shiftsim.kernels import FloatArray
+from shiftsim.sim.planner import HISTORY_SAMPLES, Observation, SceneInfo
+from shiftsim.world.map import PerMap
+from shiftsim.world.state import LAST_AGENT_KIND, NUM_STATE, Tracks, TrafficLights, Trajectory
+from shiftsim.world.state import VehicleParameters as Dimensions
+
+HEIGHT = 1.8  # m, of all objects: the arrays of a scenario have none
+ROW_SECONDS = 0.05  # s, between the rows of a log
+_STEP_US = 100_000  # us, between the poses that the tracker reads
+_DIMENSIONS = ("width", "front_length", "rear_length", "wheel_base", "height")
+_COG = 1.67  # m, rear axle to the centre of gravity, nuPlan's pacifica
 _maps = PerMap(BridgeMap)
+
+
+def vehicle_parameters(vehicle: Dimensions) -> Any:
+    """Dimensions of the ego."""
+    size = {name: getattr(vehicle, name) for name in _DIMENSIONS}
+    kind = {"vehicle_name": "pacifica", "vehicle_type": "gen1"}
+    return VehicleParameters(cog_position_from_rear_axle=_COG, **size, **kind)
+
+
+def ego_state(time_us: int, row: FloatArray, vehicle: Any) -> Any:
+    """The ego state of a row (11,), columns of `STATE_COLUMNS`."""
+    x, y, heading, vx, vy, ax, ay, steering, steering_rate, yaw_rate, yaw_accel = row.tolist()
+    pose, velocity, accel = StateSE2(x, y, heading), StateVector2D(vx, vy), StateVector2D(ax, ay)
+    time, turning = TimePoint(int(time_us)), (yaw_rate, yaw_accel, steering_rate)
+    return EgoState.build_from_rear_axle(
+        pose, velocity, accel, steering, time, vehicle, True, *turning
+    )
+
+
+class ObservedTracks(DetectionsTracks):
+    """The objects of one moment, built on first access."""
+
+    def __init__(self, time_us: int, tracks: Tracks) -> None:
+        self._time_us, self._tracks = int(time_us), tracks
+
+    @cached_property
+    def tracked_objects(self) -> Any:
+        """The objects."""
+        present = np.flatnonzero(self._tracks.valid[0]).tolist()
+        return TrackedObjects([self._object(track) for track in present])
+
+    def _object(self, track: int) -> Any:
+        tracks = self._tracks
+        kind = TrackedObjectType(int(tracks.kinds[track]))
+        token = tracks.tokens[track]
+        length, width = tracks.sizes[0, track].tolist()
+        box = OrientedBox(StateSE2(*tracks.poses[0, track].tolist()), length, width, HEIGHT)
+        sample, now_us = f"{token}@{self._time_us}", self._time_us
+        metadata = SceneObjectMetadata(now_us, sample, track, token, kind.fullname)
+        if tracks.kinds[track] > LAST_AGENT_KIND:
+            return StaticObject(kind, box, metadata)
+        velocity = StateVector2D(*tracks.velocities[0, track].tolist())
+        # nuPlan rule 579: objects of a log come with an unknown angular velocity and no predictions
+        return Agent(kind, box, velocity, metadata, angular_velocity=np.nan, predictions=[])
+
+
+def traffic_lights(time_us: int, lights: TrafficLights) -> list[Any]:
+    """The listed lights; ids are integers wherever they can be."""
+    return [
+        TrafficLightStatusData(
+            status=TrafficLightStatusType(int(status)),
+            lane_connector_id=int(name) if name.isdecimal() else name,
+            timestamp=int(time_us),
+        )
+        for name, status in lights.listed(0)
+    ]
+
+
+class HistoryKeeper:
+    """The history of a rollout; it grows by one sample per step, as nuPlan's own does."""
+
+    def __init__(self, scene: SceneInfo) -> None:
+        self._vehicle = vehicle_parameters(scene.vehicle)
+        step = float(np.median(np.diff(scene.times))) * 1e-6
+        self._interval = ROW_SECONDS * round(step / ROW_SECONDS)
+        self._buffer: Any = None
+        self._iteration = -1
+
+    def planner_input(self, observation: Observation) -> Any:
+        """What nuPlan's planner is given at this iteration."""
+        history = observation.history
+        last = len(history.time_us) - 1
+        if self._buffer is None or observation.iteration != self._iteration + 1:
+            samples = [self._sample(observation, row) for row in range(last + 1)]
+            egos, seen = (list(part) for part in zip(*samples, strict=True))
+            make = SimulationHistoryBuffer.initialize_from_list
+            self._buffer = make(HISTORY_SAMPLES, egos, seen, self._interval)
+        else:
+            self._buffer.append(*self._sample(observation, last))
+        self._iteration = observation.iteration
+        now_us = int(observation.time_us)
+        now = SimulationIteration(TimePoint(now_us), observation.iteration)
+        return PlannerInput(now, self._buffer, traffic_lights(now_us, observation.lights))
+
+    def _sample(self, observation: Observation, row: int) -> tuple[Any, Any]:
+        history = observation.history
+        time_us = int(history.time_us[row])
+        seen = ObservedTracks(time_us, history.tracks.rows(slice(row, row + 1)))
+        return ego_state(time_us, history.ego[row], self._vehicle), seen
+
+
+def to_trajectory(plan: Any, now_us: int, next_us: int, planner: str) -> Trajectory:
+    """What a planner returned, as ours; the times are those of this iteration and the next [us].
+
+    The states of an `InterpolatedTrajectory` are taken as they are. Another kind of trajectory is
+    asked for its states wherever the simulation looks at it.
+
+    Raises:
+        PlannerError: It is no trajectory of ego states.
+    """
+    if not isinstance(plan, AbstractTrajectory):
+        raise PlannerError(
+            f"planner {planner!r}: compute_planner_trajectory() returned {type(plan).__name__}, "
+            "not an AbstractTrajectory",
+            hint="return an InterpolatedTrajectory of EgoStates",
+        )
+    if isinstance(plan, InterpolatedTrajectory):
+        states = plan.get_sampled_trajectory()
+    else:
+        first, last = int(plan.start_time.time_us), int(plan.end_time.time_us)
+        moments = {*range(first, last + 1, _STEP_US), first, last, now_us, next_us}
+        times = [TimePoint(time) for time in sorted(moments) if first <= time <= last]
+        states = plan.get_state_at_times(times)
+    wrong = next((state for state in states if not isinstance(state, EgoState)), None)
+    if wrong is not None:
+        raise PlannerError(
+            f"planner {planner!r}: its trajectory has states of class {type(wrong).__name__}",
+            hint="return a trajectory of EgoStates",
+        )
+    times_us = np.array([int(state.time_us) for state in states], np.int64)
+    rows = np.array([_row(state) for state in states], np.float64)
+    return Trajectory(times_us, rows.reshape(-1, NUM_STATE))
+
+
+def _row(state: Any) -> tuple[float, ...]:
+    pose, motion = state.rear_axle, state.dynamic_car_state
+    velocity, accel = motion.rear_axle_velocity_2d, motion.rear_axle_acceleration_2d
+    moving = velocity.x, velocity.y, accel.x, accel.y
+    steering = state.tire_steering_angle, motion.tire_steering_rate
+    turning = motion.angular_velocity, motion.angular_acceleration
+    return (pose.x, pose.y, pose.heading, *moving, *steering, *turning)
 
 
 class NuplanPlanner:
