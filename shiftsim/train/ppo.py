@@ -20,8 +20,8 @@ from shiftsim.files import write_text
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.planners.learned.carl.network import CarlNetwork, Policy
 from shiftsim.train import folder, learning
+from shiftsim.train.driving import NOISES, Towns
 from shiftsim.train.folder import OnMessage, Settings, Weights
-from shiftsim.train.jobs import NOISES, Towns
 from shiftsim.train.states import Values, compress_raster, read_raster
 
 ENVS = 8

@@ -17,8 +17,8 @@ from shiftsim.planners.learned.checkpoint import resolve_device
 from shiftsim.runs.filter import read_filter_results
 from shiftsim.runs.scenarios import find_split
 from shiftsim.train import folder, learning
+from shiftsim.train.driving import RunJobs, Towns, collect, divide, mean_scores, run_jobs
 from shiftsim.train.folder import BEST, LATEST, OnMessage, Settings, Weights
-from shiftsim.train.jobs import RunJobs, Towns, collect, divide, mean_scores, run_jobs
 from shiftsim.train.states import States, write_part
 
 _WRITE_EVERY, _REPORT_EVERY = 120.0, 10.0  # s

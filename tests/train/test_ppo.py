@@ -7,8 +7,8 @@ import torch
 from shiftsim.data.store.reading import open_store
 from shiftsim.planners.learned.carl.network import CarlNetwork, Policy
 from shiftsim.train import ppo
+from shiftsim.train.driving import divide
 from shiftsim.train.folder import BEST, REINFORCED
-from shiftsim.train.jobs import divide
 from shiftsim.train.learning import to_official
 from shiftsim.train.recipe import Training
 

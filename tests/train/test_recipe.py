@@ -14,9 +14,8 @@ import shiftsim
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import CheckpointError, ConfigError
 from shiftsim.train import recipe
-from shiftsim.train.driving import Driver, Job, PolicyPlanner, Start
+from shiftsim.train.driving import Driver, Job, PolicyPlanner, Start, divide
 from shiftsim.train.folder import BEST, LATEST, STATE, Settings
-from shiftsim.train.jobs import divide
 from shiftsim.train.recipe import Training
 
 

@@ -22,8 +22,8 @@ from shiftsim.runs.scenarios import find_split
 from shiftsim.sim.traffic import Traffic, make_traffic
 from shiftsim.sim.traffic.learned.features import NUM_FEATURES
 from shiftsim.sim.traffic.learned.model import HIDDEN, SCALES, LearnedTraffic, Weights
+from shiftsim.train.driving import divide
 from shiftsim.train.folder import OnMessage, TrafficSettings, make_folder, write_table
-from shiftsim.train.jobs import divide
 from shiftsim.train.traffic.realism import compare
 from shiftsim.train.traffic.states import States, join, states_of
 
