@@ -91,7 +91,10 @@ class Braking:
         self._arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self._xy, axis=0).T))])
         self._speed = speeds(states[distinct])
         self._deceleration = deceleration
-        self._is_edit = _pedestrians_of(scenario)
+        # tracks that are pedestrians which an edit made
+        edited = set(scenario.script.tokens if scenario.script else ())
+        of_edit = np.array([token in edited for token in scenario.tracks.tokens], np.bool_)
+        self._is_edit = of_edit & (scenario.tracks.kinds == AgentKind.PEDESTRIAN)
         self._brakes_us: int | None = None
 
     def reset(self, scene: SceneInfo) -> None:
@@ -130,10 +133,3 @@ class Braking:
         arc: FloatArray = np.interp(time_us, self._time_us, self._arc[:-1])
         late = np.maximum(time_us - self._time_us[-1], 0) * 1e-6
         return arc + self._speed[-1] * late
-
-
-def _pedestrians_of(scenario: Scenario) -> np.ndarray:
-    """(N,) tracks that are pedestrians which an edit made."""
-    edited = set(scenario.script.tokens if scenario.script else ())
-    of_edit = np.array([token in edited for token in scenario.tracks.tokens], np.bool_)
-    return of_edit & (scenario.tracks.kinds == AgentKind.PEDESTRIAN)

@@ -186,7 +186,8 @@ class RunWriter:
         Returns:
             Where they are.
         """
-        records = [(task, self.ended[task]) for task in sorted(self.ended, key=_by_scenario)]
+        order = sorted(self.ended, key=lambda task: (task.token, task))
+        records = [(task, self.ended[task]) for task in order]
         locations = {
             task: record.location
             for task, record in records
@@ -207,10 +208,6 @@ class RunWriter:
             ),
         )
         return locations | written
-
-
-def _by_scenario(task: Task) -> tuple[str, Task]:
-    return task.token, task
 
 
 def _entry(result: TaskResult) -> tuple[str, dict[str, Any]]:

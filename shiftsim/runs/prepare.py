@@ -139,6 +139,9 @@ def prepare(
     tasks = [Task(*run, token) for token in selection.present for run in runs]
     missing: list[Batch] = [(Task(*run, token),) for token in selection.missing for run in runs]
     batches = _of_shard(config.shard, _batches(grouped, tasks))
+    # one batch per planner to the front: they compile all the kernels
+    leading = {batch[0].planner: batch for batch in reversed(batches)}
+    batches.sort(key=lambda batch: leading[batch[0].planner] is not batch)
     by_name = {entry.name: entry for entry in entries}
     by_name |= {config.traffic: traffic} if traffic else {}
     # of this machine; workers on others would not reach the process
@@ -152,7 +155,7 @@ def prepare(
         selection=selection,
         planners=by_name,
         noises={model.name: model for model in models},
-        batches=tuple(_leading_first(batches)),
+        batches=tuple(batches),
         missing=tuple(task for task, *_ in _of_shard(config.shard, missing)),
         fingerprint=fingerprint,
         folder=folder,
@@ -344,12 +347,6 @@ def _of_shard(shard: str, batches: list[Batch]) -> list[Batch]:
         return int.from_bytes(digest, "little") % count
 
     return [batch for batch in batches if bucket(batch[0]) == number - 1]
-
-
-def _leading_first(batches: list[Batch]) -> list[Batch]:
-    """One batch per planner to the front: they compile all the kernels."""
-    leading = {batch[0].planner: batch for batch in reversed(batches)}
-    return sorted(batches, key=lambda batch: leading[batch[0].planner] is not batch)
 
 
 def _fingerprint(
