@@ -49,35 +49,19 @@ class ConversionReport:
 
 
 def convert_nuplan(
-    logs: Path,
-    maps: Path,
+    logs: Path,  # folder that holds the logs (.db) at any depth, or one log
+    maps: Path,  # folder with `nuplan-maps-v1.0.json` and the maps
     store: Path,
     *,
-    tokens: Iterable[str] | None = None,
-    types: Iterable[str] | None = None,
-    filter_file: Path | None = None,
-    mapping: scenarios.Mapping | None = None,
+    tokens: Iterable[str] | None = None,  # only these scenarios
+    types: Iterable[str] | None = None,  # only these scenario types
+    filter_file: Path | None = None,  # nuPlan's YAML, or a text file with one token per line
+    mapping: scenarios.Mapping | None = None,  # of all scenarios; nuPlan's by type where None
     progress: Progress | None = None,
 ) -> ConversionReport:
-    """Convert scenarios of nuPlan logs into a store, or add them to one.
+    """Convert scenarios of nuPlan logs into a store, as `shiftsim.convert_nuplan`.
 
-    Args:
-        logs: Folder that holds the logs (.db) at any depth, or one log.
-        maps: Folder with `nuplan-maps-v1.0.json` and the maps.
-        store: Folder of the store.
-        tokens: Only these scenarios.
-        types: Only these scenario types.
-        filter_file: nuPlan's scenario-filter YAML, or a text file with one token per line.
-        mapping: Duration [s], offset [s] and subsample ratio of all; nuPlan's by type where None.
-        progress: Called with logs done, number of logs, and the log's name.
-
-    Returns:
-        What was converted, and what failed and why. One broken scenario stops no other. Where
-        nothing was, no new store is left.
-
-    Raises:
-        DataError: There are no logs or no maps, or the store cannot be written.
-        ConfigError: The filter asks for something that is not supported.
+    One broken scenario stops no other. Where nothing was converted, no new store is left.
     """
     chosen = _choice(tokens, types, filter_file)
     every = _log_files(Path(logs))
