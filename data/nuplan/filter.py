@@ -102,10 +102,6 @@ def _token_list(path: Path, values: Mapping[str, Any], key: str) -> frozenset[st
     return None if tokens is None else _tokens(path, tokens)
 
 
-def _flag(path: Path, values: Mapping[str, Any], key: str) -> bool:
-    return values.get(key) is True
-
-
 def _number(path: Path, values: Mapping[str, Any], key: str) -> float | None:
     value = values.get(key)
     if value is None or (type(value) in (int, float) and np.isfinite(value)):
@@ -157,7 +153,10 @@ _KEYS: dict[str, tuple[str, Callable[[Path, Mapping[str, Any], str], Any]]] = {
     "scenario_types": ("types", _names),
     "log_names": ("logs", _names),
     "map_names": ("maps", _names),
-    "remove_invalid_goals": ("remove_invalid_goals", _flag),
+    "remove_invalid_goals": (
+        "remove_invalid_goals",
+        lambda _, values, key: values.get(key) is True,
+    ),
     "num_scenarios_per_type": ("per_type", _count),
     "limit_total_scenarios": ("limit", _count),
     "timestamp_threshold_s": ("min_gap_s", _number),
@@ -167,7 +166,7 @@ _KEYS: dict[str, tuple[str, Callable[[Path, Mapping[str, Any], str], Any]]] = {
     "speed_noise_tolerance": ("speed_noise", _number),
     "fraction_in_token_set_threshold": ("min_share", _number),
     "ego_route_radius": ("route_radius", _number),
-    "shuffle": ("shuffle", _flag),
+    "shuffle": ("shuffle", lambda _, values, key: values.get(key) is True),
 }
 # fields in the order in which scenarios are left out: by lists, all together, one by one
 LISTED = ("logs", "maps", "tokens", "types", "remove_invalid_goals")
