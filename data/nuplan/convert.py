@@ -7,12 +7,11 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from shiftsim.data.nuplan import scenarios
-from shiftsim.data.nuplan.filter import JUDGED, KEY_OF, LISTED, THINNED, ScenarioFilter, read_filter
+from shiftsim.data.nuplan.filter import KEY_OF, LISTED, THINNED, ScenarioFilter, read_filter
 from shiftsim.data.nuplan.log import Log, open_log
-from shiftsim.data.nuplan.sampling import is_taken, thin_out
+from shiftsim.data.nuplan.sampling import is_taken, judgements, thin_out
 from shiftsim.data.recording import Window
 from shiftsim.data.store.tables import MANIFEST, SCENARIOS
 from shiftsim.data.store.writing import StoreWriter
@@ -254,13 +253,11 @@ class _Conversion:
 
     def judge(self, log: Log, window: Window, counts: Counter[str]) -> None:
         """Count a scenario for every key that judges scenarios one by one and takes it."""
-        chosen, road = self.chosen, partial(self._map, log.map_name)
-        for name in JUDGED:
-            if getattr(chosen, name) is not None:
-                others: dict[str, Any] = {other: None for other in JUDGED if other != name}
-                if not is_taken(log, window, road, replace(chosen, **others)):
-                    return
-                counts[name] += 1
+        road = partial(self._map, log.map_name)
+        for name, is_good in judgements(log, window, road, self.chosen):
+            if not is_good:
+                return
+            counts[name] += 1
 
     def _is_stored(self, window: Window) -> bool:
         if window.token not in self.writer.tokens:

@@ -168,10 +168,9 @@ _KEYS: dict[str, tuple[str, Callable[[Path, Mapping[str, Any], str], Any]]] = {
     "ego_route_radius": ("route_radius", _number),
     "shuffle": ("shuffle", lambda _, values, key: values.get(key) is True),
 }
-# fields in the order in which scenarios are left out: by lists, all together, one by one
+# fields in the order in which scenarios are left out: by lists, all together; then one by one
 LISTED = ("logs", "maps", "tokens", "types", "remove_invalid_goals")
 THINNED = ("per_type", "limit", "min_gap_s")
-JUDGED = ("min_way", "start_speed", "stop_speed", "min_share", "route_radius")
 KEY_OF = {field: key for key, (field, _) in _KEYS.items()}  # key of a field
 
 

@@ -62,24 +62,15 @@ class AreaSpec:
 def build_map(
     name: str,
     *,
-    edges: Sequence[EdgeSpec],
-    blocks: Sequence[BlockSpec],
-    epsg: int = 0,
-    **areas: Sequence[AreaSpec],
+    edges: Sequence[EdgeSpec],  # lanes and connectors; the order within each kind is kept
+    blocks: Sequence[BlockSpec],  # roadblocks and their connectors, likewise
+    epsg: int = 0,  # code of the metric coordinate system; 0 for a local frame
+    **areas: Sequence[AreaSpec],  # by name of another layer of the map
 ) -> VectorMap:
     """A map from its parts. References to unknown ids are left out and counted in `flaws`.
 
-    Args:
-        name: Map (city) name.
-        edges: Lanes and lane connectors; the order within each kind is kept.
-        blocks: Roadblocks and roadblock connectors; the order within each kind is kept.
-        epsg: Code of the metric coordinate system; 0 for a local frame.
-        areas: By name of another layer of the map: `intersections` and `stop_polygons`, whose
-            `kind` is their type, `crosswalks`, `walkways`, `car_parks`, and `drivable_areas`, all
-            polygons whose union is drivable.
-
-    Raises:
-        MapError: An id occurs twice, or a baseline has fewer than two vertices.
+    The `kind` of `intersections` and `stop_polygons` is their type, `drivable_areas` are polygons
+    whose union is drivable. It is a MapError if an id occurs twice, or a baseline is too short.
     """
     edges = sorted(edges, key=lambda spec: spec.is_connector)
     blocks = sorted(blocks, key=lambda spec: spec.is_connector)
