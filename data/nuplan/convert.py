@@ -71,7 +71,8 @@ def convert_nuplan(
         report = conversion.report
         show = progress or (lambda done, total, name: None)
         is_all = chosen == ScenarioFilter()
-        taken = _thinned(files, conversion, show) if chosen.thins_out or is_all else None
+        thins_out = (chosen.per_type, chosen.limit, chosen.min_gap_s) != (None, None, None)
+        taken = _thinned(files, conversion, show) if thins_out or is_all else None
         if is_all:
             text = "%d scenarios of %d logs will be made, one of every sweep as in nuPlan; %s"
             fewer = "--types, --tokens or --filter takes fewer"

@@ -38,11 +38,6 @@ class ScenarioFilter:
     shuffle: bool = False  # whether nuPlan draws at random where it leaves out
     source: str = ""  # the file
 
-    @property
-    def thins_out(self) -> bool:
-        """Whether what is taken depends on all scenarios that the logs offer."""
-        return not (self.per_type is self.limit is self.min_gap_s is None)
-
 
 def read_filter(path: Path) -> ScenarioFilter:
     """Read a scenario filter (.yaml, .yml) or a list of tokens, one per line (any other ending).

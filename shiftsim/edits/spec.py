@@ -199,11 +199,6 @@ class Edit:
         """What the new scenario depends on, beside the recorded one."""
         return digest_of(asdict(self))
 
-    @property
-    def ends_at_goal(self) -> bool:
-        """Whether a rollout ends where the goal is reached."""
-        return self.reroute is not None if self.end_at_goal is None else self.end_at_goal
-
     @cached_property
     def words(self) -> tuple[str, ...]:
         """What is edited, one line each."""
