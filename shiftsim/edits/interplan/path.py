@@ -7,9 +7,9 @@ from typing import Any, TypeAlias
 import numpy as np
 import shapely
 
-from shiftsim.edits import route
 from shiftsim.edits.builder import EGO_SIZE
 from shiftsim.edits.interplan.codes import COMMANDS
+from shiftsim.edits.route import TOLERANCE, by_command, cut_by_time, edge_at, plan_lanes, plan_line
 from shiftsim.errors import ConfigError
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.polylines import vertex_headings
@@ -54,7 +54,7 @@ def make_plan(
         lanes = driven_lanes(road, expert)
         if not lanes:
             raise ConfigError("the expert is on no lane")
-        line = route.plan_line(road, lanes, center)
+        line = plan_line(road, lanes, center)
         goal = scenario.expert[-1, :3].copy()
         return Plan(scenario.route, tuple(lanes), goal, line, expert, _end(line, goal))
     if letter not in COMMANDS:
@@ -68,34 +68,34 @@ def make_plan(
     if text:
         x, y = (float(word) for word in str(text).split(","))
         blocks = road.blocks.within_box(float(center[0]), float(center[1]), _NEAR).tolist()
-        edge = route.edge_at(road, x, y)
+        edge = edge_at(road, x, y)
         if int(road.block_of[edge]) not in blocks:
             raise ConfigError("the goal is too far away")
     else:
-        blocks = route.by_command(road, first, command, len(scenario.route))
+        blocks = by_command(road, first, command, len(scenario.route))
         edge = int(road.block_edges.at(blocks[-1])[-1])
-    lanes = route.plan_lanes(road, first, edge, blocks, keeps_oddities=True)
+    lanes = plan_lanes(road, first, edge, blocks, keeps_oddities=True)
     if not lanes:
         raise ConfigError("no lanes lead to the goal from the last lane beside the ego")
     if text:
         blocks = list(dict.fromkeys(road.block_of[lanes].tolist()))
         goal = start_on(road, lanes[-1], x, y).pose
     else:
-        lanes = route.cut_by_time(road, lanes, scenario.mapping[0])
+        lanes = cut_by_time(road, lanes, scenario.mapping[0])
         xy = road.baselines.at(lanes[-1])
         goal = np.array([*xy[-1], vertex_headings(xy)[-1]])
-    line = route.plan_line(road, lanes, center)
+    line = plan_line(road, lanes, center)
     count = scenario.num_iterations
     # nuPlan rule 710: the expert goes from vertex to vertex, on to the end of the last lane
     centers = np.array([line[int(len(line) / count * i)] for i in range(count)])
     centers[0] = center
-    ids = tuple(road.blocks.ids[block] for block in blocks)
-    return Plan(ids, tuple(lanes), goal, line, centers, _end(line, goal))
+    route = tuple(road.blocks.ids[block] for block in blocks)
+    return Plan(route, tuple(lanes), goal, line, centers, _end(line, goal))
 
 
 def _end(line: FloatArray, goal: FloatArray) -> float:
     path = shapely.LineString(line[:, :2])
-    return float(shapely.line_locate_point(path, shapely.Point(goal[:2]))) - route.TOLERANCE
+    return float(shapely.line_locate_point(path, shapely.Point(goal[:2]))) - TOLERANCE
 
 
 def edges_under(road: VectorMap, pose: FloatArray, size: FloatArray) -> list[int]:
