@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import shapely
 
 from shiftsim.errors import MapError
 from shiftsim.kernels import FloatArray, IntArray
-from shiftsim.world.layers import Layer, make_layer, make_lists, make_polylines
+from shiftsim.world.layers import Layer, Lists, make_layer, make_lists, make_polylines
 from shiftsim.world.map import LAYERS, NONE, VectorMap
 
 
@@ -89,13 +90,8 @@ def build_map(
             flaws[flaw] = flaws.get(flaw, 0) + missing
         return [index[i] for i in ids if i is not None and i in index]
 
-    def to_edges(attribute: str) -> list[list[int]]:
-        flaw = "edge names an unknown edge"
-        return [known(edge_index, getattr(s, attribute), flaw) for s in edges]
-
-    def to_blocks(attribute: str) -> list[list[int]]:
-        flaw = "roadblock names an unknown one"
-        return [known(block_index, getattr(s, attribute), flaw) for s in blocks]
+    def lists(specs: Sequence[Any], attribute: str, index: dict[str, int], flaw: str) -> Lists:
+        return make_lists(known(index, getattr(spec, attribute), flaw) for spec in specs)
 
     def to_one(index: dict[str, int], attribute: str, what: str) -> IntArray:
         flaw = f"edge names an unknown {what}"
@@ -126,21 +122,19 @@ def build_map(
         lane_index=np.array(positions, np.int64),
         left_lane=to_one(edge_index, "left_lane", "edge"),
         right_lane=to_one(edge_index, "right_lane", "edge"),
-        incoming=make_lists(to_edges("incoming")),
-        outgoing=make_lists(to_edges("outgoing")),
+        incoming=lists(edges, "incoming", edge_index, "edge names an unknown edge"),
+        outgoing=lists(edges, "outgoing", edge_index, "edge names an unknown edge"),
         block_of=block_of,
         has_traffic_lights=np.array([s.has_traffic_lights for s in edges], np.bool_),
-        stop_lines=make_lists(
-            known(stop_index, s.stop_lines, "edge names an unknown stop line") for s in edges
-        ),
+        stop_lines=lists(edges, "stop_lines", stop_index, "edge names an unknown stop line"),
         intersection_of=to_one(intersection_index, "intersection_id", "intersection"),
         turn_type=np.array([s.turn_type for s in edges], np.int64),
         is_bike=np.array([s.is_bike for s in edges], np.bool_),
         blocks=_layer(blocks),
         num_roadblocks=sum(not s.is_connector for s in blocks),
         block_edges=make_lists(members),
-        block_incoming=make_lists(to_blocks("incoming")),
-        block_outgoing=make_lists(to_blocks("outgoing")),
+        block_incoming=lists(blocks, "incoming", block_index, "roadblock names an unknown one"),
+        block_outgoing=lists(blocks, "outgoing", block_index, "roadblock names an unknown one"),
         intersection_kinds=np.array([s.kind for s in others["intersections"]], np.int64),
         stop_kinds=np.array([s.kind for s in others["stop_polygons"]], np.int64),
         flaws=flaws,
