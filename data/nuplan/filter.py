@@ -190,11 +190,7 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # Any to the checker
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping in a YAML file of nuPlan's world: sixteen digits are a token, no key is twice.
-
-    Raises:
-        ConfigError: It cannot be read, or is something else.
-    """
+    """The mapping in a YAML file of nuPlan, or a ConfigError; sixteen digits are a token."""
     try:
         values = yaml.load(_read_text(path), _Loader)
     except yaml.MarkedYAMLError as error:
