@@ -276,10 +276,8 @@ def _contradictions(edit: Edit) -> Iterator[tuple[str, str]]:
     ]
     for name, place in places:
         if (place.at is None) == (place.pose is None):
-            yield (
-                f", {name}: give either pose or a place by the recorded path",
-                "pose = [x, y, heading], or at = {ahead_m = 30, left_m = -2}",
-            )
+            what = f", {name}: give either pose or a place by the recorded path"
+            yield what, "pose = [x, y, heading], or at = {ahead_m = 30, left_m = -2}"
     if density := edit.density:
         if bool(density.level) == bool(density.gap_m):
             yield ", density: give either level or gap_m", ""

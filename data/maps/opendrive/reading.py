@@ -221,10 +221,8 @@ def _read_plan_view(element: Any, reader: elements.Reader) -> tuple[records.Geom
 def _note_directions(sections: list[Any], reader: elements.Reader) -> None:
     """Count lanes whose vendor data tell the direction of right-hand traffic, and the other."""
     for lane in (lane for section in sections for lane in section.iter("lane")):
-        number, word = (
-            reader.integer(lane, "id"),
-            next((e.get("travelDir") for e in lane.iter("vectorLane")), None),
-        )
+        number = reader.integer(lane, "id")
+        word = next((e.get("travelDir") for e in lane.iter("vectorLane")), None)
         if number and word in ("forward", "backward") and lane.get("type") in records.DRIVABLE:
             reader.told[(word == "forward") == (number < 0)] += 1
 

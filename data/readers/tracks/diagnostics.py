@@ -192,11 +192,8 @@ def _check_starts(table: TrackTable, out: axes.Diagnostics) -> None:
 
 def _check_map(table: TrackTable, road: VectorMap, min_share: float, out: axes.Diagnostics) -> Fit:
     """Whether vehicles are on the map, and as fast as its limits allow."""
-    stored, moving, fast = (
-        table.velocities,
-        table.moving_rows(_MOVING),
-        table.moving_rows(axes.FAST),
-    )
+    stored, moving = table.velocities, table.moving_rows(_MOVING)
+    fast = table.moving_rows(axes.FAST)
     # another unit of length would show elsewhere, too
     is_metric = table.vehicle_size is not None and _is_usual(*table.vehicle_size)
     if is_metric and np.isfinite(stored).any() and len(fast):
