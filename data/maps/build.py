@@ -114,7 +114,7 @@ class _Node(NamedTuple):
     place: int = _WHOLE
 
 
-class _PieceGraph:
+class _PieceGraph(Topology[_Node, Part]):
     """Which pieces are lanes, roadblocks and connectors; counts what is inferred or left out."""
 
     def __init__(self, pieces: Sequence[LanePiece], warnings: Counter[str]) -> None:
@@ -125,13 +125,12 @@ class _PieceGraph:
             if min(len(piece.left), len(piece.right), len(piece.middle)) < 2:
                 what = f"lane {piece.id!r}: a border or its centre line has fewer than two vertices"
                 raise MapError(what, "leave the lane out, or repair the file")
-        self.warnings = warnings
+        super().__init__(warnings)
         self.pieces = [piece for piece in pieces if piece.polygon.area > 0 and piece.length > 0]
         self._count("lane without area, left out", len(pieces) - len(self.pieces))
         self.index = {piece.id: i for i, piece in enumerate(self.pieces)}
         self.is_connector = self._find_connectors()
         self.left = self._find_neighbors()
-        self.topology: Topology[_Node, Part] = Topology(self._is_lane, warnings)
 
     def _count(self, what: str, number: int) -> None:
         if number:
@@ -140,13 +139,13 @@ class _PieceGraph:
     def build(self) -> LaneGraph[Part]:
         self._link()
         self._add_nodes()
-        self.topology.build_lanes(self._groups())
+        self.build_lanes(self._groups())
         what = "connector that leads from no lane to no lane, left out"
-        self.topology.build_connectors(_MAX_CHAIN, lambda nodes: frozenset({"intersection"}), what)
-        self.topology.cut_connectors()
-        return self.topology.graph
+        self.build_connectors(_MAX_CHAIN, lambda nodes: frozenset({"intersection"}), what)
+        self.cut_connectors()
+        return self.graph
 
-    def _is_lane(self, node: _Node) -> bool:
+    def is_lane(self, node: _Node) -> bool:
         return node.place != _WHOLE or not self.is_connector[node.piece]
 
     def _find_connectors(self) -> list[bool]:
@@ -180,33 +179,32 @@ class _PieceGraph:
                     pairs.append((number, target))
         self._count("successor that is not in the map, left out", unknown)
         for source, target in pairs:
-            self.topology.join(_Node(source), _Node(target))
-        self.topology.drop_wide_gaps(lambda node: self.pieces[node.piece].ends)
+            self.join(_Node(source), _Node(target))
+        self.drop_wide_gaps(lambda node: self.pieces[node.piece].ends)
 
     def _add_nodes(self) -> None:
         """All pieces; connectors at the boundary of the map begin and end with a lane."""
-        topology = self.topology
         for number, piece in enumerate(self.pieces):
             start, node, end = (_Node(number, place) for place in (_START, _WHOLE, _END))
-            begins = self.is_connector[number] and not topology.before[node]
-            ends = self.is_connector[number] and not topology.after[node]
+            begins = self.is_connector[number] and not self.before[node]
+            ends = self.is_connector[number] and not self.after[node]
             share = min(_OUTER_LENGTH / piece.length, _OUTER_SHARE)
             first, last = share if begins else 0.0, 1.0 - share if ends else 1.0
             if begins:
-                topology.join(start, node)
-                topology.segments[start] = Part(piece, 0.0, first)
+                self.join(start, node)
+                self.segments[start] = Part(piece, 0.0, first)
             if ends:
-                topology.join(node, end)
-                topology.segments[end] = Part(piece, last, 1.0)
-            topology.segments[node] = Part(piece, first, last)
+                self.join(node, end)
+                self.segments[end] = Part(piece, last, 1.0)
+            self.segments[node] = Part(piece, first, last)
 
     def _groups(self) -> list[list[_Node]]:
         """Lanes beside each other, leftmost first."""
-        lanes = [node for node in self.topology.segments if self._is_lane(node)]
+        lanes = [node for node in self.segments if self.is_lane(node)]
         left = {}
         for node in lanes:
             beside = _Node(self.left[node.piece], node.place)
-            if beside in self.topology.segments and self._is_lane(beside):
+            if beside in self.segments and self.is_lane(beside):
                 left[node] = beside
         right = {b: a for a, b in left.items()}
         groups: list[list[_Node]] = []

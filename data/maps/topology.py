@@ -6,6 +6,7 @@ other link becomes a connector: along the nodes of an intersection between two l
 a short piece that is cut from the lane before (nuPlan rule 504).
 """
 
+from abc import ABC, abstractmethod
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -64,18 +65,22 @@ class LaneGraph(Generic[S]):
     dropped: list[S] = field(default_factory=list)  # what is part of neither
 
 
-class Topology(Generic[N, S]):
+class Topology(ABC, Generic[N, S]):
     """Nodes and their links, and the lane graph that is made of them."""
 
-    def __init__(self, is_lane: Callable[[N], bool], warnings: Counter[str]) -> None:
-        """Without nodes; `is_lane` tells lanes from nodes within intersections."""
-        self.is_lane, self.warnings = is_lane, warnings
+    def __init__(self, warnings: Counter[str]) -> None:
+        """Without nodes."""
+        self.warnings = warnings
         self.segments: dict[N, S] = {}
         self.after: dict[N, list[N]] = defaultdict(list)
         self.before: dict[N, list[N]] = defaultdict(list)
         self.graph: LaneGraph[S] = LaneGraph()
         self._first: dict[N, int] = {}  # lane that begins with a node
         self._last: list[N] = []  # last node of each lane
+
+    @abstractmethod
+    def is_lane(self, node: N) -> bool:
+        """Whether a node is a lane, and not within an intersection."""
 
     def join(self, source: N, target: N) -> None:
         """Add a link, once."""

@@ -72,11 +72,9 @@ def _bound(values: FloatArray) -> None:
 def _checked(log: Log, boxes: Boxes, flaws: Counter[str]) -> Boxes:
     """The boxes that something can touch, with positive sizes."""
     places, sizes = boxes.values[:, :2], boxes.values[:, 5:7]
+    is_nowhere = np.isnan(places).any(axis=1) | ~np.isfinite(boxes.values[:, 2])
     for bad, what in (
-        (
-            np.isnan(places).any(axis=1) | ~np.isfinite(boxes.values[:, 2]),
-            "a pose that is not finite",
-        ),
+        (is_nowhere, "a pose that is not finite"),
         (np.isinf(boxes.values[:, 3:5]).any(axis=1), "an infinite velocity"),
         (~np.isfinite(sizes).all(axis=1), "no finite length or width"),
     ):

@@ -7,12 +7,11 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from shiftsim.data.nuplan import scenarios
-from shiftsim.data.nuplan.filter import JUDGED, KEY_OF, LISTED, THINNED, ScenarioFilter, read_filter
+from shiftsim.data.nuplan.filter import KEY_OF, LISTED, THINNED, ScenarioFilter, read_filter
 from shiftsim.data.nuplan.log import Log, open_log
-from shiftsim.data.nuplan.sampling import is_taken, thin_out
+from shiftsim.data.nuplan.sampling import is_taken, judgements, thin_out
 from shiftsim.data.recording import Window
 from shiftsim.data.store.tables import MANIFEST, SCENARIOS
 from shiftsim.data.store.writing import StoreWriter
@@ -49,35 +48,19 @@ class ConversionReport:
 
 
 def convert_nuplan(
-    logs: Path,
-    maps: Path,
+    logs: Path,  # folder that holds the logs (.db) at any depth, or one log
+    maps: Path,  # folder with `nuplan-maps-v1.0.json` and the maps
     store: Path,
     *,
-    tokens: Iterable[str] | None = None,
-    types: Iterable[str] | None = None,
-    filter_file: Path | None = None,
-    mapping: scenarios.Mapping | None = None,
+    tokens: Iterable[str] | None = None,  # only these scenarios
+    types: Iterable[str] | None = None,  # only these scenario types
+    filter_file: Path | None = None,  # nuPlan's YAML, or a text file with one token per line
+    mapping: scenarios.Mapping | None = None,  # of all scenarios; nuPlan's by type where None
     progress: Progress | None = None,
 ) -> ConversionReport:
-    """Convert scenarios of nuPlan logs into a store, or add them to one.
+    """Convert scenarios of nuPlan logs into a store, as `shiftsim.convert_nuplan`.
 
-    Args:
-        logs: Folder that holds the logs (.db) at any depth, or one log.
-        maps: Folder with `nuplan-maps-v1.0.json` and the maps.
-        store: Folder of the store.
-        tokens: Only these scenarios.
-        types: Only these scenario types.
-        filter_file: nuPlan's scenario-filter YAML, or a text file with one token per line.
-        mapping: Duration [s], offset [s] and subsample ratio of all; nuPlan's by type where None.
-        progress: Called with logs done, number of logs, and the log's name.
-
-    Returns:
-        What was converted, and what failed and why. One broken scenario stops no other. Where
-        nothing was, no new store is left.
-
-    Raises:
-        DataError: There are no logs or no maps, or the store cannot be written.
-        ConfigError: The filter asks for something that is not supported.
+    One broken scenario stops no other. Where nothing was converted, no new store is left.
     """
     chosen = _choice(tokens, types, filter_file)
     every = _log_files(Path(logs))
@@ -88,7 +71,8 @@ def convert_nuplan(
         report = conversion.report
         show = progress or (lambda done, total, name: None)
         is_all = chosen == ScenarioFilter()
-        taken = _thinned(files, conversion, show) if chosen.thins_out or is_all else None
+        thins_out = (chosen.per_type, chosen.limit, chosen.min_gap_s) != (None, None, None)
+        taken = _thinned(files, conversion, show) if thins_out or is_all else None
         if is_all:
             text = "%d scenarios of %d logs will be made, one of every sweep as in nuPlan; %s"
             fewer = "--types, --tokens or --filter takes fewer"
@@ -270,13 +254,11 @@ class _Conversion:
 
     def judge(self, log: Log, window: Window, counts: Counter[str]) -> None:
         """Count a scenario for every key that judges scenarios one by one and takes it."""
-        chosen, road = self.chosen, partial(self._map, log.map_name)
-        for name in JUDGED:
-            if getattr(chosen, name) is not None:
-                others: dict[str, Any] = {other: None for other in JUDGED if other != name}
-                if not is_taken(log, window, road, replace(chosen, **others)):
-                    return
-                counts[name] += 1
+        road = partial(self._map, log.map_name)
+        for name, is_good in judgements(log, window, road, self.chosen):
+            if not is_good:
+                return
+            counts[name] += 1
 
     def _is_stored(self, window: Window) -> bool:
         if window.token not in self.writer.tokens:

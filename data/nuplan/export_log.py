@@ -79,10 +79,7 @@ def cut_of(scenario: Scenario) -> tuple[int, Mapping]:
     """Row that carries token and tag, and the mapping that cuts the scenario out again from it.
 
     The mapping is the scenario's own, unless that does not give its iterations, or would not if
-    the recording went on.
-
-    Raises:
-        ConversionError: Its iterations are not evenly spaced rows.
+    the recording went on. Raises ConversionError: the iterations are not evenly spaced rows.
     """
     time, rows = scenario.time_us, scenario.iteration_rows
     span = int(time[rows[-1]] - time[rows[0]]) / 1e6

@@ -1,6 +1,6 @@
 """VectorMap -> nuPlan's map.gpkg."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import count
 from pathlib import Path
 
@@ -122,20 +122,18 @@ class _Writer:
             self._connector(edge) if road.is_connector(edge) else self._lane(edge)
         for block in range(len(road.blocks)):
             self._block(block)
-        for fid, shape, at in self._areas(road.intersections):
-            kind = int(road.intersection_kinds[at])
-            self._add("intersections", fid, shape, intersection_type_fid=kind)
-        governed: dict[int, list[str]] = {}
+        kinds: list[int] = road.intersection_kinds.tolist()
+        self._add_areas("intersections", road.intersections, intersection_type_fid=kinds)
+        governed: list[list[str]] = [[] for _ in road.stop_polygons.ids]
         for edge, name in enumerate(road.edges.ids):
             for stop in road.stop_lines.at(edge).tolist():
-                governed.setdefault(stop, []).append(name)
-        for fid, shape, at in self._areas(road.stop_polygons):
-            kind, owners = int(road.stop_kinds[at]), ",".join(governed.get(at, []))
-            values: dict[str, Value] = {
-                "stop_polygon_type_fid": kind,
-                "lane_connector_fids": owners,
-            }
-            self._add("stop_polygons", fid, shape, **values)
+                governed[stop].append(name)
+        self._add_areas(
+            "stop_polygons",
+            road.stop_polygons,
+            stop_polygon_type_fid=road.stop_kinds.tolist(),
+            lane_connector_fids=list(map(",".join, governed)),
+        )
         self._add_areas("crosswalks", road.crosswalks)
         self._add_areas("walkways", road.walkways)
         self._add_areas("carpark_areas", road.car_parks)
@@ -260,20 +258,17 @@ class _Writer:
             to_lane_group_fid=_at(self.blocks, *ends[1]),
         )
 
-    def _areas(
-        self, layer: Layer, keep: Iterable[int] | None = None
-    ) -> Iterator[tuple[int, shapely.Geometry, int]]:
-        """Id, shape and first position; pieces of one id are one row."""
+    def _add_areas(
+        self, name: str, layer: Layer, keep: Iterable[int] | None = None, **columns: Sequence[Value]
+    ) -> None:
+        """Add areas, with values by their position in the layer; pieces of one id are one row."""
         pieces: dict[int, list[int]] = {}
         for at in range(len(layer)) if keep is None else keep:
             pieces.setdefault(self._fid(layer.ids[at]), []).append(at)
         for fid, places in pieces.items():
             shapes = [layer.shape(at) for at in places]
-            yield fid, shapes[0] if len(shapes) == 1 else shapely.MultiPolygon(shapes), places[0]
-
-    def _add_areas(self, name: str, layer: Layer, keep: Iterable[int] | None = None) -> None:
-        for fid, shape, _ in self._areas(layer, keep):
-            self._add(name, fid, shape)
+            shape = shapes[0] if len(shapes) == 1 else shapely.MultiPolygon(shapes)
+            self._add(name, fid, shape, **{key: v[places[0]] for key, v in columns.items()})
 
     def _drivable(self) -> None:
         """What is drivable besides intersections and car parks, which count as such."""

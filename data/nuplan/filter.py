@@ -38,11 +38,6 @@ class ScenarioFilter:
     shuffle: bool = False  # whether nuPlan draws at random where it leaves out
     source: str = ""  # the file
 
-    @property
-    def thins_out(self) -> bool:
-        """Whether what is taken depends on all scenarios that the logs offer."""
-        return not (self.per_type is self.limit is self.min_gap_s is None)
-
 
 def read_filter(path: Path) -> ScenarioFilter:
     """Read a scenario filter (.yaml, .yml) or a list of tokens, one per line (any other ending).
@@ -102,10 +97,6 @@ def _token_list(path: Path, values: Mapping[str, Any], key: str) -> frozenset[st
     return None if tokens is None else _tokens(path, tokens)
 
 
-def _flag(path: Path, values: Mapping[str, Any], key: str) -> bool:
-    return values.get(key) is True
-
-
 def _number(path: Path, values: Mapping[str, Any], key: str) -> float | None:
     value = values.get(key)
     if value is None or (type(value) in (int, float) and np.isfinite(value)):
@@ -157,7 +148,10 @@ _KEYS: dict[str, tuple[str, Callable[[Path, Mapping[str, Any], str], Any]]] = {
     "scenario_types": ("types", _names),
     "log_names": ("logs", _names),
     "map_names": ("maps", _names),
-    "remove_invalid_goals": ("remove_invalid_goals", _flag),
+    "remove_invalid_goals": (
+        "remove_invalid_goals",
+        lambda _, values, key: values.get(key) is True,
+    ),
     "num_scenarios_per_type": ("per_type", _count),
     "limit_total_scenarios": ("limit", _count),
     "timestamp_threshold_s": ("min_gap_s", _number),
@@ -167,12 +161,11 @@ _KEYS: dict[str, tuple[str, Callable[[Path, Mapping[str, Any], str], Any]]] = {
     "speed_noise_tolerance": ("speed_noise", _number),
     "fraction_in_token_set_threshold": ("min_share", _number),
     "ego_route_radius": ("route_radius", _number),
-    "shuffle": ("shuffle", _flag),
+    "shuffle": ("shuffle", lambda _, values, key: values.get(key) is True),
 }
-# fields in the order in which scenarios are left out: by lists, all together, one by one
+# fields in the order in which scenarios are left out: by lists, all together; then one by one
 LISTED = ("logs", "maps", "tokens", "types", "remove_invalid_goals")
 THINNED = ("per_type", "limit", "min_gap_s")
-JUDGED = ("min_way", "start_speed", "stop_speed", "min_share", "route_radius")
 KEY_OF = {field: key for key, (field, _) in _KEYS.items()}  # key of a field
 
 
@@ -197,11 +190,7 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # Any to the checker
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping in a YAML file of nuPlan's world: sixteen digits are a token, no key is twice.
-
-    Raises:
-        ConfigError: It cannot be read, or is something else.
-    """
+    """The mapping in a YAML file of nuPlan, or a ConfigError; sixteen digits are a token."""
     try:
         values = yaml.load(_read_text(path), _Loader)
     except yaml.MarkedYAMLError as error:

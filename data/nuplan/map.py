@@ -28,10 +28,7 @@ _DRIVABLE_LAYERS = ("road_segments", "intersections", "generic_drivable_areas", 
 def read_map(path: Path, name: str) -> VectorMap:
     """Read a nuPlan map from `map.gpkg`; it is in metres.
 
-    Flaws that nuPlan tolerates are counted in its `flaws`.
-
-    Raises:
-        DataError: The file, a layer or a column is missing or broken.
+    Flaws that nuPlan tolerates are counted in its `flaws`; others are a DataError.
     """
     with open_database(Path(path)) as database:
         try:

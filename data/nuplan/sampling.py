@@ -4,7 +4,7 @@ First lists are thinned out, of all logs at once; then every scenario is judged 
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -88,24 +88,28 @@ def is_taken(
     log: Log, window: Window, road: Callable[[], VectorMap], chosen: ScenarioFilter
 ) -> bool:
     """Whether a filter takes one scenario of a log, by how its ego drives and where."""
-    if (chosen.min_way, chosen.start_speed, chosen.stop_speed) != (None, None, None):
-        if not _drives(_future(log, window), chosen):
-            return False
-    if not _is_among(log, window, chosen):
-        return False
-    return chosen.route_radius is None or _has_route(log, window, road(), chosen.route_radius)
+    return all(is_good for _, is_good in judgements(log, window, road, chosen))
 
 
-def _drives(states: FloatArray, chosen: ScenarioFilter) -> bool:
-    """Whether an ego with states (K, 11) goes far enough, starts and stops as asked for."""
+def judgements(
+    log: Log, window: Window, road: Callable[[], VectorMap], chosen: ScenarioFilter
+) -> Iterator[tuple[str, bool]]:
+    """Fields of a filter that judge scenarios one by one, and whether each takes this one."""
+    start, stop, noise = chosen.start_speed, chosen.stop_speed, chosen.speed_noise
+    if (chosen.min_way, start, stop) != (None, None, None):
+        states = _future(log, window)
+        speeds = np.hypot(states[:, VX], states[:, VY])
     if chosen.min_way is not None:
         steps = np.diff(center_poses(states[1:, :3])[:, :2], axis=0)
-        if np.sum(np.linalg.norm(steps, axis=1)) < chosen.min_way:
-            return False
-    speeds = np.hypot(states[:, VX], states[:, VY])
-    start, stop, noise = chosen.start_speed, chosen.stop_speed, chosen.speed_noise
-    starts = start is None or _crosses(speeds, start, noise)[0]
-    return starts and (stop is None or _crosses(speeds, stop, noise)[1])
+        yield "min_way", not np.sum(np.linalg.norm(steps, axis=1)) < chosen.min_way
+    if start is not None:
+        yield "start_speed", _crosses(speeds, start, noise)[0]
+    if stop is not None:
+        yield "stop_speed", _crosses(speeds, stop, noise)[1]
+    if chosen.min_share is not None:
+        yield "min_share", _is_among(log, window, chosen.token_set, chosen.min_share)
+    if chosen.route_radius is not None:
+        yield "route_radius", _has_route(log, window, road(), chosen.route_radius)
 
 
 def _future(log: Log, window: Window) -> FloatArray:
@@ -142,14 +146,12 @@ def _crosses(speeds: FloatArray, threshold: float, noise: float) -> tuple[bool, 
     return rises, falls
 
 
-def _is_among(log: Log, window: Window, chosen: ScenarioFilter) -> bool:
-    """Whether enough rows of the iterations are in a given set."""
-    if chosen.token_set is None or chosen.min_share is None:
-        return True
+def _is_among(log: Log, window: Window, tokens: frozenset[str] | None, share: float) -> bool:
+    """Whether enough rows of the iterations are in a set, if it is given."""
     own = {log.tokens[row] for row in window.iteration_rows.tolist()}
-    if chosen.min_share == 1.0:  # nuPlan rule 434
-        return own == chosen.token_set
-    return len(own & chosen.token_set) / len(own) > chosen.min_share
+    if tokens is None or share == 1.0:  # nuPlan rule 434
+        return tokens is None or own == tokens
+    return len(own & tokens) / len(own) > share
 
 
 def _has_route(log: Log, window: Window, road: VectorMap, radius: float) -> bool:

@@ -51,43 +51,28 @@ def by_share_of_speed(
 def make_samples(
     name: str,
     *,
-    time_us: IntArray,
-    ids: Any,
-    category: IntArray,
-    categories: Sequence[str] = tuple(KIND_NAMES),
-    xy: FloatArray,
-    headings: FloatArray | None = None,
+    time_us: IntArray,  # (A,) time stamps [us]
+    ids: Any,  # (A,) integers or texts that name the objects
+    category: IntArray,  # (A,) index into `categories`
+    categories: Sequence[str] = tuple(KIND_NAMES),  # by default `category` holds AgentKind codes
+    xy: FloatArray,  # (A, 2) box centre [m]
+    headings: FloatArray | None = None,  # (A,) [rad]; that of motion where not given, or NaN
+    # (A, 2) in the frame of `xy` [m/s], NaN where unknown; derived from the positions where they
+    # are not given, and for tracks where they contradict the positions
     velocities: FloatArray | None = None,
+    # (A, 2 or 3) length, width, height [m], of which a track gets the median; the usual size of a
+    # kind (`SIZES`) where it is not given, NaN or 0
     sizes: FloatArray | None = None,
-    kind_of: Mapping[str, AgentKind] = CATEGORIES | KIND_NAMES,
-    frames: Frames | None = None,
-    velocity_rule: VelocityRule = by_share_of_speed,
-    where: str = "",
-    remedy: str = "map it to one of",
+    kind_of: Mapping[str, AgentKind] = CATEGORIES | KIND_NAMES,  # by name of a category
+    frames: Frames | None = None,  # those of the rows; by default those at which there is one
+    velocity_rule: VelocityRule = by_share_of_speed,  # which velocities are believed
+    where: str = "",  # the file, for messages; the name of the recording by default
+    remedy: str = "map it to one of",  # of an unknown category, before the list of those known
 ) -> TrackSamples:
     """A recording from its columns. A rows, one per object and time, in any order.
 
-    Args:
-        name: Name of the recording.
-        time_us: (A,) time stamps [us].
-        ids: (A,) integers or texts that name the objects.
-        category: (A,) index into `categories`.
-        categories: Names of categories; by default `category` holds AgentKind codes.
-        xy: (A, 2) box centre [m].
-        headings: (A,) [rad]; the direction of motion where it is not given, or NaN.
-        velocities: (A, 2) in the frame of `xy` [m/s], NaN where unknown. Derived from the positions
-            where they are not given, and for tracks where they contradict the positions.
-        sizes: (A, 2 or 3) length, width, height [m]; the usual size of a kind (`SIZES`) where it is
-            not given, NaN or 0. A track gets the median.
-        kind_of: AgentKind by name of a category.
-        frames: The frames that the rows belong to; those at which there is a row by default.
-        velocity_rule: Which velocities are believed.
-        where: The file, for messages; the name of the recording by default.
-        remedy: What to do about an unknown category, before the list of those known.
-
-    Raises:
-        ConversionError: A value is not finite, a category is unknown, or an object has two rows at
-            one time. Nothing is seen for an hour, or the rows span more than a day.
+    Raises ConversionError: a value is not finite, a category is unknown, an object has two rows at
+    one time, nothing is seen for an hour, or the rows span more than a day.
     """
     where, warnings = where or name, Counter[str]()
     headings = np.full(len(xy), np.nan) if headings is None else headings

@@ -96,38 +96,32 @@ COLORS = {  # by colour; others are unknown
 # --- py123d
 
 
-def _codes(count: int, **groups: str) -> dict[int, AgentKind]:
+def _codes(count: int, text: str) -> dict[int, AgentKind]:
+    """Kind of every label; those that the text does not name are generic objects."""
     out = dict.fromkeys(range(count), AgentKind.GENERIC_OBJECT)
-    for kind, codes in groups.items():
-        out |= dict.fromkeys(map(int, codes.split()), AgentKind[kind.upper()])
+    for kind, *codes in map(str.split, text.split(";")):
+        out |= dict.fromkeys(map(int, codes), AgentKind[kind.upper()])
     return out
 
 
-# by class of labels: kind of every label
-LABELS = {
+LABELS = {  # by class of labels
     "DefaultBoxDetectionLabel": _codes(
-        12, vehicle="0 1 2", bicycle="3", pedestrian="4", traffic_cone="7", barrier="9"
+        12, "vehicle 0 1 2; bicycle 3; pedestrian 4; traffic_cone 7; barrier 9"
     ),
-    "WODMotionBoxDetectionLabel": _codes(5, vehicle="1", pedestrian="2", bicycle="3"),
-    "WODPerceptionBoxDetectionLabel": _codes(5, vehicle="1", pedestrian="2", bicycle="4"),
+    "WODMotionBoxDetectionLabel": _codes(5, "vehicle 1; pedestrian 2; bicycle 3"),
+    "WODPerceptionBoxDetectionLabel": _codes(5, "vehicle 1; pedestrian 2; bicycle 4"),
     "NuScenesBoxDetectionLabel": _codes(
         23,
-        vehicle="0 1 2 3 4 5 6 7",
-        bicycle="8 9",
-        pedestrian="10 11 12 13 14 15 16",
-        traffic_cone="17",
-        barrier="18",
+        "vehicle 0 1 2 3 4 5 6 7; bicycle 8 9; pedestrian 10 11 12 13 14 15 16; traffic_cone 17;"
+        "barrier 18",
     ),
     "AV2SensorBoxDetectionLabel": _codes(
         30,
-        vehicle="1 5 6 10 17 18 19 24 25 26",
-        bicycle="3 14 29",
-        pedestrian="15 16 22 27",
-        traffic_cone="7 8",
-        czone_sign="12",
+        "vehicle 1 5 6 10 17 18 19 24 25 26; bicycle 3 14 29; pedestrian 15 16 22 27;"
+        "traffic_cone 7 8; czone_sign 12",
     ),
     "NuPlanBoxDetectionLabel": _codes(
-        7, vehicle="0", bicycle="1", pedestrian="2", traffic_cone="3", barrier="4", czone_sign="5"
+        7, "vehicle 0; bicycle 1; pedestrian 2; traffic_cone 3; barrier 4; czone_sign 5"
     ),
 }
 LIGHTS = dict(enumerate((LightStatus.GREEN, LightStatus.YELLOW, LightStatus.RED)))

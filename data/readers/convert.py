@@ -86,22 +86,14 @@ def convert(
     reader: Reader,
     store: Path,
     *,
-    progress: Progress | None = None,
-    executor: Executor = serial_map,
+    progress: Progress | None = None,  # gets recordings done, recordings in all, and a name
+    executor: Executor = serial_map,  # how recordings are spread over processes
 ) -> ConversionReport:
     """Convert all recordings of a source to scenarios in a store.
 
     A recording that is broken is skipped and named; what was converted before from the same files
-    with the same settings is kept, also from a conversion that was killed.
-
-    Args:
-        reader: The source.
-        store: The store, made or extended.
-        progress: Called with recordings done, recordings in all and the name of the last one.
-        executor: How recordings are spread over processes; one by one in this process by default.
-
-    Raises:
-        ConversionError: None of the recordings can be converted, or they contradict their map.
+    with the same settings is kept, also from a conversion that was killed. It is a ConversionError
+    if none of the recordings can be converted, or they contradict their map.
     """
     names = reader.recordings()
     show = progress or (lambda done, total, name: None)

@@ -151,11 +151,8 @@ class SourceFile:
     def expect(self, value: Any, form: Any, place: str) -> None:
         """Raise an error unless what JSON or msgpack holds has a form.
 
-        Args:
-            value: What it holds.
-            form: A type; `[form]`: a list of such; `{name: form}`: a map with at least these names;
-                `{str: form}`: a map with any names; `(form,)`: such, or nothing.
-            place: Where it is, for the message.
+        A form is a type; `[form]`: a list of such; `{name: form}`: a map with at least these names;
+        `{str: form}`: a map with any names; `(form,)`: such, or nothing.
         """
         if value is None and isinstance(form, tuple):
             return

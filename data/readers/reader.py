@@ -12,7 +12,6 @@ from shiftsim.data.maps.opendrive.map import build_road_map, require_lanes
 from shiftsim.data.maps.opendrive.records import OpenDrive
 from shiftsim.data.readers.samples import TrackSamples
 from shiftsim.data.readers.windows import ConversionConfig, Span
-from shiftsim.world.map import VectorMap
 
 
 @dataclass(frozen=True)
@@ -65,9 +64,4 @@ def opendrive_site(drive: OpenDrive, *, name: str, **how: Any) -> BuiltMap:
     """The map of a site from OpenDRIVE, as `build_road_map`; else a ConversionError."""
     road, report = build_road_map(drive, name=name, **how)
     require_lanes(drive, report)
-    return site_map(road, report.warnings)
-
-
-def site_map(road: VectorMap, warnings: Mapping[str, int]) -> BuiltMap:
-    """The map that all recordings of a site share; none of its connectors has a known light."""
-    return BuiltMap(road, dict(warnings), {}, {})
+    return BuiltMap(road, report.warnings)  # none of its connectors has a known light

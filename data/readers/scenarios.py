@@ -16,10 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from shiftsim.data.maps.builder import BuiltMap
 from shiftsim.data.maps.lights import light_rows
 from shiftsim.data.readers import windows
 from shiftsim.data.readers.placement import extent_of
-from shiftsim.data.readers.reader import SourceRecording, site_map
+from shiftsim.data.readers.reader import SourceRecording
 from shiftsim.data.readers.routes import find_route, starts_on_lane
 from shiftsim.data.readers.samples import (
     ROW_S,
@@ -75,7 +76,7 @@ def make_scenarios(samples: TrackSamples, road: VectorMap, **how: Any) -> Conver
     Raises:
         ConfigError: No object has the id of an ego.
     """
-    return convert_recording(SourceRecording(samples, site_map(road, {}), **how))
+    return convert_recording(SourceRecording(samples, BuiltMap(road, {}), **how))
 
 
 def convert_recording(source: SourceRecording) -> Converted:

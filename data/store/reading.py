@@ -118,11 +118,7 @@ class ScenarioStore:
         return self._table.drop_columns(["iteration_rows"])
 
     def window(self, token: str) -> Window:
-        """The window of a scenario.
-
-        Raises:
-            DataError: The store has no such scenario.
-        """
+        """The window of a scenario; a DataError where the store has none of that token."""
         if token not in self._row_of:
             what = f"store {self.path.name!r} has no scenario {token!r}"
             raise DataError(what, "its `tokens` are the scenarios it has")

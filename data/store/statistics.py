@@ -98,9 +98,6 @@ def store_stats(
     """Statistics of some scenarios of a store, or of all where `tokens` is None.
 
     `progress` is called with scenarios done, scenarios in all, and a token.
-
-    Raises:
-        DataError: The store is damaged.
     """
     chosen = store.tokens if tokens is None else tuple(tokens)
     rows, cities, types = dict[str, ScenarioStats](), dict[str, str](), dict[str, str]()

@@ -61,7 +61,7 @@ class LearnedPlanner(ABC, Generic[Features, Output]):
         """What the network reads."""
 
     @abstractmethod
-    def infer(self, features: Sequence[Features]) -> Sequence[Output]:
+    def infer(self, scenes: Sequence[Features]) -> Sequence[Output]:
         """One forward pass over a batch; the outputs in the same order."""
 
     @abstractmethod

@@ -71,11 +71,9 @@ def load_network(spec: str, planner: str, *, device: str = "cpu") -> Any:
 def load_weights(spec: str, planner: str, *, device: str = "cpu") -> Weights:
     """Weights of a planner's network, strictly all and nothing else.
 
-    Args:
-        spec: A file, a folder that holds one, a name in the folder of checkpoints, or one of
-            `DETERMINISTIC`; `official`, `shiftsim`, or empty for the first of these two.
-        planner: Name of the planner.
-        device: Where the tensors go, as in `resolve_device`. Torch is set up for inference there.
+    `spec` is a file, a folder that holds one, a name in the folder of checkpoints, or one of
+    `DETERMINISTIC`; `official`, `shiftsim`, or empty for the first of these two. The tensors go to
+    the `device`, as in `resolve_device`, where torch is set up for inference.
 
     Raises:
         CheckpointError: There is no such file, it is damaged, or it is of another network.

@@ -66,7 +66,7 @@ def _apply_tables(scenario: Scenario, edit: spec.Edit) -> Scenario:
         _remove(builder, remove)
     _change_motion(builder)
     if edit.reroute:
-        reroute(builder, edit.reroute, ends=edit.ends_at_goal)
+        reroute(builder, edit.reroute, ends=edit.end_at_goal is not False)
     if speed and speed.ego_mps is not None:
         builder.set_ego_speed(speed.ego_mps)
     if edit.density:

@@ -19,7 +19,7 @@ from shiftsim.edits.spec import LEVELS, Density
 from shiftsim.errors import ConfigError
 from shiftsim.kernels import FloatArray
 from shiftsim.world.events import FOLLOW
-from shiftsim.world.lanes import find_start, initial_curvature, poses_on_line
+from shiftsim.world.lanes import find_start, initial_curvature, poses_at
 from shiftsim.world.layers import Lists
 from shiftsim.world.map import VectorMap
 
@@ -112,7 +112,7 @@ def draw_slots(
                 found_at.append(along)
                 found_speeds.append(speed)
         points = shapely.line_interpolate_point(line, found_at)
-        out += map(Slot, poses_on_line(line, points), found_speeds)
+        out += map(Slot, poses_at(line, shapely.line_locate_point(line, points)), found_speeds)
     return out, ego_speed
 
 

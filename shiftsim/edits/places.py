@@ -47,14 +47,10 @@ def ego_path(scenario: Scenario) -> EgoPath:
         ahead = np.stack([here, here + _SPACING * np.array([np.cos(heading), np.sin(heading)])])
     ahead = np.concatenate([ahead, _lanes_ahead(scenario, ahead)])
     past = _spaced(centers[now::-1, :2])[:0:-1]
-    first = past[0] if len(past) else here
-    turn = (
-        np.arctan2(*(ahead[1] - here)[::-1])
-        if len(past) == 0
-        else np.arctan2(*((past[1] if len(past) > 1 else here) - past[0])[::-1])
-    )
-    start = first - _BEHIND * np.array([np.cos(turn), np.sin(turn)])
-    xy = np.concatenate([start[None], past, ahead])
+    whole = np.concatenate([past, ahead])
+    turn = np.arctan2(*(whole[1] - whole[0])[::-1])
+    start = whole[0] - _BEHIND * np.array([np.cos(turn), np.sin(turn)])
+    xy = np.concatenate([start[None], whole])
     steps = np.hypot(*np.diff(xy, axis=0).T)
     progress = np.concatenate([[0.0], np.cumsum(steps)])
     return EgoPath(xy, progress - progress[1 + len(past)])

@@ -199,11 +199,6 @@ class Edit:
         """What the new scenario depends on, beside the recorded one."""
         return digest_of(asdict(self))
 
-    @property
-    def ends_at_goal(self) -> bool:
-        """Whether a rollout ends where the goal is reached."""
-        return self.reroute is not None if self.end_at_goal is None else self.end_at_goal
-
     @cached_property
     def words(self) -> tuple[str, ...]:
         """What is edited, one line each."""
@@ -281,10 +276,8 @@ def _contradictions(edit: Edit) -> Iterator[tuple[str, str]]:
     ]
     for name, place in places:
         if (place.at is None) == (place.pose is None):
-            yield (
-                f", {name}: give either pose or a place by the recorded path",
-                "pose = [x, y, heading], or at = {ahead_m = 30, left_m = -2}",
-            )
+            what = f", {name}: give either pose or a place by the recorded path"
+            yield what, "pose = [x, y, heading], or at = {ahead_m = 30, left_m = -2}"
     if density := edit.density:
         if bool(density.level) == bool(density.gap_m):
             yield ", density: give either level or gap_m", ""

@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import shapely
 
 from shiftsim.errors import MapError
 from shiftsim.kernels import FloatArray, IntArray
-from shiftsim.world.layers import Layer, make_layer, make_lists, make_polylines
+from shiftsim.world.layers import Layer, Lists, make_layer, make_lists, make_polylines
 from shiftsim.world.map import LAYERS, NONE, VectorMap
 
 
@@ -62,24 +63,15 @@ class AreaSpec:
 def build_map(
     name: str,
     *,
-    edges: Sequence[EdgeSpec],
-    blocks: Sequence[BlockSpec],
-    epsg: int = 0,
-    **areas: Sequence[AreaSpec],
+    edges: Sequence[EdgeSpec],  # lanes and connectors; the order within each kind is kept
+    blocks: Sequence[BlockSpec],  # roadblocks and their connectors, likewise
+    epsg: int = 0,  # code of the metric coordinate system; 0 for a local frame
+    **areas: Sequence[AreaSpec],  # by name of another layer of the map
 ) -> VectorMap:
     """A map from its parts. References to unknown ids are left out and counted in `flaws`.
 
-    Args:
-        name: Map (city) name.
-        edges: Lanes and lane connectors; the order within each kind is kept.
-        blocks: Roadblocks and roadblock connectors; the order within each kind is kept.
-        epsg: Code of the metric coordinate system; 0 for a local frame.
-        areas: By name of another layer of the map: `intersections` and `stop_polygons`, whose
-            `kind` is their type, `crosswalks`, `walkways`, `car_parks`, and `drivable_areas`, all
-            polygons whose union is drivable.
-
-    Raises:
-        MapError: An id occurs twice, or a baseline has fewer than two vertices.
+    The `kind` of `intersections` and `stop_polygons` is their type, `drivable_areas` are polygons
+    whose union is drivable. It is a MapError if an id occurs twice, or a baseline is too short.
     """
     edges = sorted(edges, key=lambda spec: spec.is_connector)
     blocks = sorted(blocks, key=lambda spec: spec.is_connector)
@@ -98,13 +90,8 @@ def build_map(
             flaws[flaw] = flaws.get(flaw, 0) + missing
         return [index[i] for i in ids if i is not None and i in index]
 
-    def to_edges(attribute: str) -> list[list[int]]:
-        flaw = "edge names an unknown edge"
-        return [known(edge_index, getattr(s, attribute), flaw) for s in edges]
-
-    def to_blocks(attribute: str) -> list[list[int]]:
-        flaw = "roadblock names an unknown one"
-        return [known(block_index, getattr(s, attribute), flaw) for s in blocks]
+    def lists(specs: Sequence[Any], attribute: str, index: dict[str, int], flaw: str) -> Lists:
+        return make_lists(known(index, getattr(spec, attribute), flaw) for spec in specs)
 
     def to_one(index: dict[str, int], attribute: str, what: str) -> IntArray:
         flaw = f"edge names an unknown {what}"
@@ -135,21 +122,19 @@ def build_map(
         lane_index=np.array(positions, np.int64),
         left_lane=to_one(edge_index, "left_lane", "edge"),
         right_lane=to_one(edge_index, "right_lane", "edge"),
-        incoming=make_lists(to_edges("incoming")),
-        outgoing=make_lists(to_edges("outgoing")),
+        incoming=lists(edges, "incoming", edge_index, "edge names an unknown edge"),
+        outgoing=lists(edges, "outgoing", edge_index, "edge names an unknown edge"),
         block_of=block_of,
         has_traffic_lights=np.array([s.has_traffic_lights for s in edges], np.bool_),
-        stop_lines=make_lists(
-            known(stop_index, s.stop_lines, "edge names an unknown stop line") for s in edges
-        ),
+        stop_lines=lists(edges, "stop_lines", stop_index, "edge names an unknown stop line"),
         intersection_of=to_one(intersection_index, "intersection_id", "intersection"),
         turn_type=np.array([s.turn_type for s in edges], np.int64),
         is_bike=np.array([s.is_bike for s in edges], np.bool_),
         blocks=_layer(blocks),
         num_roadblocks=sum(not s.is_connector for s in blocks),
         block_edges=make_lists(members),
-        block_incoming=make_lists(to_blocks("incoming")),
-        block_outgoing=make_lists(to_blocks("outgoing")),
+        block_incoming=lists(blocks, "incoming", block_index, "roadblock names an unknown one"),
+        block_outgoing=lists(blocks, "outgoing", block_index, "roadblock names an unknown one"),
         intersection_kinds=np.array([s.kind for s in others["intersections"]], np.int64),
         stop_kinds=np.array([s.kind for s in others["stop_polygons"]], np.int64),
         flaws=flaws,

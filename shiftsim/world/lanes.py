@@ -46,7 +46,7 @@ def find_starts(map: VectorMap, poses: FloatArray) -> list[Start | None]:
     owners = [index for index, choice in enumerate(edges) for _ in choice]
     points = shapely.points(poses[np.array(owners, np.int64), :2])
     progress = shapely.line_locate_point(beside, points)
-    starts = iter(zip(progress.tolist(), _poses_at(beside, progress), strict=True))
+    starts = iter(zip(progress.tolist(), poses_at(beside, progress), strict=True))
     return [
         _nearest([Start(edge, *next(starts)) for edge in choice], pose) if choice else None
         for choice, pose in zip(edges, poses, strict=True)
@@ -73,15 +73,10 @@ def start_on(map: VectorMap, edge: int, x: float, y: float) -> Start:
 def pose_on_line(line: shapely.LineString, x: float, y: float) -> tuple[float, FloatArray]:
     """Arc length of the projection of a point on a line [m], and the pose (3,) there."""
     progress = shapely.line_locate_point(line, [shapely.Point(x, y)])
-    return float(progress[0]), _poses_at(line, progress)[0]
+    return float(progress[0]), poses_at(line, progress)[0]
 
 
-def poses_on_line(line: shapely.LineString, points: np.ndarray) -> FloatArray:
-    """As `pose_on_line`, the poses (N, 3) of N shapely points."""
-    return _poses_at(line, shapely.line_locate_point(line, points))
-
-
-def _poses_at(lines: Any, progress: FloatArray) -> FloatArray:
+def poses_at(lines: Any, progress: FloatArray) -> FloatArray:
     """(N, 3) poses at arc lengths (N,) of lines; the heading is that to a point ahead."""
     lines = np.broadcast_to(np.asarray(lines, object), progress.shape)
     here, ahead = (

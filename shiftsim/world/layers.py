@@ -111,8 +111,7 @@ def make_polygons(polygons: Sequence[Sequence[FloatArray]]) -> Polygons:
 def index_polygons(xy: FloatArray, ring_ptr: IntArray, poly_ptr: IntArray) -> Polygons:
     """Add bounds and the grid to flat polygons (arrays as in `Polygons`).
 
-    Raises:
-        ValueError: Polygons are so many and so large that the grid would fill the memory.
+    Raises ValueError: they are so many and so large that the grid would fill the memory.
     """
     count = len(poly_ptr) - 1
     bounds = np.empty((count, 4))

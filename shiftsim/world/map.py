@@ -87,11 +87,7 @@ class VectorMap:
         )
 
     def edge(self, edge_id: str) -> int:
-        """Index of a lane or lane connector.
-
-        Raises:
-            MapError: There is none of that id.
-        """
+        """Index of a lane or lane connector; a MapError where there is none of that id."""
         try:
             return self.edges.index[edge_id]
         except KeyError:

@@ -43,24 +43,15 @@ Table: TypeAlias = Mapping[str, Range]
 
 
 def require(
-    ranges: Table,
+    ranges: Table,  # of the format
     field: str,
-    values: Any,
-    where: str,
+    values: Any,  # one number, or an array of them
+    where: str,  # file and element, for the message
     *,
     error: type[ShiftsimError] = DataError,
-    may_be_nan: bool = False,
+    may_be_nan: bool = False,  # whether NaN stands for a missing value
 ) -> None:
-    """Raise an error that names the first value outside the range of its field, and the place.
-
-    Args:
-        ranges: Table of the format.
-        field: Field of the table.
-        values: One number, or an array of them.
-        where: File and element, for the message.
-        error: Class of the error.
-        may_be_nan: Whether NaN stands for a missing value.
-    """
+    """Raise an error that names the first value outside the range of its field, and the place."""
     allowed = ranges[field]
     array = np.atleast_1d(values)
     if array.dtype == object:  # an integer of any size

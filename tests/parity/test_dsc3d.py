@@ -21,6 +21,7 @@ from parity_cases import (
     read_file,
 )
 
+from shiftsim.data.maps.builder import BuiltMap
 from shiftsim.data.maps.opendrive.graph import LaneSegment
 from shiftsim.data.maps.opendrive.lanes import LaneKey
 from shiftsim.data.maps.opendrive.map import build_road_map
@@ -33,7 +34,7 @@ from shiftsim.data.readers.annotations import (
     rotation_angles,
 )
 from shiftsim.data.readers.dsc3d import find_map, open_site
-from shiftsim.data.readers.reader import SourceRecording, site_map
+from shiftsim.data.readers.reader import SourceRecording
 from shiftsim.data.readers.samples import (
     ROW_S,
     TrackSamples,
@@ -242,7 +243,7 @@ def compare_scripted(folder: Path, maps: Path, cases: Cases) -> None:
         lanes = Lanes(found, site)
         spans = window_spans(recording.duration, CONFIG)
         placed = replace(recording, offset=lanes.offset)
-        source = SourceRecording(placed, site_map(lanes.road, {}), config=CONFIG, spans=spans)
+        source = SourceRecording(placed, BuiltMap(lanes.road, {}), config=CONFIG, spans=spans)
         converted = convert_recording(source)
         compare_converted(folder, converted, lanes, lanes_from, cases)
     else:

@@ -82,43 +82,40 @@ def build_lane_graph(od: OpenDrive, warnings: Counter[str]) -> Graph:
     return _Builder(od, warnings).build()
 
 
-class _Builder:
+class _Builder(Topology[LaneKey, LaneSegment]):
     def __init__(self, od: OpenDrive, warnings: Counter[str]) -> None:
+        super().__init__(warnings)
         self.od = od
-        self.warnings = warnings
-        self.topology: Topology[LaneKey, LaneSegment] = Topology(self._is_lane, warnings)
-        self.nodes = self.topology.segments
-        self.after, self.before = self.topology.after, self.topology.before
         # first and last cross-section of a lane, from its left to its right border
         self.ends: dict[LaneKey, tuple[FloatArray, FloatArray]] = {}
 
     def build(self) -> Graph:
         narrow = self._collect_nodes()
         for source, target in lane_links(self.od, self.warnings, repair=True):
-            if source in self.nodes and target in self.nodes:
-                self.topology.join(source, target)
+            if source in self.segments and target in self.segments:
+                self.join(source, target)
         self._infer_links()
         self._infer_road_links()
         for key in sorted(narrow):
             self._link_through(key)
-        self.topology.drop_wide_gaps(self.ends.__getitem__, SNAP_GAP)
+        self.drop_wide_gaps(self.ends.__getitem__, SNAP_GAP)
         for links in self.after.values():
             links.sort()
-        self.topology.build_lanes(self._groups())
-        self.topology.cut_connectors()
+        self.build_lanes(self._groups())
+        self.cut_connectors()
         what = "connector without both ends, dropped"
-        self.topology.build_connectors(_MAX_CHAIN, self._junctions, what)
-        return self.topology.graph
+        self.build_connectors(_MAX_CHAIN, self._junctions, what)
+        return self.graph
 
-    def _is_lane(self, key: LaneKey) -> bool:
-        return self.od.roads[key.road].junction is None
+    def is_lane(self, node: LaneKey) -> bool:
+        return self.od.roads[node.road].junction is None
 
     def _junctions(self, keys: Sequence[LaneKey]) -> frozenset[str]:
         found = (self.od.roads[key.road].junction for key in keys)
         return frozenset(junction for junction in found if junction is not None)
 
     def _collect_nodes(self) -> list[LaneKey]:
-        """Fill nodes and their ends; returns the lanes that are too short or too narrow to keep."""
+        """Fill segments and ends; returns the lanes that are too short or too narrow to keep."""
         unfit = []
         for road in self.od.roads.values():
             line = ReferenceLine(road.geometries)
@@ -136,7 +133,7 @@ class _Builder:
                     ends = [np.stack([left[i], right[i]]) for i in (0, 1)]
                     forward = runs_forward(road, index, number)
                     travel = (begin, end) if forward else (end, begin)
-                    self.nodes[key] = LaneSegment(key, *travel)
+                    self.segments[key] = LaneSegment(key, *travel)
                     self.ends[key] = (ends[0], ends[1]) if forward else (ends[1], ends[0])
                     widest = float(np.abs(outer - inner).max())
                     if end - begin < MIN_LENGTH or widest < MIN_WIDTH:
@@ -148,9 +145,9 @@ class _Builder:
     def _infer_links(self) -> None:
         """Links between sections of a road that the file forgot: same number, same place."""
         inferred = 0
-        for key in self.nodes:
+        for key in self.segments:
             onward = LaneKey(key.road, key.section + 1, key.lane)
-            if onward not in self.nodes:
+            if onward not in self.segments:
                 continue
             is_forward = self._is_forward(key)
             source, target = (key, onward) if is_forward else (onward, key)
@@ -158,7 +155,7 @@ class _Builder:
             if linked or self._is_forward(onward) != is_forward:
                 continue
             if np.abs(self.ends[source][1] - self.ends[target][0]).max() < INFER_GAP:
-                self.topology.join(source, target)
+                self.join(source, target)
                 inferred += 1
         if inferred:
             self.warnings["lane link missing between sections, inferred"] += inferred
@@ -168,8 +165,8 @@ class _Builder:
 
         Lanes that end where another begins, but that nothing links, are counted.
         """
-        loose = [key for key in self.nodes if not self.after[key]]
-        first = [key for key in self.nodes if not self._beyond(key, entry=True)[0]]
+        loose = [key for key in self.segments if not self.after[key]]
+        first = [key for key in self.segments if not self._beyond(key, entry=True)[0]]
         if not loose or not first:
             return
         starts = shapely.STRtree(shapely.points([self.ends[key][0].mean(axis=0) for key in first]))
@@ -182,7 +179,7 @@ class _Builder:
             if turned or source.road == target.road or is_told:
                 continue
             if onward == target.road or self._beyond(target, entry=True)[1] == source.road:
-                self.topology.join(source, target)
+                self.join(source, target)
                 self.warnings["lane link missing between linked roads, inferred"] += 1
             elif not self.before[target]:
                 touching.append((source, target))
@@ -210,20 +207,20 @@ class _Builder:
         """Take a lane out and join what lies before it to what follows (nuPlan rule 514)."""
         sources, targets = sorted(self.before[key]), sorted(self.after[key])
         for source in sources:
-            self.topology.separate(source, key)
+            self.separate(source, key)
         for target in targets:
-            self.topology.separate(key, target)
+            self.separate(key, target)
         for source, target in product(sources, targets):
             if source != target:
-                self.topology.join(source, target)
-        self.topology.graph.dropped.append(self.nodes.pop(key))
+                self.join(source, target)
+        self.graph.dropped.append(self.segments.pop(key))
         what = "drivable lane shorter than 0.1 m or narrower than 0.5 m, linked through"
         self.warnings[what] += 1
 
     def _groups(self) -> list[list[LaneKey]]:
         """Lanes of one direction of one section, leftmost first, in the order of their roads."""
         groups: dict[_Group, list[LaneKey]] = defaultdict(list)
-        for key in filter(self._is_lane, self.nodes):
+        for key in filter(self.is_lane, self.segments):
             groups[key.road, key.section, self._is_forward(key)].append(key)
         order = sorted(groups, key=lambda group: (road_order(group[0]), *group[1:]))
         for (_, _, forward), keys in groups.items():  # seen in the direction of travel

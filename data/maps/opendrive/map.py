@@ -8,17 +8,9 @@ import numpy as np
 import shapely
 
 from shiftsim.data.maps.builder import PASS_THROUGH, BuiltMap, MapBuilder, Pairs, StopArea
-from shiftsim.data.maps.opendrive import areas, control, records
+from shiftsim.data.maps.opendrive import areas, control, graph, records
 from shiftsim.data.maps.opendrive.control import LIGHT, STOP, TOWN
 from shiftsim.data.maps.opendrive.curves import ReferenceLine, length_error, total_turn
-from shiftsim.data.maps.opendrive.graph import (
-    Connector,
-    Graph,
-    Lane,
-    LaneSegment,
-    build_lane_graph,
-    is_drivable,
-)
 from shiftsim.data.maps.opendrive.lanes import border_is_mirrored
 from shiftsim.data.maps.opendrive.overlaps import Levels, cut_crossings, overlapping
 from shiftsim.data.maps.opendrive.records import OpenDrive
@@ -61,13 +53,13 @@ def build_road_map(
     """
     warnings = Counter(od.warnings)
     placed = _prepare(od, warnings)
-    graph = build_lane_graph(placed, warnings)
-    shapes = Shapes(placed, graph)
-    graph, crossings = cut_crossings(placed, graph, shapes)
+    lane_graph = graph.build_lane_graph(placed, warnings)
+    shapes = Shapes(placed, lane_graph)
+    lane_graph, crossings = cut_crossings(placed, lane_graph, shapes)
     if crossings:
         warnings["lanes that cross without a junction, made an intersection"] += crossings
-        shapes = Shapes(placed, graph)
-    builder = _RoadMapBuilder(placed, graph, shapes, warnings, country)
+        shapes = Shapes(placed, lane_graph)
+    builder = _RoadMapBuilder(placed, lane_graph, shapes, warnings, country)
     built = builder.build(name, epsg=epsg, offset=np.array(offset))
     return built.road, built
 
@@ -81,7 +73,7 @@ def require_lanes(od: OpenDrive, built: BuiltMap) -> None:
         for lane in (lane for section in found.sections for lane in section.lanes.values()):
             if lane.type not in records.DRIVABLE:
                 reasons[f"lanes of type {lane.type!r}"] += 1
-            elif not is_drivable(lane):
+            elif not graph.is_drivable(lane):
                 reasons["lanes that are closed to cars"] += 1
             elif not len(lane.widths) and not len(lane.borders):
                 reasons["lanes without width"] += 1
@@ -180,29 +172,34 @@ def _note_lanes(road: records.Road, warnings: Counter[str]) -> None:
                 warnings["border of a right lane given on the left, mirrored"] += 1
 
 
-class _RoadMapBuilder(MapBuilder[LaneSegment]):
+class _RoadMapBuilder(MapBuilder[graph.LaneSegment]):
     larger = "longer"
 
     def __init__(
-        self, od: OpenDrive, graph: Graph, shapes: Shapes, warnings: Counter[str], country: str
+        self,
+        od: OpenDrive,
+        lane_graph: graph.Graph,
+        shapes: Shapes,
+        warnings: Counter[str],
+        country: str,
     ) -> None:
-        super().__init__(graph, shapes, warnings)
+        super().__init__(lane_graph, shapes, warnings)
         self.od, self.shapes, self.country = od, shapes, country
-        self.controls = control.connector_controls(od, graph)
+        self.controls = control.connector_controls(od, lane_graph)
         self.lights = ["" if LIGHT in found else None for found in self.controls]
         self.stop_signs = [STOP in found for found in self.controls]
 
-    def connector_borders(self, connector: Connector) -> tuple[FloatArray, FloatArray]:
+    def connector_borders(self, connector: graph.Connector) -> tuple[FloatArray, FloatArray]:
         lanes = self.graph.lanes
         before = self.shapes.widths(lanes[connector.source].segments)[1]
         after = self.shapes.widths(lanes[connector.target].segments)[0]
         return widen(*self.shapes.joined_borders(connector.segments), min(before, after))
 
-    def speed_limits(self, segment: LaneSegment) -> Iterable[tuple[float | None, float]]:
+    def speed_limits(self, segment: graph.LaneSegment) -> Iterable[tuple[float | None, float]]:
         return control.speed_limits(self.od, segment, self.country)
 
     def _levels(
-        self, edges: Sequence[Lane | Connector], areas: Sequence[shapely.Polygon]
+        self, edges: Sequence[graph.Lane | graph.Connector], areas: Sequence[shapely.Polygon]
     ) -> Levels:
         return Levels(self.od, self.shapes, [edge.segments for edge in edges], areas)
 
@@ -210,7 +207,7 @@ class _RoadMapBuilder(MapBuilder[LaneSegment]):
         levels = self._levels(self.graph.lanes, polygons)
         return {pair for pair in overlapping(polygons) if levels.are_stacked(*pair)}
 
-    def are_adjacent(self, left: Lane, right: Lane) -> bool:
+    def are_adjacent(self, left: graph.Lane, right: graph.Lane) -> bool:
         """Whether no lane of another use lies between two lanes of one section."""
         one, other = (lane.segments[0].key.lane for lane in (left, right))
         return abs(one - other) - (1 if one * other < 0 else 0) == 1

@@ -12,15 +12,7 @@ from typing import Any
 import numpy as np
 from lxml import etree
 
-from shiftsim.data.maps.opendrive import records
-from shiftsim.data.maps.opendrive.elements import (
-    CRUMB,
-    CUBIC,
-    AbsurdRecordError,
-    Reader,
-    read_object,
-    read_signal,
-)
+from shiftsim.data.maps.opendrive import elements, records
 from shiftsim.data.maps.opendrive.records import OpenDrive, Road
 from shiftsim.data.xml_elements import xml_elements
 from shiftsim.errors import ConversionError
@@ -32,7 +24,7 @@ _PARAM_CUBIC = ("aU", "bU", "cU", "dU", "aV", "bV", "cV", "dV")
 _COEFFICIENTS = {
     records.ARC: ("curvature",),
     records.SPIRAL: ("curvStart", "curvEnd"),
-    records.POLY3: CUBIC,
+    records.POLY3: elements.CUBIC,
     records.PARAM_POLY3: _PARAM_CUBIC,
 }
 _TOP_LEVEL = ("header", "road", "junction", "include")
@@ -60,7 +52,7 @@ def read_opendrive(path: Path) -> OpenDrive:
 
 def parse_opendrive(data: bytes, source: str) -> OpenDrive:
     """Like `read_opendrive`, from the bytes of a file."""
-    reader = Reader(source)
+    reader = elements.Reader(source)
     header: tuple[Any, str | None, Any] = (("", ""), None, None)  # revision, geoReference, offset
     roads: dict[str, Road] = {}
     seen: set[tuple[str, str]] = set()
@@ -90,7 +82,7 @@ def parse_opendrive(data: bytes, source: str) -> OpenDrive:
         if element.tag == "road":
             try:
                 road = _read_road(element, name, reader)
-            except AbsurdRecordError as error:
+            except elements.AbsurdRecordError as error:
                 absurd.append(error.message.partition(", ")[2])
                 continue
             if road is not None:
@@ -111,7 +103,7 @@ def parse_opendrive(data: bytes, source: str) -> OpenDrive:
     return OpenDrive(source, *header, roads, junctions, dict(reader.warnings), left_hand)
 
 
-def _strip_junk(data: bytes, reader: Reader) -> bytes:
+def _strip_junk(data: bytes, reader: elements.Reader) -> bytes:
     start = data.find(b"<?xml")
     if start > 0 and b"<OpenDRIVE" not in data[:start]:
         if data[:start].strip(b"\xef\xbb\xbf \t\r\n"):
@@ -125,7 +117,7 @@ def _drop_namespaces(element: Any) -> None:
         child.tag = etree.QName(child).localname
 
 
-def _read_header(element: Any, reader: Reader) -> tuple[Any, str | None, Any]:
+def _read_header(element: Any, reader: elements.Reader) -> tuple[Any, str | None, Any]:
     geo = element.findtext("geoReference")
     shift = element.find("offset")
     offset = None
@@ -135,7 +127,7 @@ def _read_header(element: Any, reader: Reader) -> tuple[Any, str | None, Any]:
     return revision, (geo.strip() or None) if geo else None, offset
 
 
-def _read_road(element: Any, name: str, reader: Reader) -> Road | None:
+def _read_road(element: Any, name: str, reader: elements.Reader) -> Road | None:
     """One road, or None where it has no usable reference line."""
     junction = element.get("junction", "-1")
     lanes = element.find("lanes")
@@ -176,13 +168,14 @@ def _read_road(element: Any, name: str, reader: Reader) -> Road | None:
         successor=_read_link(link, "successor"),
         types=_read_types(element.findall("type"), reader),
         objects=tuple(
-            read_object(e, reader) for e in (() if objects is None else objects.findall("object"))
+            elements.read_object(e, reader)
+            for e in (() if objects is None else objects.findall("object"))
         ),
-        signals=tuple(read_signal(e, reader) for e in placed if e.get("s") is not None),
+        signals=tuple(elements.read_signal(e, reader) for e in placed if e.get("s") is not None),
     )
 
 
-def _read_plan_view(element: Any, reader: Reader) -> tuple[records.Geometry, ...] | None:
+def _read_plan_view(element: Any, reader: elements.Reader) -> tuple[records.Geometry, ...] | None:
     geometries: list[records.Geometry] = []
     tiny: list[records.Geometry] = []
     for child in () if element is None else element.findall("geometry"):
@@ -197,7 +190,7 @@ def _read_plan_view(element: Any, reader: Reader) -> tuple[records.Geometry, ...
         if kind == records.PARAM_POLY3 and not any(k in shape.keys() for k in _PARAM_CUBIC):
             reader.warn("road left out: paramPoly3 without coefficients")
             return None
-        is_crumb = TINY_LENGTH <= length < CRUMB
+        is_crumb = TINY_LENGTH <= length < elements.CRUMB
         coefficients, fits = reader.coefficients(shape, _COEFFICIENTS.get(kind, ()), is_crumb)
         if is_crumb and not all(fits):
             reader.warn("absurd geometry shorter than 1 mm, taken as a line")
@@ -225,13 +218,11 @@ def _read_plan_view(element: Any, reader: Reader) -> tuple[records.Geometry, ...
     return tuple(sorted(geometries, key=lambda record: record.s))
 
 
-def _note_directions(sections: list[Any], reader: Reader) -> None:
+def _note_directions(sections: list[Any], reader: elements.Reader) -> None:
     """Count lanes whose vendor data tell the direction of right-hand traffic, and the other."""
     for lane in (lane for section in sections for lane in section.iter("lane")):
-        number, word = (
-            reader.integer(lane, "id"),
-            next((e.get("travelDir") for e in lane.iter("vectorLane")), None),
-        )
+        number = reader.integer(lane, "id")
+        word = next((e.get("travelDir") for e in lane.iter("vectorLane")), None)
         if number and word in ("forward", "backward") and lane.get("type") in records.DRIVABLE:
             reader.told[(word == "forward") == (number < 0)] += 1
 
@@ -250,9 +241,9 @@ def _contact(element: Any) -> str | None:
     return contact if contact in ("start", "end") else None
 
 
-def _read_types(elements: list[Any], reader: Reader) -> tuple[records.RoadType, ...]:
+def _read_types(found: list[Any], reader: elements.Reader) -> tuple[records.RoadType, ...]:
     types = []
-    for element in elements:
+    for element in found:
         s, speed = reader.finite(element, "s"), element.find("speed")
         limit = None if speed is None else _read_speed(speed, reader)
         types.append(
@@ -261,7 +252,7 @@ def _read_types(elements: list[Any], reader: Reader) -> tuple[records.RoadType, 
     return tuple(sorted(types, key=lambda record: record.s))
 
 
-def _read_speed(element: Any, reader: Reader) -> records.Speed:
+def _read_speed(element: Any, reader: elements.Reader) -> records.Speed:
     unit = element.get("unit", "").lower().replace(" ", "")
     begin = reader.finite(element, "sOffset")
     text = element.get("max", "undefined")
@@ -275,7 +266,7 @@ def _read_speed(element: Any, reader: Reader) -> records.Speed:
     return records.Speed(begin, limit)
 
 
-def _read_section(element: Any, end: float, reader: Reader) -> records.LaneSection:
+def _read_section(element: Any, end: float, reader: elements.Reader) -> records.LaneSection:
     lanes: dict[int, records.Lane] = {}
     length = end - reader.finite(element, "s")
     for child in element.iter("lane"):
@@ -297,7 +288,7 @@ def _read_section(element: Any, end: float, reader: Reader) -> records.LaneSecti
     return records.LaneSection(max(reader.finite(element, "s"), 0.0), lanes)
 
 
-def _read_lane(element: Any, number: int, length: float, reader: Reader) -> records.Lane:
+def _read_lane(element: Any, number: int, length: float, reader: elements.Reader) -> records.Lane:
     link = element.find("link")
     widths, borders = element.findall("width"), element.findall("border")
     kind = element.get("type", "")
@@ -324,12 +315,12 @@ def _read_lane(element: Any, number: int, length: float, reader: Reader) -> reco
     return lane
 
 
-def _lane_ids(link: Any, name: str, reader: Reader) -> tuple[int, ...]:
+def _lane_ids(link: Any, name: str, reader: elements.Reader) -> tuple[int, ...]:
     found = [] if link is None else [reader.integer(e, "id") for e in link.findall(name)]
     return tuple(i for i in found if i is not None)
 
 
-def _read_junction(element: Any, name: str, reader: Reader) -> records.Junction:
+def _read_junction(element: Any, name: str, reader: elements.Reader) -> records.Junction:
     kind = element.get("type", "default")
     connections = []
     for child in element.findall("connection"):

@@ -9,14 +9,7 @@ import numpy as np
 from shiftsim.data.readers.build import find_pause, find_twice
 from shiftsim.data.readers.codes import KINDS
 from shiftsim.data.readers.motion import contradiction
-from shiftsim.data.readers.tracks.axes import (
-    FAST,
-    LEAST_CONTRADICTING,
-    Diagnostics,
-    check_headings,
-    check_reference,
-    check_velocities,
-)
+from shiftsim.data.readers.tracks import axes
 from shiftsim.data.readers.tracks.map_fit import MIN_ALONG, Fit, fit_map
 from shiftsim.data.readers.tracks.table import TrackTable
 from shiftsim.errors import listed
@@ -40,9 +33,9 @@ _ACCELERATION_S, _MAX_ACCELERATION = 0.5, 6.0  # s; m/s², of half of the moving
 _MAX_OVERSPEED = 1.6  # of the speed limit, of nine tenths of the rows
 
 
-def diagnose(table: TrackTable, road: VectorMap, min_share: float) -> Diagnostics:
+def diagnose(table: TrackTable, road: VectorMap, min_share: float) -> axes.Diagnostics:
     """Everything that cannot be right; `min_share` of the moving vehicles must be on the map."""
-    out = Diagnostics()
+    out = axes.Diagnostics()
     for check in (_check_kinds, _check_times, _check_jumps, _check_speeds):
         if not check(table, out):  # what follows would mean nothing
             return out
@@ -52,14 +45,14 @@ def diagnose(table: TrackTable, road: VectorMap, min_share: float) -> Diagnostic
     _check_accelerations(table, out)
     _check_walkers(table, out)
     _check_sizes(table, out)
-    check_headings(table, fit, out)
-    check_velocities(table, fit, out)
+    axes.check_headings(table, fit, out)
+    axes.check_velocities(table, fit, out)
     if not out.errors:
-        check_reference(table, out)
+        axes.check_reference(table, out)
     return out
 
 
-def _check_kinds(table: TrackTable, out: Diagnostics) -> bool:
+def _check_kinds(table: TrackTable, out: axes.Diagnostics) -> bool:
     """Whether all kinds are known, and one is a vehicle."""
     used = [table.categories[code] for code in np.unique(table.category).tolist()]
     if unknown := [name[:40] for name in used if name not in KINDS]:
@@ -77,7 +70,7 @@ def _check_kinds(table: TrackTable, out: Diagnostics) -> bool:
     return not out.errors
 
 
-def _check_times(table: TrackTable, out: Diagnostics) -> bool:
+def _check_times(table: TrackTable, out: axes.Diagnostics) -> bool:
     """Whether the motion of objects can be determined at all."""
     slow, fast = _RATES
     period, column = table.period, table.columns.found.get("time")
@@ -112,7 +105,7 @@ def _check_times(table: TrackTable, out: Diagnostics) -> bool:
     return not out.errors
 
 
-def _check_jumps(table: TrackTable, out: Diagnostics) -> bool:
+def _check_jumps(table: TrackTable, out: axes.Diagnostics) -> bool:
     """Single rows that are far from their neighbours; whether speeds mean anything beside them."""
     same = np.diff(table.track) == 0
     step, way = np.diff(table.time), np.hypot(*np.diff(table.xy, axis=0).T)
@@ -141,7 +134,7 @@ def _check_jumps(table: TrackTable, out: Diagnostics) -> bool:
     return len(far) < 0.01 * int(same.sum())
 
 
-def _check_speeds(table: TrackTable, out: Diagnostics) -> bool:
+def _check_speeds(table: TrackTable, out: axes.Diagnostics) -> bool:
     speed = table.speed[table.is_vehicle]
     high, fastest = float(np.percentile(speed, 95)), float(speed.max())
     out.figures["fastest_vehicle_mps"] = fastest
@@ -173,7 +166,7 @@ def _check_speeds(table: TrackTable, out: Diagnostics) -> bool:
     return False
 
 
-def _check_gaps(table: TrackTable, out: Diagnostics) -> None:
+def _check_gaps(table: TrackTable, out: axes.Diagnostics) -> None:
     stamps = np.unique(table.time_us) / 1e6
     gaps = np.diff(stamps)
     if gaps.max() > _MAX_GAP:
@@ -185,7 +178,7 @@ def _check_gaps(table: TrackTable, out: Diagnostics) -> None:
         )
 
 
-def _check_starts(table: TrackTable, out: Diagnostics) -> None:
+def _check_starts(table: TrackTable, out: axes.Diagnostics) -> None:
     """Objects that all begin at once and end one after another."""
     first, last = table.time[table.ends[:-1]], table.time[table.ends[1:] - 1]
     vanish = (last < last.max() - 1.0).mean()
@@ -197,14 +190,15 @@ def _check_starts(table: TrackTable, out: Diagnostics) -> None:
         )
 
 
-def _check_map(table: TrackTable, road: VectorMap, min_share: float, out: Diagnostics) -> Fit:
+def _check_map(table: TrackTable, road: VectorMap, min_share: float, out: axes.Diagnostics) -> Fit:
     """Whether vehicles are on the map, and as fast as its limits allow."""
-    stored, moving, fast = table.velocities, table.moving_rows(_MOVING), table.moving_rows(FAST)
+    stored, moving = table.velocities, table.moving_rows(_MOVING)
+    fast = table.moving_rows(axes.FAST)
     # another unit of length would show elsewhere, too
     is_metric = table.vehicle_size is not None and _is_usual(*table.vehicle_size)
     if is_metric and np.isfinite(stored).any() and len(fast):
         wrong, _ = contradiction(stored, table.derived, table.time, table.track)
-        is_metric = bool(wrong[table.track[fast]].mean() <= LEAST_CONTRADICTING)
+        is_metric = bool(wrong[table.track[fast]].mean() <= axes.LEAST_CONTRADICTING)
     else:
         is_metric = False
     fit = fit_map(road, table.xy[moving], table.derived[moving], min_share, only_metres=is_metric)
@@ -235,9 +229,9 @@ def _check_map(table: TrackTable, road: VectorMap, min_share: float, out: Diagno
     return fit
 
 
-def _check_accelerations(table: TrackTable, out: Diagnostics) -> None:
+def _check_accelerations(table: TrackTable, out: axes.Diagnostics) -> None:
     """Along and across, over half a second: three times too fast they are nine times as large."""
-    time, rows = table.time, table.moving_rows(FAST)
+    time, rows = table.time, table.moving_rows(axes.FAST)
     after = np.minimum(rows + max(1, round(_ACCELERATION_S / table.period)), len(time) - 1)
     used = (table.track[after] == table.track[rows]) & (time[after] > time[rows])
     used &= time[after] < time[rows] + 2.0 * max(_ACCELERATION_S, table.period)
@@ -255,7 +249,7 @@ def _check_accelerations(table: TrackTable, out: Diagnostics) -> None:
         )
 
 
-def _check_walkers(table: TrackTable, out: Diagnostics) -> None:
+def _check_walkers(table: TrackTable, out: axes.Diagnostics) -> None:
     """How fast pedestrians walk while they do, the same whatever a clock counts."""
     is_walker = table.is_of(AgentKind.PEDESTRIAN)[table.ends[:-1]]
     speeds = []
@@ -278,7 +272,7 @@ def _is_usual(length: float, width: float) -> bool:
     return _LENGTHS[0] <= length <= _LENGTHS[1] and _WIDTHS[0] <= width <= _WIDTHS[1]
 
 
-def _check_sizes(table: TrackTable, out: Diagnostics) -> None:
+def _check_sizes(table: TrackTable, out: axes.Diagnostics) -> None:
     sizes = table.sizes
     large = np.flatnonzero((sizes[:, 0] > _LONGEST) | (sizes[:, 1] > _WIDEST))
     if 0 < len(large) < 0.5 * len(sizes):

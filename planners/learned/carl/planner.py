@@ -83,11 +83,11 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         self._blindness = self._why_blind(scene.map, status)
         return CarlFeatures(pictures, measure(ego, self._last_action))
 
-    def infer(self, features: Sequence[CarlFeatures]) -> list[Action]:
+    def infer(self, scenes: Sequence[CarlFeatures]) -> list[Action]:
         """Actions (2,) in [-1, 1]: acceleration and steering."""
         import torch
 
-        parts = (np.stack(part) for part in zip(*features, strict=True))
+        parts = (np.stack(part) for part in zip(*scenes, strict=True))
         pictures, measured = (torch.from_numpy(part).to(self.device) for part in parts)
         with torch.inference_mode():
             each = [network(pictures, measured).action for network in self.networks]

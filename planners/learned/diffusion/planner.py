@@ -10,19 +10,13 @@ from typing import Any
 import numpy as np
 
 from shiftsim.geometry.boxes import from_frame
+from shiftsim.planners.learned import features
 from shiftsim.planners.learned.base import LearnedPlanner
 from shiftsim.planners.learned.diffusion.features import (
     FeatureBuilder,
     Features,
     Single,
     lane_lines,
-)
-from shiftsim.planners.learned.features import (
-    NO_ROUTE,
-    plan_of_poses,
-    poses_of,
-    short_history,
-    stack_scenes,
 )
 from shiftsim.sim.noise import keyed_generator
 from shiftsim.sim.planner import Observation, SceneInfo
@@ -56,29 +50,31 @@ class DiffusionPlanner(LearnedPlanner[Features, Single]):
         out = self._build(observation, noise)
         # why the official planner would fail here
         if out.route is None:
-            self._reason = NO_ROUTE
+            self._reason = features.NO_ROUTE
         elif len(out.edges) == 0:
             self._reason = "no lane within 100 m"
         else:
-            self._reason = short_history(len(observation.history.ego))
+            self._reason = features.short_history(len(observation.history.ego))
         return out
 
-    def infer(self, features: Sequence[Features]) -> Sequence[Single]:
+    def infer(self, scenes: Sequence[Features]) -> Sequence[Single]:
         """Trajectories (11, 80, 4) of ego and neighbours: x, y [m], cos, sin in the ego frame."""
         import torch
 
         with torch.inference_mode():
-            inputs, noise = self.batch(features)
+            inputs, noise = self.batch(scenes)
             return list(self.network(inputs, noise).cpu().numpy())
 
-    def batch(self, features: Sequence[Features]) -> tuple[Mapping[str, Any], Any]:
+    def batch(self, scenes: Sequence[Features]) -> tuple[Mapping[str, Any], Any]:
         """Tensors that the network reads, by name, and the start noise (B, 11, 80, 4)."""
-        rows = [[getattr(one, name) for name in (*INPUTS, "noise")] for one in features]
-        *inputs, noise = stack_scenes(rows, self.device)
+        rows = [[getattr(one, name) for name in (*INPUTS, "noise")] for one in scenes]
+        *inputs, noise = features.stack_scenes(rows, self.device)
         return dict(zip(INPUTS, inputs, strict=True)), noise
 
     def decode(self, output: Single, observation: Observation) -> Trajectory:
         """The ego's trajectory in the map frame."""
         self.degraded = self._reason
         history = observation.history
-        return plan_of_poses(from_frame(poses_of(output[0]), history.ego[-1]), history)
+        return features.plan_of_poses(
+            from_frame(features.poses_of(output[0]), history.ego[-1]), history
+        )

@@ -12,19 +12,8 @@ import numpy as np
 
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.kernels import BoolArray
+from shiftsim.planners.learned import features
 from shiftsim.planners.learned.base import LearnedPlanner
-from shiftsim.planners.learned.features import (
-    NO_ROUTE,
-    STEP,
-    AgentFeatures,
-    agent_features,
-    map_poses,
-    plan_of_poses,
-    poses_of,
-    short_history,
-    stack_scenes,
-    straight_on,
-)
 from shiftsim.planners.learned.map_features import LightLookup, RoadFeatures, road_features
 from shiftsim.planners.routes.correction import RouteCorrector
 from shiftsim.sim.planner import History, Observation, SceneInfo
@@ -42,7 +31,7 @@ _NO_LANE = f"no lane or crosswalk within {RADIUS:g} m, heading and speed are kep
 class Features(NamedTuple):
     """What the network reads of one scene."""
 
-    agents: AgentFeatures  # the ego and the agents
+    agents: features.AgentFeatures  # the ego and the agents
     road: RoadFeatures  # the map
     current_state: np.ndarray  # (7,) of `current_state`, float32
     route: tuple[int, ...]  # blocks of the corrected route
@@ -79,21 +68,23 @@ class PlanTF(LearnedPlanner[Features, Plans]):
             self._route = route
             self._on_route[:] = False
             self._on_route[list(route)] = True
-        agents = agent_features(history, center, MAX_AGENTS)
+        agents = features.agent_features(history, center, MAX_AGENTS)
         lights = self._lights.at(observation.lights)
         road = road_features(self._map, rear_axle, center, RADIUS, lights, self._on_route)
         if not len(road.objects):
             self._reason = _NO_LANE
         else:
-            self._reason = short_history(len(history.ego)) if self._corrector else NO_ROUTE
+            self._reason = (
+                features.short_history(len(history.ego)) if self._corrector else features.NO_ROUTE
+            )
         return Features(agents, road, current_state(history), self._route)
 
-    def infer(self, features: Sequence[Features]) -> Sequence[Plans]:
+    def infer(self, scenes: Sequence[Features]) -> Sequence[Plans]:
         """Six plans per scene."""
         import torch
 
         with torch.inference_mode():
-            out = self.network(make_batch(features, self.device))
+            out = self.network(make_batch(scenes, self.device))
             trajectories = out.trajectory.cpu().numpy()
             probabilities = out.probability.cpu().numpy()
         return [Plans(*pair) for pair in zip(trajectories, probabilities, strict=True)]
@@ -102,9 +93,11 @@ class PlanTF(LearnedPlanner[Features, Plans]):
         """The likeliest plan in the map frame."""
         self.degraded, history = self._reason, observation.history
         if self._reason == _NO_LANE:
-            return straight_on(history)
+            return features.straight_on(history)
         best = output.trajectory[int(np.argmax(output.probability))]
-        return plan_of_poses(map_poses(poses_of(best), history.ego[-1]), history)
+        return features.plan_of_poses(
+            features.map_poses(features.poses_of(best), history.ego[-1]), history
+        )
 
 
 def current_state(history: History) -> np.ndarray:
@@ -112,7 +105,7 @@ def current_state(history: History) -> np.ndarray:
     ego = history.ego
     speed = ego[-1, VX]
     # nuPlan rule 302: not those of the state; they follow from the last two headings
-    turn = wrap_angle(ego[-1, HEADING] - ego[-2, HEADING]) / STEP if len(ego) > 1 else 0.0
+    turn = wrap_angle(ego[-1, HEADING] - ego[-2, HEADING]) / features.STEP if len(ego) > 1 else 0.0
     steer = yaw_rate = 0.0
     if abs(speed) >= MIN_SPEED:
         steer = np.clip(np.arctan(turn * PACIFICA.wheel_base / abs(speed)), -MAX_STEER, MAX_STEER)
@@ -120,13 +113,13 @@ def current_state(history: History) -> np.ndarray:
     return np.array([0.0, 0.0, 0.0, speed, ego[-1, AX], steer, yaw_rate], np.float32)
 
 
-def make_batch(features: Sequence[Features], device: str) -> Any:
+def make_batch(scenes: Sequence[Features], device: str) -> Any:
     """Inputs of the network; padding is valid nowhere."""
     from shiftsim.planners.learned.plantf.network import Inputs
 
-    parts = [(one.agents, one.road) for one in features]
+    parts = [(one.agents, one.road) for one in scenes]
     counts = [[len(part.valid) for part in same] for same in zip(*parts, strict=True)]
-    scenes = [
+    arrays = [
         (
             *(agents.position, agents.heading, agents.velocity, agents.shape, agents.valid),
             # nuPlan rule 301: all agents have the category of the ego
@@ -136,6 +129,6 @@ def make_batch(features: Sequence[Features], device: str) -> Any:
             *(road.kind, road.on_route.astype(np.int64), road.light, road.has_limit, road.limit),
             road.valid,
         )
-        for agents, road, state, _ in features
+        for agents, road, state, _ in scenes
     ]
-    return Inputs(*[*stack_scenes(scenes, device), counts])
+    return Inputs(*[*features.stack_scenes(arrays, device), counts])

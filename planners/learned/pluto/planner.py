@@ -14,15 +14,8 @@ import numpy as np
 
 from shiftsim.geometry.boxes import boxes_to_corners, turned
 from shiftsim.kernels import FloatArray
+from shiftsim.planners.learned import features
 from shiftsim.planners.learned.base import LearnedPlanner
-from shiftsim.planners.learned.features import (
-    NO_ROUTE,
-    AgentFeatures,
-    agent_features,
-    plan_of_poses,
-    short_history,
-    stack_scenes,
-)
 from shiftsim.planners.learned.map_features import LightLookup, RoadFeatures, road_features
 from shiftsim.planners.learned.pluto import reference, scoring, world
 from shiftsim.planners.proposals.tracker import STEP_US, STEPS
@@ -70,7 +63,7 @@ class Surroundings:
     drivable: reference.Drivable  # drivable areas
     static: world.StaticObjects  # static objects on them
     lines: list[FloatArray]  # reference lines (K, 3)
-    agents: AgentFeatures  # the agents, nearest first
+    agents: features.AgentFeatures  # the agents, nearest first
     road: RoadFeatures  # lanes, connectors and crosswalks
 
 
@@ -113,18 +106,18 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
         drivable = reference.drivable_near(road, route, center[0], center[1])
         static = world.static_objects(history.tracks, drivable, center[0], center[1])
         lines = reference.reference_lines(road, route, ego[:3], center)
-        agents = agent_features(history, center, MAX_AGENTS)
+        agents = features.agent_features(history, center, MAX_AGENTS)
         lights = self._lights.at(observation.lights)
         near = road_features(road, ego[:3], center, RADIUS, lights, route.has_block)
         self.surroundings = Surroundings(drivable, static, lines, agents, near)
         return scene_inputs(ego, agents, near, static, reference.line_features(lines, ego[:3]))
 
-    def infer(self, features: Sequence[SceneInputs]) -> list[Output]:
+    def infer(self, scenes: Sequence[SceneInputs]) -> list[Output]:
         """One forward pass."""
         import torch
 
         with torch.inference_mode():
-            outputs = self.network(make_batch(features, self.device))
+            outputs = self.network(make_batch(scenes, self.device))
         arrays = [getattr(outputs, name).cpu().numpy() for name in Output._fields]
         return [
             Output(
@@ -133,15 +126,15 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
                 prediction[: len(scene.category) - 1],
                 free,
             )
-            for scene, trajectory, logits, prediction, free in zip(features, *arrays, strict=True)
+            for scene, trajectory, logits, prediction, free in zip(scenes, *arrays, strict=True)
         ]
 
     def decode(self, output: Output, observation: Observation) -> Trajectory:
         """The best proposal, an emergency brake, or the reference-free trajectory."""
         history, self.choice = observation.history, None
         # where the official planner would fail
-        reason = short_history(len(history.ego)) if self.surroundings.lines else NO_LINE
-        self.degraded = reason if self._blocks else NO_ROUTE
+        reason = features.short_history(len(history.ego)) if self.surroundings.lines else NO_LINE
+        self.degraded = reason if self._blocks else features.NO_ROUTE
         if not self.surroundings.lines:
             free = headings_of(output.ref_free_trajectory)
             return _plan(to_map(free, history.ego[-1, :3]), observation)
@@ -189,7 +182,7 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
 
 def scene_inputs(
     ego: FloatArray,
-    agents: AgentFeatures,
+    agents: features.AgentFeatures,
     road: RoadFeatures,
     static: world.StaticObjects,
     lines: reference.LineFeatures,
@@ -221,7 +214,7 @@ def make_batch(scenes: Sequence[SceneInputs], device: str) -> Any:
 
     parts = ("category", "kind", "object_category", "line_valid")
     counts = [[len(getattr(scene, name)) for scene in scenes] for name in parts]
-    return Inputs(*[*stack_scenes(scenes, device), counts])
+    return Inputs(*[*features.stack_scenes(scenes, device), counts])
 
 
 def headings_of(trajectory: np.ndarray) -> np.ndarray:
@@ -276,7 +269,7 @@ def predicted_agents(
 
 def _plan(poses: FloatArray, observation: Observation) -> Trajectory:
     """Poses from 0.1 s on as a plan."""
-    plan = plan_of_poses(poses, observation.history)
+    plan = features.plan_of_poses(poses, observation.history)
     # nuPlan rule 249: the plan starts at the first pose, not at the ego
     plan.states[0] = plan.states[1]
     return plan
