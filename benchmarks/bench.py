@@ -19,7 +19,7 @@ from shiftsim.benchmarks import INTERPLAN_THRESHOLDS, Drawn, Track, known_sets, 
 from shiftsim.benchmarks import published as published_figures
 from shiftsim.data import open_store
 from shiftsim.edits.sampling import sample_edits
-from shiftsim.errors import ConfigError, DataError
+from shiftsim.errors import ConfigError, DataError, one_of
 from shiftsim.files import DEFAULT_STORE, write_text
 from shiftsim.report import build
 from shiftsim.report.figures import figures
@@ -278,7 +278,7 @@ class OpenedRuns(NamedTuple):
         self,
         folder: Path,
         options: build.Options,
-        formats: Sequence[str] = FORMATS,
+        formats: Sequence[str] = (),
         *,
         pictures: bool = True,
         pages: bool = False,
@@ -288,19 +288,22 @@ class OpenedRuns(NamedTuple):
     ) -> list[Path]:
         """Write tables and pictures to a folder, and return the files.
 
-        There is a file per format; with `pages` there are HTML pages in place of these: tables,
-        pictures, and every scenario with its replay.
+        There is a file per format, of all formats where none is given; with `pages` there are HTML
+        pages in place of these: tables, pictures, and every scenario with its replay.
 
         Raises:
+            ConfigError: There is no such format.
             MissingExtraError: Pictures are asked for, and matplotlib is missing.
         """
+        for name in formats:
+            one_of("format", name, FORMATS)
         is_whole = options.tables == tuple(build.TABLES)
         groups = self.groups(allow_partial=allow_partial)
         tables = self._tables(groups, options, is_whole)
         drawn = figures(groups) if pictures or pages else []
         title = title or f"Report on {', '.join(run.path.name for run in self.runs)}"
         if not pages:
-            return build.write_report(folder, title, self.runs, tables, drawn, formats)
+            return build.write_report(folder, title, self.runs, tables, drawn, formats or FORMATS)
         folder.mkdir(parents=True, exist_ok=True)
         images = {figure.save(folder).name: figure.title for figure in drawn}
         shown = galleries(self.runs, [_store_of(run) for run in self.runs], Choice())

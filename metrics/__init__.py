@@ -9,58 +9,29 @@ from dataclasses import replace
 
 from shiftsim.errors import ConfigError
 from shiftsim.files import load_attribute
-from shiftsim.metrics.result import (
-    DEEPPLAN,
-    NUPLAN,
-    PROFILES,
-    Collision,
-    MetricRow,
-    Series,
-    Statistic,
-    Thresholds,
-    Violation,
-    thresholds_of,
-)
-from shiftsim.metrics.score import (
-    MULTIPLIERS,
-    SHORT_NAMES,
-    WEIGHTS,
-    Measurements,
-    MetricResult,
-    evaluate,
-    measure,
-)
+from shiftsim.metrics.result import DEEPPLAN as DEEPPLAN
+from shiftsim.metrics.result import NUPLAN as NUPLAN
+from shiftsim.metrics.result import PROFILES as PROFILES
+from shiftsim.metrics.result import Collision as Collision
+from shiftsim.metrics.result import MetricRow as MetricRow
+from shiftsim.metrics.result import Series as Series
+from shiftsim.metrics.result import Statistic as Statistic
+from shiftsim.metrics.result import Thresholds as Thresholds
+from shiftsim.metrics.result import Violation as Violation
+from shiftsim.metrics.result import thresholds_of as thresholds_of
+from shiftsim.metrics.score import MULTIPLIERS as MULTIPLIERS
+from shiftsim.metrics.score import SHORT_NAMES as SHORT_NAMES
+from shiftsim.metrics.score import WEIGHTS as WEIGHTS
+from shiftsim.metrics.score import Measurements as Measurements
+from shiftsim.metrics.score import MetricResult as MetricResult
+from shiftsim.metrics.score import evaluate as evaluate
+from shiftsim.metrics.score import measure as measure
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 
 METRIC_VERSION = "1"  # raised with any change of a definition
 CustomMetric = Callable[[SimulationLog, VectorMap], float | MetricRow]
-
-__all__ = [
-    "DEEPPLAN",
-    "METRIC_VERSION",
-    "MULTIPLIERS",
-    "NUPLAN",
-    "PROFILES",
-    "SHORT_NAMES",
-    "WEIGHTS",
-    "Collision",
-    "CustomMetric",
-    "Measurements",
-    "MetricResult",
-    "MetricRow",
-    "Series",
-    "Statistic",
-    "Thresholds",
-    "Violation",
-    "add_metrics",
-    "compute_metrics",
-    "evaluate",
-    "load_metric",
-    "measure",
-    "thresholds_of",
-]
 
 
 def compute_metrics(

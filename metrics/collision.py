@@ -16,14 +16,7 @@ from shiftsim.geometry.boxes import (
 )
 from shiftsim.geometry.rings import SLACK, convex_intersect
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.metrics.result import (
-    Collision,
-    MetricPart,
-    MetricRow,
-    Thresholds,
-    Violation,
-    metric_part,
-)
+from shiftsim.metrics.result import Collision, MetricPart, MetricRow, Thresholds, Violation
 from shiftsim.world.state import (
     LAST_AGENT_KIND,
     AgentKind,
@@ -163,7 +156,7 @@ def evaluate(collisions: tuple[Collision, ...], thresholds: Thresholds) -> Metri
             for how, value in ("max", max(values)), ("min", min(values)), ("mean", np.mean(values)):
                 name = f"{how}_collision_energy_with_{group}"
                 energies.append((name, "meters_per_second", how.upper(), float(value)))
-    return metric_part(
+    return MetricPart.of(
         MetricRow(NAME, score, float(total), "count", 0.0, violation),
         (NAME, "boolean", "BOOLEAN", total == 0),
         ("number_of_all_at_fault_collisions", "count", "COUNT", total),

@@ -19,7 +19,6 @@ from shiftsim.metrics.result import (
     Thresholds,
     Violation,
     first_violation,
-    metric_part,
 )
 from shiftsim.world.state import (
     AX,
@@ -176,7 +175,7 @@ def evaluate(
     score = float(not violations)
     first = min(violations, key=lambda violation: violation.iteration, default=None)
     row = MetricRow(NAME, score, float(len(violations)), "count", 0.0, first)
-    return parts, metric_part(row, (NAME, "boolean", "BOOLEAN", score))
+    return parts, MetricPart.of(row, (NAME, "boolean", "BOOLEAN", score))
 
 
 def _part(
@@ -190,7 +189,7 @@ def _part(
     nearest = low if value - low < high - value else high
     row = MetricRow(metric, None, value, unit, nearest, violation)
     kinds = (("max", "MAX"), ("min", "MIN"), ("avg", "MEAN"), ("p90", "P90"))
-    return metric_part(
+    return MetricPart.of(
         row,
         *((f"{n}_{metric}", unit, kind, v) for (n, kind), v in zip(kinds, others, strict=True)),
         (f"abs_{metric}_within_bounds", "boolean", "BOOLEAN", violation is None),

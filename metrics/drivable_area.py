@@ -6,14 +6,7 @@ import numpy as np
 
 from shiftsim.geometry.rings import boundary_distance_below
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.metrics.result import (
-    MetricPart,
-    MetricRow,
-    Series,
-    Thresholds,
-    first_violation,
-    metric_part,
-)
+from shiftsim.metrics.result import MetricPart, MetricRow, Series, Thresholds, first_violation
 from shiftsim.metrics.route import EdgeLists
 from shiftsim.world.layers import Polygons, in_any
 from shiftsim.world.map import VectorMap
@@ -50,10 +43,10 @@ def evaluate(
     first = first_violation(far, furthest, time_us)
     score = float(first is None)
     row = MetricRow(NAME, score, float(furthest.max()), "meters", bound, first)
-    compliance = metric_part(row, (NAME, "boolean", "BOOLEAN", score))
+    compliance = MetricPart.of(row, (NAME, "boolean", "BOOLEAN", score))
     outside = np.any(area.outside, axis=1)
     first = first_violation(outside, furthest, time_us)
-    return compliance, metric_part(
+    return compliance, MetricPart.of(
         MetricRow(CORNERS_NAME, None, float(outside.sum()), "count", 0.0, first),
         (CORNERS_NAME, "boolean", "BOOLEAN", first is None),
         series=Series("boolean", np.where(outside, 0.0, 1.0)),

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shiftsim.kernels import BoolArray, IntArray, kernel
-from shiftsim.metrics.result import MetricPart, MetricRow, Thresholds, metric_part
+from shiftsim.metrics.result import MetricPart, MetricRow, Thresholds
 from shiftsim.metrics.route import EdgeLists, has
 from shiftsim.world.layers import Lists
 from shiftsim.world.map import VectorMap
@@ -55,7 +55,7 @@ def evaluate(lanes: LaneChanges, time_us: IntArray, thresholds: Thresholds) -> M
             (f"ratio_of_failed_{NAME}", "ratio", "RATIO", ratio),
         ]
     statistics.append((f"{NAME}_fail_rate_below_threshold", "boolean", "BOOLEAN", ratio <= bound))
-    return metric_part(MetricRow(NAME, None, ratio, "ratio", bound, None), *statistics)
+    return MetricPart.of(MetricRow(NAME, None, ratio, "ratio", bound, None), *statistics)
 
 
 @kernel

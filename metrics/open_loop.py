@@ -12,7 +12,7 @@ import numpy as np
 
 from shiftsim.errors import DataError
 from shiftsim.kernels import FloatArray, IntArray
-from shiftsim.metrics.result import MetricPart, MetricRow, metric_part
+from shiftsim.metrics.result import MetricPart, MetricRow
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import center_poses
 
@@ -144,7 +144,7 @@ def _error_part(metric: str, errors: FloatArray) -> MetricPart:
     name, unit, bound, _ = METRICS[metric]
     mean = float(errors.mean())  # nuPlan rule 731
     by_horizon = zip(HORIZONS, errors.mean(axis=1).tolist(), strict=True)
-    return metric_part(
+    return MetricPart.of(
         MetricRow(metric, max(0.0, 1.0 - mean / bound), mean, unit, bound, None),
         *((f"planner_expert_{name}_horizon_{h}", unit, "MEAN", value) for h, value in by_horizon),
         (metric, "boolean", "BOOLEAN", mean <= bound),
@@ -156,7 +156,7 @@ def _miss_part(rates: FloatArray) -> MetricPart:
     worst = float(rates.max())
     score = float(worst <= MAX_MISS_RATE)
     by_horizon = zip(HORIZONS, rates.tolist(), strict=True)
-    return metric_part(
+    return MetricPart.of(
         MetricRow(MISS, score, worst, "ratio", MAX_MISS_RATE, None),
         *((f"planner_miss_rate_horizon_{h}", "ratio", "RATIO", rate) for h, rate in by_horizon),
         (MISS, "boolean", "BOOLEAN", score),

@@ -10,14 +10,7 @@ import numpy as np
 
 from shiftsim.errors import MapError
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.metrics.result import (
-    MetricPart,
-    MetricRow,
-    Series,
-    Thresholds,
-    first_violation,
-    metric_part,
-)
+from shiftsim.metrics.result import MetricPart, MetricRow, Series, Thresholds, first_violation
 from shiftsim.metrics.route import EdgeLists, driven_route
 from shiftsim.world.layers import Polygons, Polylines, contains, project_on_line
 from shiftsim.world.map import NONE, VectorMap
@@ -91,7 +84,7 @@ def evaluate(progress: Progress, thresholds: Thresholds) -> tuple[MetricPart, Me
     if progress.has_route:
         ratio = 0.0 if ego < -floor else min(1.0, max(ego, floor) / max(expert, floor))
     own = [("ego_total_progress_along_route", "meters", "VALUE", ego)]
-    along = metric_part(
+    along = MetricPart.of(
         MetricRow(NAME, ratio, ratio, "ratio", None, None),
         ("expert_total_progress_along_route", "meters", "VALUE", expert),
         *(own if progress.has_route else []),
@@ -100,7 +93,7 @@ def evaluate(progress: Progress, thresholds: Thresholds) -> tuple[MetricPart, Me
     )
     score = float(ratio >= thresholds.min_progress)
     row = MetricRow(MAKING_NAME, score, ratio, "ratio", thresholds.min_progress, None)
-    return along, metric_part(row, (MAKING_NAME, "boolean", "BOOLEAN", score))
+    return along, MetricPart.of(row, (MAKING_NAME, "boolean", "BOOLEAN", score))
 
 
 def lane_progress(map: VectorMap, route: EdgeLists, centers: FloatArray) -> FloatArray:
@@ -133,7 +126,7 @@ def evaluate_direction(
     violation = first_violation(-sums >= compliance, -sums, time_us)
     seconds = f"{horizon:g}"
     lowest_name = f"min_progress_along_driving_direction_in_{seconds}_second_interval"
-    return metric_part(
+    return MetricPart.of(
         MetricRow(DIRECTION_NAME, score, regress, "meters", compliance, violation),
         (f"{DIRECTION_NAME}_score", "value", "VALUE", score),
         (lowest_name, "meters", "MIN", -regress),

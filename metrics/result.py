@@ -122,13 +122,13 @@ class MetricPart:
     statistics: tuple[Statistic, ...]
     series: Series | None
 
-
-def metric_part(
-    row: MetricRow, *statistics: tuple[str, str, str, float], series: Series | None = None
-) -> MetricPart:
-    """A row with statistics of its metric, each a name, unit, kind and value, and its series."""
-    named = (Statistic(row.metric, *about, float(value)) for *about, value in statistics)
-    return MetricPart(row, tuple(named), series)
+    @staticmethod
+    def of(
+        row: MetricRow, *statistics: tuple[str, str, str, float], series: Series | None = None
+    ) -> "MetricPart":
+        """A row, statistics of its metric, each a name, unit, kind and value, and its series."""
+        named = (Statistic(row.metric, *about, float(value)) for *about, value in statistics)
+        return MetricPart(row, tuple(named), series)
 
 
 class Collision(NamedTuple):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from shiftsim.errors import DataError
-from shiftsim.kernels import BoolArray, FloatArray, IntArray
+from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.metrics import (
     collision,
     comfort,
@@ -89,16 +89,6 @@ class Measurements:
     ttc: time_to_collision.TimeToCollision  # time to collision and partner at each sample
     overspeed: FloatArray  # (K,) speed above the limit, 0 where there is none [m/s]
     lane_progress: FloatArray  # (K,) progress along the lane since the sample before [m]
-
-    @property
-    def is_common(self) -> BoolArray:
-        """(K,) whether all corners are in the same or in connected lanes."""
-        return self.lanes.is_common
-
-    @property
-    def at_fault_times(self) -> list[int]:
-        """Time stamp of each at-fault collision, ascending [us]."""
-        return [c.time_us for c in self.collisions if c.at_fault]
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,14 +4,7 @@ import numpy as np
 
 from shiftsim.errors import MapError
 from shiftsim.kernels import FloatArray, IntArray, kernel
-from shiftsim.metrics.result import (
-    MetricPart,
-    MetricRow,
-    Series,
-    Thresholds,
-    first_violation,
-    metric_part,
-)
+from shiftsim.metrics.result import MetricPart, MetricRow, Series, Thresholds, first_violation
 from shiftsim.metrics.route import EdgeLists, Lanes, lanes_of
 from shiftsim.world.map import VectorMap
 
@@ -52,7 +45,7 @@ def evaluate(over: FloatArray, time_us: IntArray, thresholds: Thresholds) -> Met
     row = MetricRow(NAME, score, highest, "meters_per_second", thresholds.max_overspeed, violation)
     is_kept = (NAME, "boolean", "BOOLEAN", violation is None)
     series = Series("over_speeding[meters_per_second]", over)
-    return metric_part(row, is_kept, *_violations(over, time_us), series=series)
+    return MetricPart.of(row, is_kept, *_violations(over, time_us), series=series)
 
 
 def _violations(over: FloatArray, time_us: IntArray) -> list[tuple[str, str, str, float]]:

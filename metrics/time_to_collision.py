@@ -15,7 +15,6 @@ from shiftsim.metrics.result import (
     Series,
     Thresholds,
     first_violation,
-    metric_part,
 )
 from shiftsim.world.layers import Polygons, in_any
 from shiftsim.world.map import VectorMap
@@ -66,7 +65,7 @@ def evaluate(ttc: TimeToCollision, time_us: IntArray, thresholds: Thresholds) ->
     within = float(violation is None)
     if violation is not None and (partner := ttc.partners[violation.iteration]) >= 0:
         violation = violation._replace(partner=ttc.tokens[partner])
-    return metric_part(
+    return MetricPart.of(
         MetricRow(NAME, within, lowest, "seconds", bound, violation),
         ("min_time_to_collision", "seconds", "MIN", lowest),
         (NAME, "boolean", "BOOLEAN", within),

@@ -27,13 +27,6 @@ _INTERSECTION_STEP = 5  # iterations between the points tested
 ALL = "all"
 
 # Scenarios of the published benchmark (Canevaro et al., Shift & Drift) by site.
-PUBLISHED_SCENARIOS = {
-    "Sindelfingen": 490,
-    "Stuttgart": 206,
-    "Munich": 205,
-    "San Francisco": 180,
-    "Berlin": 101,
-}
 PUBLISHED_SETS = {"nuPlan Val14": 1118, "interPlan": 80, "DeepPlan": 1182}
 
 

@@ -80,8 +80,7 @@ def run(
         **settings,
     }
     plan = prepare(make_config(values), planners=planners, noises=models)
-    finished = execute(plan, **{"on_progress": on_progress} if on_progress else {})
-    return _with_methods(finished)
+    return _with_methods(execute(plan, **{"on_progress": on_progress} if on_progress else {}))
 
 
 def demo(store: str | Path = DEFAULT_STORE, **settings: Any) -> "Run":
@@ -155,8 +154,7 @@ def merge(runs: Iterable[Any], *, out: str | None = None, allow_partial: bool = 
     from shiftsim.runs.derive import merge_runs
 
     shards = [each if hasattr(each, "manifest") else open_run(each) for each in runs]
-    merged = merge_runs(shards, out=out, allow_partial=allow_partial)
-    return _with_methods(merged)
+    return _with_methods(merge_runs(shards, out=out, allow_partial=allow_partial))
 
 
 def score_files(
@@ -193,8 +191,7 @@ def score_files(
         raise ConfigError("simulation logs say where the others were", hint="leave tracks out")
     found = logs or read_source(Path(source), tracks)
     settings |= {"recorded": tracks == RECORDED, "partial_rollouts": partial}
-    made = score_elsewhere(found, store=store, **settings)
-    return _with_methods(made)
+    return _with_methods(score_elsewhere(found, store=store, **settings))
 
 
 def open_run(path: str | Path) -> "Run":
@@ -211,8 +208,7 @@ def open_run(path: str | Path) -> "Run":
     """
     from shiftsim.runs.results import open_run
 
-    found = open_run(path)
-    return _with_methods(found)
+    return _with_methods(open_run(path))
 
 
 def load_planner(name: str, **arguments: Any) -> Planner:

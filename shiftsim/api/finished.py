@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from shiftsim.errors import ConfigError, listed, one_of
+from shiftsim.errors import ConfigError, listed
 from shiftsim.runs import results
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.scenario import Scenario
@@ -94,14 +94,9 @@ class Run(results.Run):
             MissingExtraError: matplotlib is missing.
         """
         from shiftsim.report.build import TABLES, Options
-        from shiftsim.report.tables import FORMATS
 
-        for name in formats:
-            one_of("format", name, FORMATS)
         options = Options(tuple(tables or TABLES), by)
-        return list(
-            self._opened(*others).report(Path(folder), options, formats or FORMATS, **settings)
-        )
+        return list(self._opened(*others).report(Path(folder), options, formats, **settings))
 
     def worst(self, count: int = 10) -> list[dict[str, Any]]:
         """The worst of each recording and cause: key, `cls`, `reason`, how many `others`."""

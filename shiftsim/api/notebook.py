@@ -12,6 +12,7 @@ from shiftsim.metrics import MetricResult
 from shiftsim.runs.results import Run
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.planner import Observation, SceneInfo
+from shiftsim.view.still import overview, svg_of
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import EgoState, Tracks, Trajectory, speeds
@@ -24,8 +25,6 @@ def preformatted(text: str) -> str:
 
 def _picture_of(thing: Scenario | VectorMap) -> str:
     """A scenario or a map as a picture; as text where matplotlib is missing."""
-    from shiftsim.view.still import overview, svg_of
-
     try:
         return f"{preformatted(repr(thing))}{svg_of(overview(thing))}"
     except MissingExtraError:
@@ -48,29 +47,6 @@ def _table_of(log: SimulationLog) -> str:
     return f"<table>{''.join(cells)}</table>"
 
 
-for _kind, _shown in (
-    (Scenario, _picture_of),
-    (VectorMap, _picture_of),
-    (SimulationLog, _table_of),
-):
-    setattr(_kind, "_repr_html_", _shown)  # noqa: B010
-
-
-def _plot(self: Scenario | VectorMap) -> Any:
-    """A matplotlib figure: of a scenario at its first iteration, or of the whole map.
-
-    Raises:
-        MissingExtraError: matplotlib is missing.
-    """
-    from shiftsim.view.still import overview
-
-    return overview(self)
-
-
-for _kind in (Scenario, VectorMap):
-    setattr(_kind, "plot", _plot)  # noqa: B010
-
-
 def _missing(self: Any, name: str) -> Any:
     """`__getattr__` of what has no such attribute: says what may be meant."""
     owners = [kind.__name__ for kind in type(self).__mro__]
@@ -79,6 +55,10 @@ def _missing(self: Any, name: str) -> Any:
     raise no_attribute(f"{type(self).__name__!r} object", owners, name, names)
 
 
+setattr(SimulationLog, "_repr_html_", _table_of)  # noqa: B010
+for _kind in (Scenario, VectorMap):
+    setattr(_kind, "_repr_html_", _picture_of)  # noqa: B010
+    setattr(_kind, "plot", overview)  # noqa: B010
 for _kind in (
     *(Scenario, ScenarioStore, Observation, SceneInfo, EgoState, Tracks),
     *(SimulationLog, Trajectory, MetricResult, VectorMap, Run),

@@ -38,9 +38,8 @@ save_rollouts allow_partial""".split()
     retry_failed="Do again what failed before.",
 )
 def bench(
-    *,
-    track: str = Argument(help="semantic-shift, state-drift or edits."),
     settings: cli.Settings,
+    track: str = Argument(help="semantic-shift, state-drift or edits."),
     val14: str = Option("", help="Store, or STORE:SPLIT, with Val14 (left out)."),
     published: bool = Option(False, "--published", help="The paper's figures beside the own ones."),
     estimate: bool = Option(

@@ -255,11 +255,10 @@ def _add_dataset(kind: str, text: str) -> None:
     @app.command(kind, help=text)
     @cli.with_settings("workers")
     def convert(
+        settings: cli.Settings,
         folder: Source,
         store: Store,
         egos: Egos = "recorded",
-        *,
-        settings: cli.Settings,
         quiet: Quiet = False,
         as_json: Json = False,
     ) -> None:

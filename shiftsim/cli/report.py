@@ -7,7 +7,6 @@ from typer import Argument, Exit, Option, echo
 
 from shiftsim import cli
 from shiftsim.cli import Json, Quiet, plural, print_json, progress_bar
-from shiftsim.errors import one_of
 from shiftsim.files import safe_join
 
 if TYPE_CHECKING:
@@ -67,21 +66,19 @@ def report(
     from shiftsim.benchmarks.bench import open_runs
     from shiftsim.report.build import BRIEF, TABLES, Options
     from shiftsim.report.scores import summary
-    from shiftsim.report.tables import FORMATS, render
+    from shiftsim.report.tables import render
 
     opened = open_runs(folders, labels or ())
     if as_json:
         print_json([summary(run) for run in opened.runs])
         return
-    for name in style:
-        one_of("format", name, FORMATS)
     if figures and out is None:
         out = safe_join(folders[0], "report")
     title = f"Report on {', '.join(folder.resolve().name for folder in folders)}"
     options = Options(tuple(table or TABLES), by, published)
     shared: dict[str, Any] = {"allow_partial": allow_partial, "title": title}
     if out is not None:
-        files = opened.report(out, options, style or FORMATS, pictures=figures, **shared)
+        files = opened.report(out, options, style, pictures=figures, **shared)
         echo(f"{plural(len(files), 'file')} in {out}: {', '.join(path.name for path in files)}")
     if site is not None:
         with progress_bar(quiet=quiet) as advance:

@@ -15,15 +15,7 @@ from typer import Argument, Option, echo
 
 import shiftsim
 from shiftsim import cli
-from shiftsim.cli import (
-    Json,
-    Quiet,
-    plural,
-    print_json,
-    print_result,
-    progress_bar,
-    stdout_to_stderr,
-)
+from shiftsim.cli import Json, Quiet, plural, print_result, progress_bar, stdout_to_stderr
 from shiftsim.cli.report import print_worst
 from shiftsim.errors import ConfigError
 from shiftsim.files import DEFAULT_STORE, read_toml, store_path
@@ -80,7 +72,7 @@ def run_settings(
     quiet: bool,
     as_json: bool = False,
 ) -> None:
-    """Run what the settings  print what it gave, and leave with the right code."""
+    """Run what the settings say, print what it gave, and leave with the right code."""
     from shiftsim.runs.execute import execute
     from shiftsim.runs.prepare import prepare
 
@@ -269,7 +261,7 @@ def leave_with(finished: "Run", *, allow_partial: bool, as_json: bool) -> None:
     if as_json:
         from shiftsim.report.scores import summary
 
-        print_json(summary(finished))
+        cli.print_json(summary(finished))
     else:
         _print_results(finished, allow_partial=allow_partial)
     if not finished.is_complete:
@@ -313,12 +305,11 @@ def _print_results(finished: "Run", *, allow_partial: bool) -> None:
     controller="What moved the ego there, of files: a label. [elsewhere]",
 )
 def score(
-    *,
+    settings: cli.Settings,
     source: Path = Argument(metavar="RUN|FILE", help="A run; poses; nuPlan's simulation logs."),
     tracks: str = Option("", help="The others: a table of boxes, or recorded. Of files."),
     point: str = Option("", help="rear_axle or center, whose poses files hold. [rear_axle]"),
     partial: bool = Option(False, "--partial", help="Also rollouts that end early; labelled so."),
-    settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -382,13 +373,12 @@ def bundle(
 
 @cli.with_settings("workers", "limit")
 def demo(
+    settings: cli.Settings,
     out: Path | None = Option(None, help="Folder of the store."),
     towns: int | None = Option(
         None, min=1, help="Only make a store of N random towns to train in."
     ),
     seed: int | None = Option(None, min=0, help="Of the random towns; same seed, same bytes. [0]"),
-    *,
-    settings: cli.Settings,
     quiet: Quiet = False,
 ) -> None:
     """Generate small recordings, convert them, run three planners clean and disturbed.

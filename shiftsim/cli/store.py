@@ -70,11 +70,10 @@ def _survey_lines(path: Path, found: "CheckReport") -> "Iterator[str]":
 
 @cli.with_settings("thresholds", "workers", thresholds="nuplan or deepplan. [deepplan]")
 def filter_scenarios(
+    settings: cli.Settings,
     store: Store,
     min_path: float | None = Option(None, help="Shortest path [m]. [5]"),
     min_progress: float | None = Option(None, help="Least share of it along the route. [0.5]"),
-    *,
-    settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -124,6 +123,7 @@ def _chosen(store: "ScenarioStore", settings: cli.Settings) -> tuple[str, ...]:
 
 @cli.with_settings("split", "all_scenarios")
 def make_split(
+    settings: cli.Settings,
     store: Store,
     out: Path = Option(
         ..., "--out", "-o", help="File to write: .toml (count and hash too) or .txt."
@@ -132,8 +132,6 @@ def make_split(
     cities: list[str] | None = Option(None, "--city", help="Repeatable. [all]"),
     per_type: int | None = Option(None, min=1, help="At most N of every type."),
     limit: int | None = Option(None, min=1, help="At most N in all."),
-    *,
-    settings: cli.Settings,
     as_json: Json = False,
 ) -> None:
     """Write a list of scenarios that --split takes, the same however often it is written.
@@ -159,10 +157,9 @@ def make_split(
 @export.command("nuplan")
 @cli.with_settings("split", "all_scenarios")
 def export_to_nuplan(
+    settings: cli.Settings,
     store: Store,
     out: Path = Option(..., "--out", "-o", help="Folder to write to."),
-    *,
-    settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -171,12 +168,10 @@ def export_to_nuplan(
     nuPlan's own code opens its four city maps whatever map is asked for: put them into the folder
     of the maps too, and merge the two index files.
     """
-    from shiftsim.data.nuplan.export import export_nuplan
-
     opened = cli.open_store(store)
     tokens = _chosen(opened, settings)
     with progress_bar(quiet=quiet or as_json) as advance:
-        report = export_nuplan(opened, out, tokens=tokens, progress=advance)
+        report = opened.export_nuplan(out, tokens=tokens, progress=advance)
     mappings: list[dict[str, Any]] = [
         {"type": kind, "mapping": list(mapping), "scenarios": count}
         for (kind, mapping), count in sorted(report.mappings.items())
@@ -213,7 +208,7 @@ def _export_lines(report: "ExportReport", mappings: list[dict[str, Any]]) -> "It
 @export.command("results")
 @cli.with_settings("store", "workers", store="Store. [the one of the run]")
 def export_results(
-    *,
+    settings: cli.Settings,
     source: Path = Argument(metavar="RUN", help="A run with stored rollouts."),
     out: Path = Option(..., "--out", "-o", help="Folder to write to."),
     logs: Path | None = Option(
@@ -223,7 +218,6 @@ def export_results(
         None, envvar="NUPLAN_MAPS_ROOT", help="Folder of the maps, which nuBoard opens."
     ),
     tables_only: bool = Option(False, "--tables-only", help="Write no simulation logs."),
-    settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -257,17 +251,17 @@ def _result_lines(report: "ResultsExport", run: "Run", store: str) -> "Iterator[
 
 @cli.with_settings("split", "all_scenarios")
 def show_stats(
+    settings: cli.Settings,
     store: Store,
     by: str = Option("city", help="city or type."),
     style: str = Option("text", "--format", "-f", help="text, or csv with a row per scenario."),
     out: Path | None = Option(None, help="Write the table to this file."),
     figure: Path | None = Option(None, help="Draw bars into this file (.png, .svg, .pdf)."),
-    *,
-    settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Scenarios, agents, speeds, lengths and interactions, per city and in all."""
+    from shiftsim.benchmarks import published
     from shiftsim.data.store.statistics import store_stats
     from shiftsim.report.dataset import draw_stats, stats_dict, stats_table
 
@@ -282,9 +276,10 @@ def show_stats(
     text = stats_table(found, by=by, style=style, width=width)
     if figure is not None:
         name = opened.path.resolve().name
-        draw_stats(found, figure, title=f"{name}: {plural(len(tokens), 'scenario')}")
+        title = f"{name}: {plural(len(tokens), 'scenario')}"
+        draw_stats(found, figure, published(), title=title)
     if as_json:
-        print_json(stats_dict(found))
+        print_json(stats_dict(found, published()))
         return
     if out is not None:
         out.write_text(text + "\n", "utf-8")

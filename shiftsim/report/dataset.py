@@ -8,7 +8,6 @@ from typing import Any, TypeAlias
 from shiftsim.data.store.statistics import (
     ALL,
     COLUMNS,
-    PUBLISHED_SCENARIOS,
     PUBLISHED_SETS,
     StoreStats,
     store_stats,
@@ -17,7 +16,7 @@ from shiftsim.errors import ConfigError, DataError, one_of
 from shiftsim.report.groups import DataSet, Group, distinct_sets
 from shiftsim.report.palette import AGENTS, new_figure, save_picture
 from shiftsim.report.paper import Published
-from shiftsim.report.tables import Number, Row, Table, csv_text, text
+from shiftsim.report.tables import Number, Record, Row, Table, render
 from shiftsim.runs.results import Run
 from shiftsim.runs.scenarios import open_run_store
 
@@ -36,7 +35,6 @@ _MEANS = {  # headings of the means
     "path_m": "path",
     "route_m": "route",
 }
-_HEADER = ("scenarios", *_MEANS.values(), "at intersections [%]")
 _AXES = {
     "interactions": "mean number of agents near\nthe ego's path within 3 s",
     "mean_speed_mps": "mean speed of the ego [m/s]",
@@ -49,45 +47,41 @@ _COLOURS = {f"{kind.name.lower()}s": colour for kind, colour in AGENTS.items()}
 _OWN: dict[str, Any] = {"color": "#4a5560"}
 _PUBLISHED: dict[str, Any] = {"facecolor": "white", "edgecolor": "#4a5560", "hatch": "////"}
 _LINE, _SETS_HEIGHT = 0.45, 1.5  # inches: a city, the published sets
-_SITES = {"sifi": "Sindelfingen", "str": "Stuttgart", "muc": "Munich", "ber": "Berlin"}
-_SITES |= {"sfo": "San Francisco", "muenchen": "Munich", "münchen": "Munich"}
-_SITES |= {name.casefold().replace(" ", ""): name for name in PUBLISHED_SCENARIOS}
-
-
-def published_scenarios(city: str) -> int | None:
-    """Scenarios that the published benchmark has of a site; None where it has none."""
-    plain = "".join(filter(str.isalpha, city.casefold()))
-    return PUBLISHED_SCENARIOS.get(_SITES.get(plain, ""))
 
 
 def stats_table(stats: StoreStats, *, by: str = "city", style: str = "text", width: int = 0) -> str:
     """Means per scenario of each group (`city` or `type`) and of all; `csv` has every scenario."""
     one_of("format", style, FORMATS)
-    if style == "csv":
-        rows = [["token", "city", "type", *COLUMNS]]
-        for token, row in stats.rows.items():
-            numbers = [repr(getattr(row, name)) for name in COLUMNS]
-            rows.append([token, stats.cities[token], stats.types[token], *numbers])
-        return csv_text(rows)
+    each: list[Row] = [
+        (
+            *(token, stats.cities[token], stats.types[token]),
+            *(Number(getattr(row, name)) for name in COLUMNS),
+        )
+        for token, row in stats.rows.items()
+    ]
+    full = Table("stats", "", ("token", "city", "type", *COLUMNS), each, 3)
     sets = ", ".join(f"{name} {count}" for name, count in PUBLISHED_SETS.items())
     notes = (_NOTE, f"published scenarios: {sets}")
-    return text(Table("stats", "", (by, *_HEADER), _means(stats, by), 1, notes), width)
+    table = Table.of("stats", "", _means(stats, by), 1, notes=notes, full=full)
+    return render(table, style, width=width)
 
 
-def _means(stats: StoreStats, by: str) -> list[Row]:
-    """A row of means per group and of all, under `_HEADER`."""
+def _means(stats: StoreStats, by: str) -> list[Record]:
+    """Means of each group and of all."""
     return [
-        (
-            name,
-            Number(row["scenarios"], 0),
-            *(Number(row[column], 1) if column in row else None for column in _MEANS),
-            Number(100.0 * row["intersection"], 0) if "intersection" in row else None,
-        )
+        {
+            by: name,
+            "scenarios": Number(row["scenarios"], 0),
+            **{text: Number(row[n], 1) if n in row else None for n, text in _MEANS.items()},
+            "at intersections [%]": (
+                Number(100.0 * row["intersection"], 0) if "intersection" in row else None
+            ),
+        }
         for name, row in stats.groups(by).items()
     ]
 
 
-def stats_dict(stats: StoreStats) -> dict[str, object]:
+def stats_dict(stats: StoreStats, published: Published) -> dict[str, object]:
     """The means as JSON values, with the published numbers beside them."""
     cities = stats.groups("city")
     return {
@@ -95,26 +89,26 @@ def stats_dict(stats: StoreStats) -> dict[str, object]:
         "types": stats.groups("type"),
         "published": {
             "scenarios": PUBLISHED_SETS,
-            "sites": {c: n for c in cities if (n := published_scenarios(c)) is not None},
+            "sites": {c: n for c in cities if (n := published.count(c)) is not None},
         },
     }
 
 
-def draw_stats(stats: StoreStats, path: Path, *, title: str) -> None:
+def draw_stats(stats: StoreStats, path: Path, published: Published, *, title: str) -> None:
     """Draw the store beside the published sets, and its cities; the path's ending is the format.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
         ConfigError: The ending is none that can be drawn.
     """
-    figure = stats_figure(stats, title=title)
+    figure = stats_figure(stats, published, title=title)
     try:
         save_picture(figure, path)
     except ValueError as error:
         raise ConfigError(f"{path}: {error}", hint="use .png, .svg or .pdf") from error
 
 
-def stats_figure(stats: StoreStats, *, title: str) -> Any:
+def stats_figure(stats: StoreStats, published: Published, *, title: str) -> Any:
     """The picture of `draw_stats` as a matplotlib figure; all bars lie, so that names have room.
 
     Raises:
@@ -132,11 +126,11 @@ def stats_figure(stats: StoreStats, *, title: str) -> Any:
     sets.invert_yaxis()
 
     panels = lower.subplots(1, 4, sharey=True, width_ratios=(1.0, 1.5, 1.0, 1.0))
-    published = {city: published_scenarios(city) for city in cities}
     counts: list[_Bars] = [[(groups[city]["scenarios"], _OWN)] for city in cities]
-    for bars, number in zip(counts, published.values(), strict=True):
+    sites = [published.count(city) for city in cities]
+    for bars, number in zip(counts, sites, strict=True):
         bars += [(number, _PUBLISHED)] if number is not None else []
-    hatched = " (hatched: published)" if any(published.values()) else ""
+    hatched = " (hatched: published)" if any(sites) else ""
     _draw(panels[0], counts, "{:.0f}", f"scenarios{hatched}")
     pale = [
         [(row.get(kind, 0.0), {"color": c, "alpha": 0.45}) for kind, c in _COLOURS.items()]
@@ -194,15 +188,16 @@ def _statistics(run: Run, data: DataSet) -> StoreStats | str:
 
 def data_statistics(found: Mapping[str, StoreStats | str]) -> Table | None:
     """Means per scenario by city; None where no store could be read."""
-    rows: list[Row] = []
+    records: list[Record] = []
     notes = [_NOTE]
     for label, stats in found.items():
         if isinstance(stats, str):
             notes.append(f"{label}: {stats}")
         else:
-            rows += [(label, *row) for row in _means(stats, "city")]
-    header = ("set", "city", *_HEADER)
-    return Table("data-statistics", "The scenarios", header, rows, 2, notes) if rows else None
+            records += [{"set": label, **record} for record in _means(stats, "city")]
+    if not records:
+        return None
+    return Table.of("data-statistics", "The scenarios", records, 2, notes=notes)
 
 
 def benchmark_comparison(

@@ -17,7 +17,7 @@ from shiftsim.report.statistics import (
     compare,
     holm,
 )
-from shiftsim.report.tables import Cell, Interval, Number, Row, Table
+from shiftsim.report.tables import Cell, Interval, Number, Record, Row, Table
 from shiftsim.runs.results import Run
 
 ALL_KINDS = "all"
@@ -39,10 +39,10 @@ def planner_comparison(groups: Sequence[Group], *, noisy: bool = False) -> Table
         "95 % CI: cluster bootstrap over recordings; p: the sign of each recording's difference "
         "flipped at random; Holm: corrected for all pairs of the same set, traffic and noise",
     ]
-    rows, smallest = [], 0.0
+    records, smallest = list[Record](), 0.0
     for block in pairs:
         found, least = _compared(block)
-        rows += found
+        records += found
         smallest = max(smallest, least)
     few = min(block[0].data.num_recordings for block in pairs)
     if few < FEW_CLUSTERS:
@@ -54,38 +54,37 @@ def planner_comparison(groups: Sequence[Group], *, noisy: bool = False) -> Table
         words = "not compared, as rollouts are missing or no other planner has the same seeds"
         names = (f"{group.planner} {group.noise} {group.traffic}" for group in alone)
         notes.append(f"{words}: {', '.join(names)}")
-    labels = ("set", "traffic", "noise", "first", "second")
-    return Table(
+    return Table.of(
         "planner-comparison-noise" if noisy else "planner-comparison",
         f"Planners compared scenario by scenario{', under noise' if noisy else ', clean'}: "
         "difference of closed-loop scores × 100, first minus second",
-        (*labels, "difference", "95 % CI", "better/same/worse", "p", "p (Holm)"),
-        rows,
-        len(labels),
-        notes,
+        records,
+        5,
+        notes=notes,
     )
 
 
-def _compared(block: Sequence[Group]) -> tuple[list[Row], float]:
-    """A row per pair of groups, and the smallest p-value that their recordings allow."""
+def _compared(block: Sequence[Group]) -> tuple[list[Record], float]:
+    """A record per pair of groups, and the smallest p-value that their recordings allow."""
     clusters = cluster_codes(block[0].data.recordings)
     pairs = [*combinations(block, 2)]
     results = [
         compare(100.0 * a.scenario_means(), 100.0 * b.scenario_means(), clusters) for a, b in pairs
     ]
     corrected = holm([result.p_value for result in results])
-    rows: list[Row] = [
-        (
-            *(first.data.label, first.traffic, first.noise, first.planner, second.planner),
-            Number(result.difference),
-            result.interval,
-            f"{result.wins}/{result.ties}/{result.losses}",
-            Number(result.p_value, 4),
-            Number(p_value, 4),
-        )
+    records: list[Record] = [
+        {
+            **{"set": first.data.label, "traffic": first.traffic, "noise": first.noise},
+            **{"first": first.planner, "second": second.planner},
+            "difference": Number(result.difference),
+            "95 % CI": result.interval,
+            "better/same/worse": f"{result.wins}/{result.ties}/{result.losses}",
+            "p": Number(result.p_value, 4),
+            "p (Holm)": Number(p_value, 4),
+        }
         for (first, second), result, p_value in zip(pairs, results, corrected, strict=True)
     ]
-    return rows, max(result.smallest_p for result in results)
+    return records, max(result.smallest_p for result in results)
 
 
 def scenario_types(groups: Sequence[Group]) -> list[Table]:
@@ -116,26 +115,22 @@ def edited_scores(groups: Sequence[Group]) -> list[Table]:
         names = np.unique(kinds).tolist()
         grades = [*GRADES] if any(difficulties) else []
         is_noisy = any(group.noise != "none" for group in mine)
-        rows: list[Row] = []
+        total = "interPlan score" if data.is_interplan else "all"
+        records: list[Record] = []
         for group in mine:
             for name in [*names, ALL_KINDS] if len(names) > 1 else names:
-                part = group.only((kinds == name) | (name == ALL_KINDS))
-                grade = difficulties[(kinds == name) | (name == ALL_KINDS)]
-                noise = (group.noise,) if is_noisy else ()
-                count = Number(len(part.data.tokens), 0)
-                recorded = () if data.is_interplan else recorded_score(part, groups)[:1]
-                scores = (part.only(grade == one).estimate() for one in grades)
-                labels = (group.traffic, group.planner, *noise, name or "unknown", count)
-                rows.append((*labels, *recorded, *scores, part.estimate()))
-        header = [*("traffic", "planner"), *(["noise"] if is_noisy else []), "kind", "scenarios"]
-        num_labels = len(header) - 1
-        notes = [data.rules]
-        if data.is_interplan:
-            header += [*grades, "interPlan score"]
-            notes.append("interPlan score: its metrics and weights, mean over the scenarios")
-        else:
-            header += ["recorded", *grades, "all"]
-            notes.append("recorded: the same scenarios without the edit")
+                where = (kinds == name) | (name == ALL_KINDS)
+                part = group.only(where)
+                record: Record = {"traffic": group.traffic, "planner": group.planner}
+                record |= {"noise": group.noise} if is_noisy else {}
+                record |= {"kind": name or "unknown", "scenarios": Number(len(part.data.tokens), 0)}
+                if not data.is_interplan:
+                    record["recorded"] = recorded_score(part, groups)[0]
+                record |= {one: part.only(difficulties[where] == one).estimate() for one in grades}
+                records.append(record | {total: part.estimate()})
+        of_total = "interPlan score: its metrics and weights, mean over the scenarios"
+        without = "recorded: the same scenarios without the edit"
+        notes = [data.rules, of_total if data.is_interplan else without]
         if grades:
             each = ", ".join(f"{name} {most:g}" for name, most in GRADES.items())
             notes.append(
@@ -143,8 +138,9 @@ def edited_scores(groups: Sequence[Group]) -> list[Table]:
                 "PDM-Closed avoids it"
             )
         title = f"Edited scenarios: {data.label}, closed-loop score × 100"
-        name, best = f"edits_{data.name}", dict.fromkeys(header[num_labels + 1 :], max)
-        out.append(Table(name, title, tuple(header), rows, num_labels, notes, best=best))
+        num_labels, name = 3 + is_noisy, f"edits_{data.name}"
+        best = dict.fromkeys([*records[0]][num_labels + 1 :], max)
+        out.append(Table.of(name, title, records, num_labels, notes=notes, best=best))
     return out
 
 
@@ -183,21 +179,8 @@ def open_loop_scores(groups: Sequence[Group]) -> Table | None:
     each = {(group.run.path, group.planner): group for group in reversed(asked)}
     if not each:
         return None
-    errors = tuple(f"{name} {unit}" for name, unit, *_ in open_loop.METRICS.values())
-    header = (
-        "set",
-        "traffic",
-        "planner",
-        "noise",
-        "CLS",
-        "open loop",
-        *errors,
-        "missed",
-        "rollouts",
-        "plans",
-    )
-    rows = [_open_loop_row(group) for group in reversed(each.values())]
-    counts = dict.fromkeys(str(row[-1]) for row in rows if row[-1])
+    records = [_open_loop_record(group) for group in reversed(each.values())]
+    counts = dict.fromkeys(str(record["plans"]) for record in records if record["plans"])
     notes = (
         "CLS: closed loop under that noise; open loop: nuPlan's score of the plans along the "
         "recording; errors: means over plans and horizons of 3, 5 and 8 s; missed: largest share "
@@ -206,8 +189,9 @@ def open_loop_scores(groups: Sequence[Group]) -> Table | None:
         f"plans compared: {', '.join(counts)}",
     )
     title = "Open loop beside closed loop, scores × 100"
-    best = dict.fromkeys(("CLS", "open loop"), max) | dict.fromkeys((*errors, "missed"), min)
-    return Table("open-loop", title, header, rows, 4, notes, best=best)
+    scores, errors = [*records[0]][4:6], [*records[0]][6:-2]
+    best = dict.fromkeys(scores, max) | dict.fromkeys(errors, min)
+    return Table.of("open-loop", title, records, 4, notes=notes, best=best)
 
 
 def open_loop_values(group: Group, metric: str) -> FloatArray:
@@ -222,7 +206,7 @@ def open_loop_values(group: Group, metric: str) -> FloatArray:
     return np.array([np.nan if value is None else value for value in values])
 
 
-def _open_loop_row(group: Group) -> Row:
+def _open_loop_record(group: Group) -> Record:
     metrics = group.run.metrics
     mine = pc.and_(
         pc.equal(metrics["planner"], group.name), pc.equal(metrics["noise"], group.noise)
@@ -234,24 +218,26 @@ def _open_loop_row(group: Group) -> Row:
     )
     plans = metrics.filter(pc.and_(mine, pc.equal(metrics["metric"], open_loop.COUNT)))
     counted, there = sums.get(open_loop.COUNT), pc.sum(plans["threshold"]).as_py()
-    score = means.get(open_loop.TOTAL)
-    return (
-        *(group.data.label, group.traffic, group.planner, group.noise, group.estimate()),
-        None if score is None else Number(100.0 * score),
-        *(None if (e := means.get(name)) is None else Number(e) for name in open_loop.METRICS),
-        None if (rate := means.get(open_loop.MISS)) is None else Number(rate),
-        Number(len(plans), 0),
-        f"{counted:.0f} of {there:.0f}" if counted else None,
-    )
+
+    def mean(name: str, scale: float = 1.0) -> Number | None:
+        return None if (value := means.get(name)) is None else Number(scale * value)
+
+    return {
+        **{"set": group.data.label, "traffic": group.traffic, "planner": group.planner},
+        "noise": group.noise,
+        "CLS": group.estimate(),
+        "open loop": mean(open_loop.TOTAL, 100.0),
+        **{f"{error} {unit}": mean(m) for m, (error, unit, *_) in open_loop.METRICS.items()},
+        "missed": mean(open_loop.MISS),
+        "rollouts": Number(len(plans), 0),
+        "plans": f"{counted:.0f} of {there:.0f}" if counted else None,
+    }
 
 
 def planning_times(groups: Sequence[Group]) -> Table:
     """How long planners think, and how often the simulator's fallback plan had to do."""
     each = {(group.run.path, group.planner): group for group in groups}
     runs = {group.run.path: group.run for group in groups}
-    times = ("ms per step", "95 % ms", "worst 95 % ms", "s per rollout")
-    degraded = ("degraded steps", "in rollouts")
-    header = ("set", "traffic", "planner", "rollouts", *times, *degraded)
     notes = (
         "per step: mean and 95th percentile within a rollout, of both the median over the "
         "rollouts, which compilation at the start of a run does not touch; per rollout: the "
@@ -259,11 +245,12 @@ def planning_times(groups: Sequence[Group]) -> Table:
         *dict.fromkeys(f"machine: {_machine(run)}" for run in runs.values()),
     )
     title = "Planning time, and steps driven on a degraded (fallback) plan"
-    rows, best = [*map(_times_row, each.values())], dict.fromkeys((*times, *degraded), min)
-    return Table("planning-time", title, header, rows, 3, notes, best=best)
+    records = [*map(_times_record, each.values())]
+    best = dict.fromkeys([*records[0]][4:], min)
+    return Table.of("planning-time", title, records, 3, notes=notes, best=best)
 
 
-def _times_row(group: Group) -> Row:
+def _times_record(group: Group) -> Record:
     tasks, scores = group.run.tasks, group.run.scores
     finished = pc.equal(tasks["status"], "ok")
     done = tasks.filter(pc.and_(pc.equal(tasks["planner"], group.name), finished))
@@ -278,15 +265,16 @@ def _times_row(group: Group) -> Row:
         return Number(sum(found), digits) if found else None
 
     tail = known("planning_ms_p95")
-    return (
-        *(group.data.label, group.traffic, group.planner),
-        Number(len(done), 0),
-        *(medians("planning_ms_mean"), medians("planning_ms_p95")),
-        Number(float(tail.max())) if len(tail) else None,
-        medians("read_seconds", "simulate_seconds", "metrics_seconds", digits=3),
-        Number(int(degraded.sum()), 0),
-        Number(int(np.sum(degraded > 0)), 0),
-    )
+    return {
+        **{"set": group.data.label, "traffic": group.traffic, "planner": group.planner},
+        "rollouts": Number(len(done), 0),
+        "ms per step": medians("planning_ms_mean"),
+        "95 % ms": medians("planning_ms_p95"),
+        "worst 95 % ms": Number(float(tail.max())) if len(tail) else None,
+        "s per rollout": medians("read_seconds", "simulate_seconds", "metrics_seconds", digits=3),
+        "degraded steps": Number(int(degraded.sum()), 0),
+        "in rollouts": Number(int(np.sum(degraded > 0)), 0),
+    }
 
 
 def _machine(run: Run) -> str:

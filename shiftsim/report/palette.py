@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from shiftsim.errors import MissingExtraError
+from shiftsim.errors import import_extra
 from shiftsim.files import atomic_write
 from shiftsim.world.state import AgentKind
 
@@ -30,14 +30,10 @@ def new_figure(
     Raises:
         MissingExtraError: matplotlib is not installed.
     """
-    try:
-        import matplotlib
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtraError(
-            "pictures need matplotlib", hint="pip install 'shiftsim[plots]'"
-        ) from error
+    matplotlib: Any = import_extra("matplotlib", "plots")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     matplotlib.rcParams.update({"svg.hashsalt": "shiftsim", "pdf.fonttype": 42})
     figure = Figure(layout=layout, **settings)
     FigureCanvasAgg(figure)

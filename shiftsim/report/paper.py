@@ -43,6 +43,10 @@ class Published:
         found = (s for s, names in self.cities.items() if plain in map(_letters, (s, *names)))
         return next(found, "")
 
+    def count(self, city: str) -> int | None:
+        """Scenarios that the paper has of a city; None where it has none."""
+        return self.scenarios.get(self.abbreviation(city))
+
     def scores(self, traffic: str) -> dict[str, dict[str, float]]:
         """Values of `semantic_shift` under one traffic mode, by planner and column."""
         return {

@@ -73,14 +73,10 @@ def scores(groups: Sequence[Group], *, by: str | None = None) -> Table:
 def planner_notes(runs: Iterable[Run]) -> list[str]:
     """What a reader must know of planners: their weights, who saw the recording, who drove."""
     runs = list(runs)
-    made_up, own, informed = set[str](), set[str](), set[str]()
-    for name, identity in (pair for run in runs for pair in planner_identities(run).items()):
-        if str(identity.get("checkpoint", "")).startswith("deterministic:"):
-            made_up.add(name)
-        if identity.get("weights"):
-            own.add(f"{name}, {identity['weights']}")
-        if identity.get("sees_recording"):
-            informed.add(name)
+    found = [pair for run in runs for pair in planner_identities(run).items()]
+    made_up = {n for n, one in found if str(one.get("checkpoint")).startswith("deterministic:")}
+    own = {f"{n}, {one['weights']}" for n, one in found if one.get("weights")}
+    informed = {n for n, one in found if one.get("sees_recording")}
     notes = {
         f"MEANINGLESS: made-up weights of {', '.join(sorted(made_up))}": made_up,
         "; ".join(sorted(own)): own,

@@ -78,13 +78,10 @@ class Comparison(NamedTuple):
     losses: int  # scenarios on which the first is worse
 
 
-def compare(
-    first: FloatArray, second: FloatArray, clusters: IntArray, *, draws: int = DRAWS
-) -> Comparison:
+def compare(first: FloatArray, second: FloatArray, clusters: IntArray) -> Comparison:
     """Compare (S,) scores of two planners on the same scenarios, of the recordings `clusters`."""
     delta = first - second
-    interval = bootstrap_interval(delta, clusters, draws=draws)
-    tested = sign_flip_test(delta, clusters, draws=draws)
+    interval, tested = bootstrap_interval(delta, clusters), sign_flip_test(delta, clusters)
     counts = (int(np.sum(which)) for which in (delta > 0.0, delta == 0.0, delta < 0.0))
     return Comparison(float(delta.mean()), interval, *tested, *counts)
 

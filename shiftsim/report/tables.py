@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from textwrap import wrap
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from shiftsim.errors import one_of
 from shiftsim.report.words import LONG, legend
@@ -71,6 +71,7 @@ class Interval:
 
 Cell: TypeAlias = str | Number | Interval | None
 Row: TypeAlias = tuple[Cell, ...]
+Record: TypeAlias = dict[str, Cell]
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +89,14 @@ class Table:
     # measured columns, and what chooses the best number of each, `max` or `min`
     best: Mapping[str, Callable[[Iterable[float]], float]] = field(default_factory=dict)
     paper: "Table | None" = None  # the same for a paper, where it is another table
+
+    @classmethod
+    def of(
+        cls, name: str, title: str, records: Sequence[Record], num_labels: int, **more: Any
+    ) -> "Table":
+        """A table of records, one at least, whose keys are the header."""
+        rows = [tuple(record.values()) for record in records]
+        return cls(name, title, tuple(records[0]), rows, num_labels, **more)
 
     def __post_init__(self) -> None:
         for row in self.rows:
@@ -174,13 +183,8 @@ def _csv(table: Table) -> str:
         columns.append(["label", *labels])
     if table.notes:
         columns.append(["notes", *[" | ".join(table.notes)] * len(table.rows)])
-    return csv_text(zip(*columns, strict=True))
-
-
-def csv_text(rows: Iterable[Sequence[str]]) -> str:
-    """Rows as CSV, without a line end behind the last one."""
     out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows(rows)
+    csv.writer(out, lineterminator="\n").writerows(zip(*columns, strict=True))
     return out.getvalue().rstrip("\n")
 
 
@@ -194,32 +198,14 @@ def _labels(row: Row, header: Sequence[str]) -> str:
     return "; ".join(f"{n} {c.label}" for n, c in named if isinstance(c, Number) and c.label)
 
 
+_TEXT = "backslash asciitilde asciicircum less greater bar".split()
+_MATH = "pm times cdot geq leq surd sigma theta rightarrow Delta rho".split()
 _LATEX = {
     **{c: f"\\{c}" for c in "&%$#_{}"},
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "<": r"\textless{}",
-    ">": r"\textgreater{}",
-    "|": r"\textbar{}",
-    '"': "''",
-    "±": r"$\pm$",
-    "×": r"$\times$",
-    "·": r"$\cdot$",
-    "−": r"$-$",
-    "≥": r"$\geq$",
-    "≤": r"$\leq$",
-    "√": r"$\surd$",
-    "σ": r"$\sigma$",
-    "θ": r"$\theta$",
-    "–": "--",
-    "…": r"\dots{}",
-    "→": r"$\rightarrow$",
-    "Δ": r"$\Delta$",
-    "ρ": r"$\rho$",
-    "²": "$^2$",
-    "³": "$^3$",
-    "°": r"$^\circ$",
+    **{c: f"\\text{name}{{}}" for c, name in zip("\\~^<>|", _TEXT, strict=True)},
+    **{c: f"$\\{name}$" for c, name in zip("±×·≥≤√σθ→Δρ", _MATH, strict=True)},
+    **{c: f"${power}$" for c, power in zip("²³°−", ("^2", "^3", r"^\circ", "-"), strict=True)},
+    **{'"': "''", "–": "--", "…": r"\dots{}"},
 }
 _LATEX_TABLE = str.maketrans(_LATEX)
 

@@ -9,7 +9,6 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from threading import Event, Lock, Thread
 from time import monotonic
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -198,12 +197,7 @@ class LiveServer(LocalServer):
         Thread(target=self.serve_forever, args=(0.1,), daemon=True).start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
         """Let an open page see the end, and stop answering; the page keeps what it shows."""
         interrupted = kind is not None and issubclass(kind, KeyboardInterrupt)
         self.run.end("interrupted" if interrupted else "stopped" if kind else "finished")

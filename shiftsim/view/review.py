@@ -24,18 +24,9 @@ from shiftsim.data.store.review import (
 from shiftsim.errors import ConfigError
 from shiftsim.runs.filter import read_filter_results
 from shiftsim.sim.log import as_recorded
+from shiftsim.view import scene
 from shiftsim.view.pack import Quantised, pack
 from shiftsim.view.page import framed
-from shiftsim.view.scene import (
-    Fields,
-    Replay,
-    ShownRollout,
-    describe_scene,
-    indices_near,
-    line_fields,
-    rollout_fields,
-    scene_fields,
-)
 from shiftsim.view.serving import LocalServer
 from shiftsim.world.scenario import Scenario
 
@@ -90,13 +81,15 @@ class ReviewService:
             DataError: The store has no such scenario.
         """
         recorded = self.store.read_recorded(token)
-        replay = Replay(recorded, [ShownRollout("recorded", "none", 0, as_recorded(recorded))])
+        replay = scene.Replay(
+            recorded, [scene.ShownRollout("recorded", "none", 0, as_recorded(recorded))]
+        )
         blocks = _blocks_near(replay)
         result = self._filter_results.get(token) or {}
         return {
-            "meta": describe_scene(replay),
-            "scene": pack(scene_fields(replay)),
-            "rollout": pack(rollout_fields(replay, 0)),
+            "meta": scene.describe_scene(replay),
+            "scene": pack(scene.scene_fields(replay)),
+            "rollout": pack(scene.rollout_fields(replay, 0)),
             "blocks": pack(_block_fields(replay, blocks)),
             "blockIds": [recorded.map.blocks.ids[block] for block in blocks],
             "recordedRoute": list(recorded.route),
@@ -170,20 +163,20 @@ def _start_block(scenario: Scenario) -> int | None:
     return next(iter(on_route or found), None)
 
 
-def _blocks_near(replay: Replay) -> list[int]:
+def _blocks_near(replay: scene.Replay) -> list[int]:
     """Blocks that share a point with the box that is drawn, and those of the route."""
     layer = replay.scenario.map.blocks
     route = (layer.index[name] for name in replay.scenario.route if name in layer.index)
-    return sorted({*indices_near(layer, replay.box), *route})
+    return sorted({*scene.indices_near(layer, replay.box), *route})
 
 
-def _block_fields(replay: Replay, blocks: list[int]) -> Fields:
+def _block_fields(replay: scene.Replay, blocks: list[int]) -> scene.Fields:
     """Outlines of the blocks: rings per block, vertices per ring, vertices."""
     layer = replay.scenario.map.blocks
     rings = [layer.rings(block) for block in blocks]
     count = Quantised(np.array([len(group) for group in rings], float), 1.0)
     flat = [ring for group in rings for ring in group]
-    return {"blocks.rings": count, **line_fields("blocks", flat, replay.origin)}
+    return {"blocks.rings": count, **scene.line_fields("blocks", flat, replay.origin)}
 
 
 def review_server(service: ReviewService, port: int = 0) -> LocalServer:

@@ -14,17 +14,7 @@ import numpy as np
 from shiftsim.errors import ConfigError, MissingExtraError
 from shiftsim.kernels import FloatArray
 from shiftsim.report.palette import Style, new_figure, planner_styles, save_picture
-from shiftsim.view.drawing import (
-    SMALL,
-    Mark,
-    caption,
-    draw_map,
-    draw_moment,
-    draw_scale,
-    draw_scene,
-    draw_violation,
-    spread_labels,
-)
+from shiftsim.view import drawing
 from shiftsim.view.scene import Replay, ShownRollout, box_around
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
@@ -84,24 +74,24 @@ def still(
     """
     row = _sample_at(scenario, shown, at)
     figure, axes, _ = _scene(scenario, shown, at, note)
-    draw_moment(axes, scenario, shown, _styles(shown), row)
+    drawing.draw_moment(axes, scenario, shown, _styles(shown), row)
     return figure
 
 
 def _scene(
     scenario: Scenario, shown: Sequence[ShownRollout], at: float, note: str
-) -> tuple[Any, Any, list[Mark]]:
+) -> tuple[Any, Any, list[drawing.Mark]]:
     """Figure and axes with all that does not move, and the marks of violations."""
     extent, styles = _extent(Replay(scenario, shown).paths), _styles(shown)
     figure, ((axes,),) = _panels(1, 1, extent)
-    draw_scene(axes, scenario, shown, styles, extent)
-    found = (draw_violation(axes, item, styles[item.planner]) for item in shown)
+    drawing.draw_scene(axes, scenario, shown, styles, extent)
+    found = (drawing.draw_violation(axes, item, styles[item.planner]) for item in shown)
     marks = [mark for mark in found if mark]
-    draw_scale(axes, extent)
+    drawing.draw_scale(axes, extent)
     _heading(axes, scenario, at)
-    axes.set_xlabel(note, fontsize=SMALL)
+    axes.set_xlabel(note, fontsize=drawing.SMALL)
     _add_legend(figure, axes)
-    spread_labels(figure, axes, marks)
+    drawing.spread_labels(figure, axes, marks)
     return figure, axes, marks
 
 
@@ -121,15 +111,17 @@ def grid(
     per_line = max(20, int(15 * sides[1] / sides[0] * _width(len(at), extent)))  # characters
     for item, line in zip(shown, panels, strict=True):
         for row, axes in zip(rows, line, strict=True):
-            draw_scene(axes, scenario, [item], styles, extent)
-            draw_moment(axes, scenario, [item], styles, row)
-            draw_violation(axes, item, styles[item.planner], in_short=True)
-        line[0].set_ylabel(_wrapped(caption(item, shown), per_line), fontsize=SMALL - 1)
+            drawing.draw_scene(axes, scenario, [item], styles, extent)
+            drawing.draw_moment(axes, scenario, [item], styles, row)
+            drawing.draw_violation(axes, item, styles[item.planner], in_short=True)
+        line[0].set_ylabel(
+            _wrapped(drawing.caption(item, shown), per_line), fontsize=drawing.SMALL - 1
+        )
     for time, axes in zip(at, panels[0], strict=True):
-        axes.set_title(f"{time:g} s", fontsize=SMALL + 1)
-    draw_scale(panels[-1][0], extent)
-    figure.supxlabel("\n".join(filter(None, (_KEY, note))), fontsize=SMALL - 1)
-    figure.suptitle(_words(scenario), fontsize=SMALL + 1)
+        axes.set_title(f"{time:g} s", fontsize=drawing.SMALL + 1)
+    drawing.draw_scale(panels[-1][0], extent)
+    figure.supxlabel("\n".join(filter(None, (_KEY, note))), fontsize=drawing.SMALL - 1)
+    figure.suptitle(_words(scenario), fontsize=drawing.SMALL + 1)
     return figure
 
 
@@ -144,8 +136,8 @@ def overview(thing: Scenario | VectorMap) -> Any:
     bounds = thing.edges.polygons.bounds
     extent = _extent([bounds[:, :2], bounds[:, 2:]])
     figure, ((axes,),) = _panels(1, 1, extent)
-    draw_map(axes, thing, (), extent)
-    draw_scale(axes, extent)
+    drawing.draw_map(axes, thing, (), extent)
+    drawing.draw_scale(axes, extent)
     return figure
 
 
@@ -162,9 +154,9 @@ def before_and_after(recorded: Scenario, edited: Scenario) -> Any:
     extent = _extent([recorded.expert[:, :2], edited.expert[:, :2], changed])
     figure, (both,) = _panels(1, 2, extent)
     for scenario, axes in zip((recorded, edited), both, strict=True):
-        draw_scene(axes, scenario, (), {}, extent)
-        draw_moment(axes, scenario, (), {}, 0)
-        draw_scale(axes, extent)
+        drawing.draw_scene(axes, scenario, (), {}, extent)
+        drawing.draw_moment(axes, scenario, (), {}, 0)
+        drawing.draw_scale(axes, extent)
         title = f"{scenario.token}  {scenario.scenario_type}"
         axes.set_title(title.replace("$", r"\$"), fontsize=9)
     ring = {"s": 90, "facecolors": "none", "edgecolors": _EDITED, "linewidths": 1.4, "zorder": 8}
@@ -234,7 +226,7 @@ def _add_legend(figure: Any, axes: Any) -> None:
     width, height = figure.get_size_inches()
     is_tall = height > 1.3 * width
     place = "outside right upper" if is_tall else "outside lower left"
-    look: dict[str, Any] = {"fontsize": SMALL, "frameon": False, "handlelength": 3.0}
+    look: dict[str, Any] = {"fontsize": drawing.SMALL, "frameon": False, "handlelength": 3.0}
     handles, labels = axes.get_legend_handles_labels()
     length = 38 if is_tall else 85  # characters
     labels = [_wrapped(label, length, subsequent_indent="  ") for label in labels]
@@ -259,7 +251,7 @@ def _words(scenario: Scenario) -> str:
 
 
 def _heading(axes: Any, scenario: Scenario, time: float) -> None:
-    axes.set_title(f"{_words(scenario)}  {time:.1f} s", fontsize=SMALL + 1)
+    axes.set_title(f"{_words(scenario)}  {time:.1f} s", fontsize=drawing.SMALL + 1)
 
 
 def _film(path: Path, scenario: Scenario, shown: Sequence[ShownRollout], note: str) -> None:
@@ -279,7 +271,7 @@ def _film(path: Path, scenario: Scenario, shown: Sequence[ShownRollout], note: s
     figure.set_layout_engine("none")  # it is laid out, and each frame would be again
     with writer.saving(figure, str(path), _FILM_DPI):
         for row, time in enumerate(_times(scenario, shown).tolist()):
-            drawn = draw_moment(axes, scenario, shown, styles, row)
+            drawn = drawing.draw_moment(axes, scenario, shown, styles, row)
             for mark in marks:
                 for artist in (mark.burst, mark.label):
                     artist.set_visible(mark.time <= time + 1e-6)

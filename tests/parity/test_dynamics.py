@@ -268,17 +268,19 @@ def test_idm_world(path: Path, cases: Cases) -> None:
     for iteration, rows in enumerate(frames[: scenario.num_iterations]):
         if iteration:
             traffic.step(iteration - 1, scenario.ego[iteration - 1], tracks, iteration)
-        where, index = f"{name} {iteration}", np.array(list(traffic.routes), np.int64)
+        fleet, where = traffic._scene.fleet, f"{name} {iteration}"
+        index, alive = traffic._scene.agents[fleet.alive], np.flatnonzero(fleet.alive)
         vehicles = np.flatnonzero(tracks.valid[iteration] & is_vehicle)
         cases.compare("idm_world tracks", where, vehicles, index)
         values = np.array(rows, np.object_).reshape(-1, len(VEHICLE_COLUMNS)).T
         theirs = File("idm_world", "column", dict(zip(columns, values, strict=True)), cases)
         theirs.match(where, {"token": [tracks.tokens[i] for i in index.tolist()]})
         numbers = [tracks.poses[iteration, index], tracks.velocities[iteration, index]]
-        ours = np.column_stack([*numbers, traffic.path_speeds]).T
+        ours = np.column_stack([*numbers, fleet.speed[fleet.alive]]).T
         theirs.match(where, dict(zip(NUMBERS, ours, strict=True)), WORLD)
         assert len(index) == len(rows)
-        for row, route in enumerate(traffic.routes.values()):
+        for row, agent in enumerate(alive.tolist()):
+            route = fleet.route[agent, : fleet.route_size[agent]].tolist()
             edges = {"route_edge_ids": [scenario.map.edges.ids[edge] for edge in route]}
             theirs.at(row).match(f"{where} vehicle {row}", edges)
     world.finish(cases, "idm_world")

@@ -62,9 +62,9 @@ def compare_series(
     ours = {
         "driven_route": [measured.route.ids(road, i) for i in samples],
         "corner_routes": [[corners.ids(road, i, corner) for corner in range(4)] for i in samples],
-        "common_or_connected": measured.is_common,
+        "common_or_connected": measured.lanes.is_common,
         "corners_in_drivable_area": ~measured.drivable.outside.any(axis=1),
-        "at_fault_times": measured.at_fault_times,
+        "at_fault_times": [one.time_us for one in measured.collisions if one.at_fault],
         "at_fault_counts": at_fault_counts(measured.collisions),
         "time_to_collision": np.where(np.isinf(measured.ttc.values), np.nan, measured.ttc.values),
         "overspeed": measured.overspeed,

@@ -145,12 +145,13 @@ def compare_route(run: Any, measured: Any, road: VectorMap, tables: dict[str, Ro
     route: dict[str, Any] = {
         "iteration": np.arange(len(samples)),
         "center": [",".join(measured.route.ids(road, i)) for i in samples],
-        "in_common_or_connected": measured.is_common,
+        "in_common_or_connected": measured.lanes.is_common,
     }
     for number, name in enumerate(CORNERS):
         route[name] = [",".join(corners.ids(road, i, number)) for i in samples]
     tables["route"].match(run, route)
     contacts = measured.collisions
+    at_fault = {one.time_us for one in contacts if one.at_fault}
     collisions = {
         "time_us": [one.time_us for one in contacts],
         "track_token": [one.token for one in contacts],
@@ -158,7 +159,7 @@ def compare_route(run: Any, measured: Any, road: VectorMap, tables: dict[str, Ro
         "collision_type": [f"{one.collision_type.upper()}_COLLISION" for one in contacts],
         "delta_v": [one.delta_v for one in contacts],
         "at_fault": [one.at_fault for one in contacts],
-        "timestamp_has_at_fault": [one.time_us in measured.at_fault_times for one in contacts],
+        "timestamp_has_at_fault": [one.time_us in at_fault for one in contacts],
     }
     tables["collisions"].match(run, collisions, {"delta_v": 1e-9})
 

@@ -9,13 +9,13 @@ from pictures import cut_off, overlaps, written
 from stores import write_toy_store
 from worlds import cruise_scenario, standing_tracks
 
+from shiftsim.benchmarks import published
 from shiftsim.cli import main
 from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.statistics import PUBLISHED_SETS, scenario_stats, store_stats
 from shiftsim.errors import ConfigError
 from shiftsim.report.dataset import (
     draw_stats,
-    published_scenarios,
     stats_dict,
     stats_figure,
     stats_table,
@@ -105,7 +105,7 @@ def test_tables_hold_the_means_and_the_published_numbers(store):
     rows = stats_table(found, style="csv").splitlines()
     assert len(rows) == 5
     assert float(dict(zip(rows[0].split(","), rows[1].split(","), strict=True))["path_m"]) > 14.0
-    assert stats_dict(found)["published"]["sites"] == {}
+    assert stats_dict(found, published())["published"]["sites"] == {}
     with pytest.raises(ConfigError, match="format 'xls'"):
         stats_table(found, style="xls")
 
@@ -115,25 +115,25 @@ def test_tables_hold_the_means_and_the_published_numbers(store):
     [("sindelfingen", 490), ("SIFI", 490), ("san_francisco", 180), ("BER", 101), ("street", None)],
 )
 def test_sites_of_the_published_benchmark_are_recognised(city, count):
-    assert published_scenarios(city) == count
+    assert published().count(city) == count
 
 
 def test_the_picture_is_drawn_the_same_again(store, tmp_path):
     found = store_stats(store)
     found = replace(found, cities=dict(zip(found.rows, ["Berlin", "a", "a", "MUC"], strict=True)))
     for name in ("one.png", "two.png"):
-        draw_stats(found, tmp_path / name, title="toy")
+        draw_stats(found, tmp_path / name, published(), title="toy")
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
     assert (tmp_path / "one.png").read_bytes()[:4] == b"\x89PNG"
     with pytest.raises(ConfigError, match="not supported"):
-        draw_stats(found, tmp_path / "one.bmpx", title="toy")
+        draw_stats(found, tmp_path / "one.bmpx", published(), title="toy")
 
 
 def test_the_picture_shows_published_sets_beside_ours_and_labels_all_axes(store):
     found = store_stats(store)
     cities = ["Berlin", "San Francisco", "a", "Sindelfingen"]
     found = replace(found, cities=dict(zip(found.rows, cities, strict=True)))
-    figure = stats_figure(found, title="toy: 4 scenarios")
+    figure = stats_figure(found, published(), title="toy: 4 scenarios")
     sets, counts, *others = figure.axes
     assert [bar.get_width() for bar in sets.patches] == [4, *PUBLISHED_SETS.values()]
     assert sorted(bar.get_width() for bar in counts.patches) == [1, 1, 1, 1, 101, 180, 490]

@@ -144,26 +144,6 @@ class IdmTraffic:
             _remove(tracks, row, gone)
             self._stopped = self._stopped[~far]
 
-    @property
-    def routes(self) -> dict[int, list[int]]:
-        """The last edges of each agent's route, oldest first, by track; agents that are left."""
-        if self._scene is None:
-            return {}
-        fleet = self._scene.fleet
-        return {
-            int(self._scene.agents[a]): fleet.route[a, : fleet.route_size[a]].tolist()
-            for a in np.flatnonzero(fleet.alive)
-        }
-
-    @property
-    def path_speeds(self) -> FloatArray:
-        """Speeds along their paths of the agents that are left, in their order [m/s]."""
-        if self._scene is None:
-            return np.zeros(0)
-        fleet = self._scene.fleet
-        speeds: FloatArray = fleet.speed[fleet.alive]
-        return speeds
-
 
 def _remove(tracks: Tracks, row: int, which: np.ndarray) -> None:
     """Remove tracks (a mask) from a row on."""
