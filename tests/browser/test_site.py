@@ -1,0 +1,118 @@
+"""The site of the documentation: it fits a phone, can be read in both modes, and searches."""
+
+import shutil
+import subprocess
+import sys
+
+import pytest
+from places import REPOSITORY
+
+LOADED = "document.readyState === 'complete'"
+PHONE, DESK = (390, 844), (1440, 900)
+LEAST_CONTRAST = 4.5
+FAINT = """(() => {
+  const parse = (text) => {
+    const parts = text.match(/[\\d.]+/g).map(Number);
+    const unit = text.startsWith("color(") ? 255 : 1;
+    return [...parts.slice(0, 3).map((part) => part * unit), parts[3] ?? 1];
+  };
+  const over = (above, below) =>
+    [0, 1, 2].map((i) => above[i] * above[3] + below[i] * (1 - above[3])).concat(1);
+  const luminance = (colour) => {
+    const linear = colour.slice(0, 3).map((part) => {
+      const share = part / 255;
+      return share <= 0.04045 ? share / 12.92 : ((share + 0.055) / 1.055) ** 2.4;
+    });
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2];
+  };
+  const found = [];
+  const texts = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  while (texts.nextNode()) {
+    const element = texts.currentNode.parentElement, text = texts.currentNode.data.trim();
+    const box = element.getBoundingClientRect();
+    if (!text || !box.width || element.closest("script, style")) continue;
+    if (!element.checkVisibility({ opacityProperty: true, visibilityProperty: true })) continue;
+    let ground = [255, 255, 255, 1], opacity = 1;
+    const chain = [];
+    for (let node = element; node; node = node.parentElement) chain.unshift(getComputedStyle(node));
+    for (const style of chain) {
+      ground = over(parse(style.backgroundColor), ground);
+      opacity *= style.opacity;
+    }
+    const colour = parse(chain.at(-1).color);
+    colour[3] *= opacity;
+    const pair = [luminance(over(colour, ground)), luminance(ground)].sort((a, b) => b - a);
+    const contrast = (pair[0] + 0.05) / (pair[1] + 0.05);
+    if (contrast < LEAST) found.push(`${contrast.toFixed(2)} ${text.slice(0, 40)}`);
+  }
+  return found;
+})()""".replace("LEAST", str(LEAST_CONTRAST))
+
+
+@pytest.fixture(scope="module")
+def site():
+    """The built site; Zensical writes nowhere but inside the repository."""
+    pytest.importorskip("zensical", reason="needs the dependency group `docs`")
+    folder = REPOSITORY / "build" / "browsed"
+    command = [sys.executable, "tools/site.py", "build/browsed"]
+    subprocess.run(command, cwd=REPOSITORY, check=True, capture_output=True)
+    yield folder
+    shutil.rmtree(folder)
+
+
+def prefer(page, mode):
+    """Let the browser ask for light or dark pages."""
+    features = [{"name": "prefers-color-scheme", "value": mode}]
+    page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+
+
+def test_every_page_fits_a_phone_and_asks_no_other_server(page, site):
+    for path in sorted(site.rglob("*.html")):
+        if path.name == "404.html":
+            continue  # for the root of a server
+        page.open(path.as_uri(), PHONE, LOADED)
+        assert page.run("document.documentElement.scrollWidth") <= PHONE[0], path.name
+        asked = page.run("performance.getEntriesByType('resource').map((entry) => entry.name)")
+        assert [name for name in asked if not name.startswith("file:")] == []
+
+
+@pytest.mark.parametrize("mode", ["light", "dark"])
+def test_text_stands_out_from_its_ground(page, site, mode):
+    prefer(page, mode)
+    schemes = {"light": "default", "dark": "slate"}
+    for name in ("index", "quickstart", "metrics", "nuplan_rules", "api", "api/run", "api/command"):
+        page.open((site / f"{name}.html").as_uri(), DESK, LOADED)
+        page.wait(f"document.body.dataset.mdColorScheme === '{schemes[mode]}'")
+        assert page.run(FAINT) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "place"), [("time to collision", "metrics.html"), ("open_run", "api/run.html")]
+)
+def test_the_search_finds_metrics_and_pages_of_the_api(page, site, words, place):
+    page.open((site / "index.html").as_uri(), DESK, LOADED)
+    page.browser.find_element("css selector", ".md-search__button").click()
+    page.wait("!!document.activeElement.shadowRoot?.activeElement")
+    page.press(words)
+    page.wait(f"!!document.activeElement.shadowRoot.querySelector('a[href*=\"{place}\"]')")
+
+
+def test_the_rules_are_a_table_that_can_be_filtered(page, site):
+    page.open((site / "nuplan_rules.html").as_uri(), DESK, LOADED)
+    rows = "[...document.querySelectorAll('.rules tr:has(details)')]"
+    shown = f"{rows}.filter((row) => row.checkVisibility())"
+    everything = page.run(f"{shown}.length")
+    assert everything > 200
+    box = page.browser.find_element("css selector", ".rules-filter input")
+    box.send_keys("expert one sample")
+    page.wait(f"{shown}.length < 10")
+    assert "71" in page.run(f"{shown}.map((row) => row.cells[0].textContent)")
+    assert page.run("document.querySelector('[role=status]').textContent") != ""
+
+
+def test_a_link_to_a_rule_opens_it(page, site):
+    address = (site / "nuplan_rules.html").as_uri()
+    page.open(f"{address}#71-the-expert-has-one-sample-more-than-the-ego", DESK, LOADED)
+    page.wait(
+        "document.querySelector('.rules details[open]')?.textContent.includes('T - 1 samples')"
+    )
