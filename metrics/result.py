@@ -127,7 +127,7 @@ class MetricPart:
         row: MetricRow, *statistics: tuple[str, str, str, float], series: Series | None = None
     ) -> "MetricPart":
         """A row, statistics of its metric, each a name, unit, kind and value, and its series."""
-        named = (Statistic(row.metric, *about, float(value)) for *about, value in statistics)
+        named = (Statistic(row.metric, n, unit, kind, float(v)) for n, unit, kind, v in statistics)
         return MetricPart(row, tuple(named), series)
 
 

@@ -1,24 +1,32 @@
 """What `import shiftsim` offers that joins layers which may not import one another.
 
-The other public names are where they are defined; `shiftsim/__init__.py` lists all of them.
+The other public names are where they are defined; `shiftsim/__init__.py` lists all of them. At the
+end come what notebooks show of scenarios, maps and rollouts, which know nothing of pictures, and
+what objects answer when they are asked for something by another name.
 """
 
+import html
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import shiftsim.api.notebook  # pictures, and answers to other names
 import shiftsim.edits  # noqa: F401  # attaches Scenario.edited
 from shiftsim.api.stores import demo_store as demo_store
 from shiftsim.data import open_store as open_store
-from shiftsim.errors import ConfigError
+from shiftsim.data.store.reading import ScenarioStore
+from shiftsim.errors import ConfigError, MissingExtraError, no_attribute
 from shiftsim.files import DEFAULT_STORE, store_path
+from shiftsim.metrics import MetricResult
 from shiftsim.planners import registry
+from shiftsim.runs import results
 from shiftsim.sim import loop
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
-from shiftsim.sim.planner import Planner
+from shiftsim.sim.planner import Observation, Planner, SceneInfo
+from shiftsim.view.still import overview, svg_of
+from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario, require_scenario
+from shiftsim.world.state import EgoState, Tracks, Trajectory, speeds
 
 if TYPE_CHECKING:
     from shiftsim.api.finished import Run
@@ -266,6 +274,51 @@ def _with_methods(found: Any) -> "Run":
     from shiftsim.api.finished import Run
 
     return Run(found.path, found.manifest)
+
+
+def _picture_of(thing: Scenario | VectorMap) -> str:
+    """A scenario or a map as a picture; as text where matplotlib is missing."""
+    text = f"<pre>{html.escape(repr(thing))}</pre>"
+    try:
+        return f"{text}{svg_of(overview(thing))}"
+    except MissingExtraError:
+        return text
+
+
+def _table_of(log: SimulationLog) -> str:
+    """What can be said of a rollout without its map."""
+    driven = speeds(log.ego)
+    rows = {
+        "scenario": log.token,
+        "samples": len(log.ego),
+        "duration": f"{(log.time_us[-1] - log.time_us[0]) * 1e-6:.1f} s",
+        "speed": f"{driven.mean():.1f} m/s on average, {driven.max():.1f} m/s at most",
+        "tracks": log.tracks.num_tracks,
+        "noise": "yes" if log.noise.any() else "none",
+        "planning": f"{log.planning_seconds.mean() * 1e3:.2f} ms per step",
+    }
+    cells = (f"<tr><th>{name}</th><td>{html.escape(str(v))}</td></tr>" for name, v in rows.items())
+    return f"<table>{''.join(cells)}</table>"
+
+
+def _missing(self: Any, name: str) -> Any:
+    """`__getattr__` of what has no such attribute: says what may be meant."""
+    owners = [kind.__name__ for kind in type(self).__mro__]
+    # `dir` itself asks for attributes that begin like that
+    names = [] if name[0] == "_" else [other for other in dir(self) if other[0] != "_"]
+    raise no_attribute(f"{type(self).__name__!r} object", owners, name, names)
+
+
+setattr(SimulationLog, "_repr_html_", _table_of)  # noqa: B010
+for _kind in (Scenario, VectorMap):
+    setattr(_kind, "_repr_html_", _picture_of)  # noqa: B010
+    setattr(_kind, "plot", overview)  # noqa: B010
+_kinds: tuple[type, ...] = (
+    *(Scenario, ScenarioStore, Observation, SceneInfo, EgoState, Tracks),
+    *(SimulationLog, Trajectory, MetricResult, VectorMap, results.Run),
+)
+for _answering in _kinds:
+    setattr(_answering, "__getattr__", _missing)  # noqa: B010
 
 
 def __getattr__(name: str) -> Any:

@@ -153,8 +153,8 @@ def dsc3d(
         **cli.given(category_map=dict(word.split("=", 1) for word in category or ()) or None),
     }
     options = _options(config, flags)
-    where = {"site": site, "map_path": map_path}
-    make = partial(shiftsim.convert_dsc3d, source, **where, **settings, **vars(options))
+    rest: dict[str, Any] = {"site": site, "map_path": map_path, **settings, **vars(options)}
+    make = partial(shiftsim.convert_dsc3d, source, **rest)
     lines = partial(_site_lines, is_short=options.is_short)
     _convert(make, store, "site", lines, quiet=quiet, as_json=as_json)
 

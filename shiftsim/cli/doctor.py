@@ -165,9 +165,9 @@ def compile_kernels(advance: Advance) -> dict[str, Any]:
         store = demo_store(Path(folder, "demo"))
         for number, (planners, settings) in enumerate(runs):
             advance(number, len(runs), f"{', '.join(planners)} in {settings['traffic']} traffic")
-            chosen = {"store": str(store), "split": "demo-mini", "limit": 6, "workers": 1}
-            chosen |= {"noise": "ou-high", "out": f"{folder}/run-{number}", **settings}
-            shiftsim.run(planners, **chosen)
+            chosen: dict[str, Any] = {"store": str(store), "split": "demo-mini", "limit": 6}
+            chosen |= {"workers": 1, "noise": "ou-high", "out": f"{folder}/run-{number}"}
+            shiftsim.run(planners, **chosen | settings)
         advance(len(runs), len(runs))
     files = machine_code()
     return {

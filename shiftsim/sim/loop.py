@@ -93,7 +93,6 @@ class Rollout:
         self.warning = ""  # why the first plan is most likely not what was meant
         # nuPlan rule 12: the last answer of the planner is never executed
         self.num_samples = scenario.num_iterations - 1
-        self._times = scenario.iteration_times
         rows, start = rollout_rows(scenario)
         self._start = start
         # rows: the past samples, then the iterations; the ego is filled up to the present, the
@@ -168,14 +167,13 @@ class Rollout:
 
     def _note_fallback(self) -> None:
         """Note whether the plan is a fallback by the planner's own account."""
-        iteration = self.iteration
         if reason := getattr(self.planner, "degraded", ""):
             if self.setting.strict:
                 raise PlannerError(
-                    f"the planner fell back at iteration {iteration}: {reason}",
+                    f"the planner fell back at iteration {self.iteration}: {reason}",
                     hint="without --strict it continues, and the step is counted as degraded",
                 )
-            self._degraded[iteration] = True
+            self._degraded[self.iteration] = True
 
     def _checked(self, plan: Any) -> Trajectory | Command:
         """The plan in log time; its poses are noted."""
@@ -194,13 +192,12 @@ class Rollout:
         """Write the next state of the ego, and note the command."""
         iteration, row = self.iteration, self._start + self.iteration
         now_us, next_us = self._time_us[row : row + 2].tolist()
-        state, after = self._ego[row], self._ego[row + 1]
-        (accel, rate), command = self._noise[iteration], self._commands[iteration]
-        controller = self.setting.controller
+        after, controller = self._ego[row + 1], self.setting.controller
         if plan is None or controller == "log-playback":
             after[:] = self.scenario.ego[self.scenario.iteration_rows[iteration + 1]]
         elif controller == "lqr":
-            follow(plan, now_us, next_us, state, after, command, accel, rate)
+            states, command = (self._ego[row], after), self._commands[iteration]
+            follow(plan, (now_us, next_us), states, command, self._noise[iteration])
         elif isinstance(plan, Command):
             raise ConfigError(
                 "perfect tracking needs a planner that returns a trajectory, not a command",
@@ -218,7 +215,7 @@ class Rollout:
             ego=self._ego[samples],
             tracks=self._tracks.rows(samples),
             traffic_lights=self._lights.rows(samples),
-            expert_time_us=self._times,
+            expert_time_us=self.scenario.iteration_times,
             expert_ego=self.scenario.expert,
             route=self.scenario.route,
             commands=self._commands[: self.num_samples],
@@ -246,26 +243,20 @@ def executable(plan: Any, now_us: int, next_us: int, where: str = "") -> Traject
 
 def follow(
     plan: Trajectory | Command,
-    now_us: int,
-    next_us: int,
-    state: FloatArray,  # (11,) of the vehicle
-    after: FloatArray,  # (11,) receives the next state
-    command: FloatArray,  # (2,) receives the clean command
-    accel: float = 0.0,  # noise of the command [m/s^2]
-    rate: float = 0.0,  # the same [rad/s]
+    step: tuple[int, int],  # time stamps of both states [us]
+    states: tuple[FloatArray, FloatArray],  # (11,) of the vehicle, and the next one, to be written
+    command: FloatArray,  # (2,) receives the command, to which the noise (2,) is added
+    noise: FloatArray,
 ) -> None:
-    """Move a vehicle by an executable plan: tracker and kinematic bicycle, or that alone.
-
-    Raises:
-        InvalidTrajectoryError: The tracker cannot follow the plan.
-    """
+    """Move a vehicle by an executable plan: tracker and kinematic bicycle, or that alone."""
+    (now_us, next_us), (state, after), (accel, rate) = step, states, noise
     if isinstance(plan, Command):
         command[:] = plan.acceleration, plan.steering_rate
         command_and_step(now_us, next_us, state, command, accel, rate, after)
         return
-    times, states = plan.time_us, plan.states
-    status = track_and_step(now_us, next_us, state, times, states, accel, rate, after, command)
-    raise_for_status(status, now_us, times)
+    plan_us, poses = plan.time_us, plan.states
+    status = track_and_step(now_us, next_us, state, plan_us, poses, accel, rate, after, command)
+    raise_for_status(status, now_us, plan_us)
 
 
 def simulate(

@@ -280,14 +280,11 @@ def observe_log(
 ) -> Observation:
     """What a planner would see where the ego is as recorded, or in given states."""
     rows = past_rows(scenario, iteration, samples)
-    now = int(scenario.iteration_rows[iteration])
-    history = History(
-        readonly(scenario.time_us[rows]),
-        readonly(scenario.ego[rows] if ego is None else np.array(ego, np.float64, ndmin=2)),
-        (scenario.tracks.rows(rows) if tracks is None else tracks).readonly(),
-    )
-    lights = scenario.traffic_lights.rows(np.array([now])).readonly()
-    return Observation(iteration, int(scenario.time_us[now]), history, lights)
+    states = scenario.ego[rows] if ego is None else np.array(ego, np.float64, ndmin=2)
+    seen = scenario.tracks.rows(rows) if tracks is None else tracks
+    lights = scenario.traffic_lights.rows(rows)
+    builder = ObservationBuilder(scenario.time_us[rows], states, seen, lights)
+    return builder.at(iteration, len(rows) - 1)
 
 
 class ObservationBuilder:

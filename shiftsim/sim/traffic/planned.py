@@ -161,4 +161,5 @@ class PlannedTraffic:
         now_us, next_us = self._clock[row - 1], self._clock[row]
         answer = driver.planner.plan(driver.observations.at(iteration, row - 1))
         plan = executable(answer, now_us, next_us)
-        follow(plan, now_us, next_us, driver.ego[row - 1], driver.ego[row], np.empty(2))
+        states = driver.ego[row - 1], driver.ego[row]
+        follow(plan, (now_us, next_us), states, np.empty(2), np.zeros(2))
