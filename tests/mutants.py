@@ -33,6 +33,7 @@ from mutations import Mutant, names_of
 
 CPU_SECONDS = 60  # of a child; one that takes longer hangs
 DESCRIPTORS = (property, cached_property, staticmethod, classmethod)
+PLAIN = (bool, int, float, str, tuple, dict)
 MEMORY = 8 << 30  # bytes that a child may have mapped
 
 Name = tuple[str, str]  # a module and a top-level name of it
@@ -123,7 +124,8 @@ def _change_class(module: ModuleType, statement: ast.ClassDef) -> None:
     setattr(module, statement.name, old)
     for name, value in vars(new).items():
         is_code = callable(value) or isinstance(value, DESCRIPTORS)
-        if (is_code or name == "_field_defaults") and name not in ("__setattr__", "__delattr__"):
+        is_value = isinstance(value, PLAIN) and name[:2] != "__" and name[-1] != "_"
+        if (is_code or is_value) and name not in ("__setattr__", "__delattr__"):
             with contextlib.suppress(TypeError, AttributeError):
                 setattr(old, name, value)
 

@@ -20,11 +20,17 @@ EDITED = "parity/test_scenario_edits.py::test_edits"
 OFFICIAL_PLANNERS = "parity/test_pdm.py"
 PDM_TESTS = (
     "planners/pdm/test_scorer.py",
+    "planners/proposals/test_contacts.py",
     *(f"{OFFICIAL_PLANNERS}::{name}" for name in ("test_kernel", "test_steps")),
     "planners/pdm/test_pdm.py",
     f"{OFFICIAL_PLANNERS}::test_loops",
 )
-IDM_TESTS = ("planners/test_idm.py", f"{OFFICIAL_PLANNERS}::test_idm_calls")
+IDM_TESTS = (
+    "planners/routes/test_lights.py",
+    "planners/routes/test_graph.py",
+    "planners/test_idm.py",
+    f"{OFFICIAL_PLANNERS}::test_idm_calls",
+)
 READER_TESTS = (
     "data/readers/test_build.py",
     "data/readers/test_dsc3d.py",
@@ -89,6 +95,7 @@ LEFT_OUT = (  # takes long, and notices little more
     "data/readers/tracks/test_reader.py::test_the_command_converts_and_draws",
     "sim/traffic/test_idm.py::test_order_of_replayed_objects_does_not_matter",
     "planners/pdm/test_pdm.py::test_tracks_of_a_corridor_are_those_its_polygon_touches",
+    "planners/proposals/test_proposals.py::test_an_area_holds_the_points_that_shapely_says",
 )
 TESTS_OF = {f"shiftsim.{name}": tests for group in GROUPS.values() for name, tests in group.items()}
 

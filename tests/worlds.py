@@ -1,13 +1,15 @@
 """Small worlds to simulate in: a straight two-lane road and whoever is on it."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import shapely
 
 from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
-from shiftsim.world.layers import Layer, make_layer
+from shiftsim.world.layers import make_layer, make_polylines
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import (
@@ -149,26 +151,31 @@ def moved_poses(poses: np.ndarray, angle: float, shift: np.ndarray) -> np.ndarra
     return out
 
 
-def moved_layer(layer: Layer, angle: float, shift: np.ndarray) -> Layer:
-    """A map layer after the same."""
-    shapes = [
-        shapely.transform(layer.shape(i), lambda xy: moved_points(xy, angle, shift))
-        for i in range(len(layer))
-    ]
-    return make_layer(layer.ids, shapes)
+def mapped(road: VectorMap, move: Callable[[np.ndarray], np.ndarray]) -> VectorMap:
+    """A map whose points (..., 2) all went elsewhere."""
+    layers = ("edges", "blocks", "intersections", "crosswalks", "drivable_areas")
+    lines = ("baselines", "left_boundaries", "right_boundaries")
+    changes: dict[str, Any] = {}
+    for name in layers:
+        layer = getattr(road, name)
+        shapes = [shapely.transform(layer.shape(i), move) for i in range(len(layer))]
+        changes[name] = make_layer(layer.ids, shapes)
+    for name in lines:
+        line = getattr(road, name)
+        changes[name] = make_polylines([move(line.at(i)) for i in range(len(line.ptr) - 1)])
+    return replace(road, **changes)
 
 
 def moved_map(road: VectorMap, angle: float, shift: np.ndarray) -> VectorMap:
-    """A map after the same."""
-    layers = ("edges", "blocks", "intersections", "crosswalks", "drivable_areas")
-    lines = ("baselines", "left_boundaries", "right_boundaries")
-    changes = {name: moved_layer(getattr(road, name), angle, shift) for name in layers}
-    for name in lines:
-        line = getattr(road, name)
-        xy = moved_points(line.xy, angle, shift)
-        xy.flags.writeable = False  # as in every map
-        changes[name] = line._replace(xy=xy)
-    return replace(road, **changes)
+    """A map after a rotation [rad] and a translation [m] of the world."""
+    return mapped(road, lambda xy: moved_points(xy, angle, shift))
+
+
+def bent_points(xy: np.ndarray, turn: float = 2.0, radius: float = 150.0) -> np.ndarray:
+    """Points (..., 2) beside the x axis, which becomes an arc to the left from a heading on."""
+    along, beside = xy[..., 0] / radius, radius - xy[..., 1]
+    arc = np.stack([beside * np.sin(along), radius - beside * np.cos(along)], axis=-1)
+    return moved_points(arc, turn, np.zeros(2))
 
 
 def moved(scenario: Scenario, angle: float, shift: np.ndarray) -> Scenario:

@@ -4,11 +4,21 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import given
+import shapely
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from worlds import cruise_scenario, standing_tracks, straight_road, with_velocities
+from strategies import seeds
+from worlds import (
+    bent_points,
+    cruise_scenario,
+    mapped,
+    standing_tracks,
+    straight_road,
+    with_velocities,
+)
 
 from shiftsim.errors import PlannerError
+from shiftsim.geometry.boxes import boxes_to_corners, wrap_angles
 from shiftsim.planners.idm import Idm
 from shiftsim.planners.routes.graph import search_levels
 from shiftsim.sim.planner import observe_log, scene_info
@@ -174,13 +184,13 @@ def test_a_reset_forgets_the_path_and_the_target_of_the_scenario_before():
     planner = Idm()
     fast = cruise_scenario(road=straight_road(20.0))
     other = cruise_scenario(road=straight_road(None), start=(10.0, 3.5, 0.0))
-    plans = []
     for scenario in (other, fast, other):
         planner.reset(scene_info(scenario))
-        plans.append(
-            planner.plan(observe_log(scenario, 0, ego=scenario.expert[0], samples=1)).states
-        )
-    np.testing.assert_array_equal(plans[0], plans[2])
+        assert planner.path is planner.route_plan is None
+        seen = observe_log(scenario, 0, ego=scenario.expert[0], samples=1)
+        plan, alone = planner.plan(seen), started(scenario).plan(seen)
+        np.testing.assert_array_equal(plan.states, alone.states)
+        np.testing.assert_array_equal(plan.time_us, seen.time_us + 500_000 * np.arange(17))
 
 
 def test_a_start_outside_the_route_takes_the_nearest_lane():
@@ -287,3 +297,68 @@ def test_speed_backwards_and_standing_still_give_finite_plans():
         centers, speeds = roll_out(cruise_scenario(), ego)
         assert np.isfinite(centers).all()
         assert speeds[-1] > 0.0
+
+
+BENT = mapped(straight_road(12.0), bent_points)  # headings pass through half a turn
+
+
+def slow_roll_out(path, ego, objects, speeds, headings):
+    """Box centres and speeds with shapely's corridors; None where several objects are touched."""
+    line = np.column_stack([path.driven.xy, np.unwrap(path.driven.heading)])
+    arc, end = path.driven.progress, path.driven.progress[-1]
+    progress, speed, rows = path.project(*ego.center[:2]), float(ego.values[VX]), []
+    for step in range(17):  # at first the ego is where it is, then on the path
+        at = np.clip(progress, 0.0, end)
+        x, y, heading = (np.interp(at, arc, column) for column in line.T)
+        rows.append((x, y, wrap_angles(np.array([heading]))[0], speed))
+        place = np.array([x, y, heading]) if step else ego.center
+        box = shapely.Polygon(boxes_to_corners(place, np.array([5.176, 2.297])))
+        far = min(at + 8.0 * 12.0, end)
+        inner = line[(arc > at) & (arc < far), :2]
+        ends = [[np.interp(s, arc, line[:, axis]) for axis in (0, 1)] for s in (at, far)]
+        ahead = shapely.LineString([ends[0], *inner, ends[1]])
+        corridor = ahead.buffer(0.5 * 2.297, cap_style="square").union(box)
+        met = np.flatnonzero(shapely.intersects(corridor, objects))
+        gap, lead_speed, away = end - progress - 2.588, 0.0, shapely.distance(objects, box)
+        if (away == 0.0).sum() > 1:
+            return None
+        if len(met):
+            lead = met[away[met].argmin()]
+            gap, lead_speed = away[lead], speeds[lead] * np.cos(headings[lead] - place[2])
+        closing = speed * (speed - lead_speed) / (2.0 * np.sqrt(3.0))
+        wanted = 1.0 + 1.5 * speed + closing
+        accel = 1.0 - (speed / 12.0) ** 4 - (wanted / max(gap, 1.0)) ** 2
+        progress += 0.5 * speed
+        speed = max(0.0, speed + 0.5 * np.clip(accel, -3.0, 1.0))
+    return np.array(rows)
+
+
+@settings(max_examples=15)
+@given(seeds)
+def test_plans_in_a_bend_are_those_of_a_slow_version(seed):
+    rng = np.random.default_rng(seed)
+    count, x0 = 5, float(rng.uniform(120.0, 280.0))
+    along = x0 + rng.uniform(-6.0, 45.0, count)
+    places = bent_points(np.column_stack([along, rng.uniform(-2.5, 2.5, count)]))
+    tracks = standing_tracks(NUM_ROWS, np.c_[places, rng.uniform(-3, 3, count)], [AgentKind(0)] * 5)
+    tracks.kinds[:] = rng.choice([0, 0, 1, 2, 4], count)
+    tracks.velocities[:] = rng.uniform(-4.0, 4.0, (count, 2))
+    tracks.sizes[:] = rng.uniform(0.5, 5.0, (count, 2))
+    x, y = bent_points(np.array([x0, 0.3]))
+    scenario = cruise_scenario(speed=float(rng.uniform(0.0, 12.0)), road=BENT, tracks=tracks)
+    ego = scenario.expert[0].copy()
+    ego[:3] = x, y, 2.0 + x0 / 150.0 + 0.1
+
+    planner = started(scenario)
+    seen = observe_log(scenario, 0, ego=ego, samples=1)
+    centers, speeds = planner.roll_out(seen)
+
+    poses, now = tracks.poses[60], seen.ego
+    near = np.hypot(*(poses[:, :2] - now.center[:2]).T) < 40.0
+    rings = shapely.polygons(boxes_to_corners(poses, tracks.sizes[60]))[near]
+    fast = np.where(tracks.kinds > 2, 0.0, np.hypot(*tracks.velocities[60].T))[near]
+    expected = slow_roll_out(planner.path, now, rings, fast, poses[near, 2])
+    assume(expected is not None)
+    np.testing.assert_allclose(centers[:, :2], expected[:, :2], rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(centers[:, 2], expected[:, 2], rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(speeds, expected[:, 3], rtol=0.0, atol=1e-6)

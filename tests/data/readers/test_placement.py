@@ -36,3 +36,28 @@ def test_lanes_and_other_drivable_areas_are_drivable():
 @pytest.mark.parametrize("x", [-5.0, 0.0, 100.5, 200.0, 900.0])
 def test_lanes_lead_along_the_nearest_segment(x):
     assert direction_at(ROAD.baselines, 0, x, 2.0) == (1.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("points", "looked_at"), [(0, 0), (2000, 2000), (4001, 2001), (6000, 2000)]
+)
+def test_at_most_some_thousand_places_are_looked_at(points, looked_at):
+    found = place_on_map(ROAD, np.tile([5.0, 0.0], (points, 1)), 0.95)
+    assert (found.num_points, found.num_drivable) == (looked_at, looked_at)
+    assert found.best_share == float(points > 0)
+    assert found.shift.tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize(("enough", "is_moved"), [(0.5, False), (0.51, True)])
+def test_a_better_place_is_looked_for_where_too_few_are_on_the_road(enough, is_moved):
+    points = np.column_stack([np.linspace(100.0, 300.0, 40), np.tile([-1.0, -4.0], 20)])
+    found = place_on_map(ROAD, points, enough)
+    assert (found.num_drivable, bool(found.shift.any())) == (20, is_moved)
+    assert found.best_share == (1.0 if is_moved else 0.5)
+    assert found.shift.tolist() == [0.0, 2.25 * is_moved]  # the smallest one that does
+
+
+def test_a_map_without_lanes_has_no_better_place():
+    road = build_map("none", edges=[], blocks=[])
+    found = place_on_map(road, PLACES, 0.95)
+    assert (found.num_drivable, found.best_share, found.shift.tolist()) == (0, 0.0, [0.0, 0.0])

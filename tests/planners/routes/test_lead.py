@@ -7,6 +7,7 @@ from corridors import bent_band, some_boxes
 
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.corridor import CLEAR, HIT
+from shiftsim.geometry.rings import SLACK
 from shiftsim.planners.routes.lead import (
     OVERLAPPING,
     find_lead,
@@ -56,3 +57,17 @@ def test_of_two_objects_that_are_touched_the_lower_one_leads_whatever_their_orde
         occupancy = np.array([OVERLAPPING, HIT, OVERLAPPING])
         keep_one_overlap(objects_of(rings), occupancy, footprint, {})
         assert occupancy.tolist() == [{1: HIT, lead: OVERLAPPING}.get(i, CLEAR) for i in range(3)]
+
+
+@pytest.mark.parametrize("turned", [0, 1, 2, 3, 4])
+def test_a_vertex_that_is_repeated_changes_no_gap(turned):
+    footprint = boxes_to_corners(np.zeros(3), np.array([4.0, 2.0]))
+    corner = np.array([[5.0, 0.3], [5.0, 0.3], [9.0, -4.0], [9.0, 4.0], [9.0, 4.0]])
+    found = find_lead(footprint, objects_of([np.roll(corner, turned, axis=0)]), np.array([HIT]))
+    assert found == (0, pytest.approx(3.0, abs=1e-12))
+
+
+def test_the_least_difference_of_gaps_decides():
+    footprint = boxes_to_corners(np.zeros(3), np.array([4.0, 2.0]))
+    rings = [footprint + np.array([7.0 + more, 0.0]) for more in (0.0, -0.5 * SLACK, 0.5 * SLACK)]
+    assert find_lead(footprint, objects_of(rings), np.full(3, HIT))[0] == 1
