@@ -57,7 +57,12 @@ GROUPS: dict[str, dict[str, tuple[str, ...]]] = {
             "metrics/test_open_loop.py",
         ),
         "sim.traffic": ("sim/traffic/test_own_traffic.py", "sim/traffic/test_learned.py", EDITED),
+        "sim.traffic.learned": (
+            "sim/traffic/test_learned_features.py",
+            "sim/traffic/test_learned.py",
+        ),
         "sim.traffic.idm": (
+            "sim/traffic/test_idm_paths.py",
             "parity/test_dynamics.py::test_idm_world",
             "sim/traffic/test_idm_buffer.py",
             "sim/traffic/test_idm.py",

@@ -15,10 +15,13 @@ SIZE = EgoBox(4.0, 2.0, 1.0)
 
 
 def some_areas(rng, count):
-    """Overlapping quadrilaterals, some of which hold an ego, and one with a hole."""
+    """Overlapping boxes, some of which hold an ego, one of them with a hole; and a star."""
     poses = rng.uniform([-12.0, -12.0, -3.0], [12.0, 12.0, 3.0], (count, 3))
     rings = [[ring] for ring in boxes_to_corners(poses, rng.uniform(3.0, 16.0, (count, 2)))]
     rings[0].append(poses[0, :2] + 0.1 * (rings[0][0] - poses[0, :2]))
+    angles = np.arange(24) * np.pi / 12.0
+    star = rng.uniform(2.0, 9.0, (24, 1)) * np.column_stack([np.cos(angles), np.sin(angles)])
+    rings[1] = [poses[1, :2] + star]
     return rings
 
 
@@ -31,6 +34,7 @@ def test_places_are_those_that_shapely_says(seed):
     chosen, by_center = rng.permutation(7)[:6], bool(rng.integers(2))
     states = np.zeros((3, 12, NUM_STATE))
     states[..., :3] = rng.uniform([-9.0, -9.0, -3.0], [9.0, 9.0, 3.0], (3, 12, 3))
+    states[0, :, :2] = rings[1][0][::2]  # on a boundary is not within
     areas = areas_of(make_polygons(rings), on_route, numbers)
     places = find_places(states, SIZE, areas, chosen, limits, by_center=by_center)
 
