@@ -67,7 +67,8 @@ def test_a_vertex_that_is_repeated_changes_no_gap(turned):
     assert found == (0, pytest.approx(3.0, abs=1e-12))
 
 
-def test_the_least_difference_of_gaps_decides():
-    footprint = boxes_to_corners(np.zeros(3), np.array([4.0, 2.0]))
+@pytest.mark.parametrize("place", [(0.0, 0.0), (-128.0, -64.0), (-128.0, 64.0), (128.0, -64.0)])
+def test_the_least_difference_of_gaps_decides(place):
+    footprint = boxes_to_corners(np.array([*place, 0.0]), np.array([4.0, 2.0]))
     rings = [footprint + np.array([7.0 + more, 0.0]) for more in (0.0, -0.5 * SLACK, 0.5 * SLACK)]
     assert find_lead(footprint, objects_of(rings), np.full(3, HIT))[0] == 1
