@@ -42,7 +42,10 @@ OPEN_DATA_TESTS = (
     "data/readers/test_open_data.py",
     "data/readers/test_open_data_faults.py",
 )
-TABLE_TESTS = tuple(f"data/readers/tracks/test_{name}.py" for name in ("reader", "diagnostics"))
+TABLE_TESTS = tuple(
+    f"data/readers/tracks/test_{name}.py"
+    for name in ("limits", "map_fit", "columns", "reader", "diagnostics")
+)
 # The tests of each module, fast ones first; a module's own file comes before those of its folder.
 # Every group has the same share of a sample.
 GROUPS: dict[str, dict[str, tuple[str, ...]]] = {

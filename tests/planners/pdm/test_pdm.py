@@ -88,6 +88,23 @@ def test_an_object_that_touches_the_ego_is_ignored_from_then_on():
     assert again.best == 4
 
 
+def test_a_plan_holds_the_poses_of_its_step():
+    scenario, planner = cruise_scenario(), PdmClosed()
+    planner.reset(scene_info(scenario))
+    seen = observe_log(scenario, 0, ego=scenario.expert[0], samples=1)
+    plan = planner.plan(seen)
+    np.testing.assert_array_equal(plan.time_us, seen.time_us + 100_000 * np.arange(81))
+    np.testing.assert_array_equal(plan.states[:, :3], one_step(scenario)[1].poses)
+    assert not plan.states[:, 3:].any()
+
+
+def test_a_negative_share_of_the_limit_looks_as_far_ahead():
+    """The ratio of speeds is raised to an even power."""
+    scenario = scenario_with([[40.0, 0.0, 0.0]], [VEHICLE])
+    plans = [one_step(scenario, speed_fractions=(share,))[1].poses for share in (0.8, -0.8)]
+    np.testing.assert_array_equal(*plans)
+
+
 def test_a_far_object_changes_nothing():
     _, alone = one_step(cruise_scenario())
     _, step = one_step(scenario_with([[-200.0, 0.0, 0.0]], [VEHICLE]))

@@ -1,5 +1,8 @@
 """Scores of PDM-Closed in small worlds made by hand."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from worlds import standing_tracks
@@ -7,13 +10,21 @@ from worlds import standing_tracks
 from shiftsim.geometry.polylines import make_path
 from shiftsim.planners.pdm.forecast import make_forecast, select_tracks, touched
 from shiftsim.planners.pdm.parameters import DEFAULT
-from shiftsim.planners.pdm.scorer import Place, Scores, _follow_route, normalise, score
+from shiftsim.planners.pdm.planner import choose
+from shiftsim.planners.pdm.scorer import (
+    Place,
+    Scores,
+    _follow_route,
+    normalise,
+    score,
+    weighted_mean,
+)
 from shiftsim.planners.proposals.areas import areas_of
 from shiftsim.planners.proposals.places import OFF_ROUTE, ego_box, find_places
 from shiftsim.planners.proposals.tracker import SCORED
 from shiftsim.planners.routes.lead import red_lights
 from shiftsim.world.layers import make_polygons
-from shiftsim.world.state import NUM_STATE, PACIFICA, VX, AgentKind, X
+from shiftsim.world.state import NUM_STATE, PACIFICA, VX, VY, AgentKind, X
 
 ROAD = np.array([[-50.0, -20.0], [150.0, -20.0], [150.0, 20.0], [-50.0, 20.0]])
 AREAS = areas_of(make_polygons([[ROAD]]), np.array([True]), np.array([0]))
@@ -97,5 +108,34 @@ def test_what_is_touched_comes_in_the_order_of_the_index():
 def test_tracks_are_seen_where_they_are_now():
     tracks = standing_tracks(2, np.zeros((1, 3)), [AgentKind.VEHICLE])
     tracks.poses[0] = 100.0
+    tracks.valid[0] = False
     assert select_tracks(tracks, 0.0, 0.0, set(), DEFAULT).tolist() == [0]
     assert select_tracks(tracks, 100.0, 100.0, set(), DEFAULT).tolist() == []
+    tracks.valid[:] = [[True], [False]]
+    assert select_tracks(tracks, 0.0, 0.0, set(), DEFAULT).tolist() == []
+
+
+@pytest.mark.parametrize(
+    ("total", "collision", "speed", "chosen"),
+    [
+        ([0.1, 0.7, 0.7], 20.0, 5.0, (1, True)),  # 2 s and 5 m/s, exactly
+        ([0.1, 0.7, 0.7], 21.0, 5.0, (1, False)),
+        ([0.1, 0.7, 0.9], 0.0, 5.01, (2, False)),
+        ([0.9, 0.7, 0.7], np.inf, 1.0, (0, False)),
+    ],
+)
+def test_a_slow_ego_brakes_before_an_early_collision(total, collision, speed, chosen):
+    ego = np.zeros(NUM_STATE)
+    ego[[VX, VY]] = 0.6 * speed, -0.8 * speed
+    scores = SimpleNamespace(
+        total=np.array(total), collision_index=np.where(np.arange(3) == chosen[0], collision, 30.0)
+    )
+    best, braked = choose(scores, ego, DEFAULT)
+    assert (best, braked) == chosen
+    assert (type(best), type(braked)) == (int, bool)
+
+
+def test_scores_are_weighted():
+    params = replace(DEFAULT, progress_weight=3.0, ttc_weight=1.0, comfort_weight=4.0)
+    mean = weighted_mean(*np.array([[1.0, 0.5], [0.0, 1.0], [0.5, 1.0]]), params)
+    assert mean.tolist() == [5.0 / 8.0, 6.5 / 8.0]
