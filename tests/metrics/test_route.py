@@ -12,8 +12,8 @@ from shiftsim.errors import MapError
 from shiftsim.metrics.route import corner_routes, driven_route
 from shiftsim.world.layers import make_layer, make_lists
 
-# four lanes on either side of a crossing of 20 m, and connectors that overlap in it
-LANES = [shapely.box(x, y, x + 20.0, y + 4.0) for x in (0.0, 40.0) for y in (0.0, 4.0, 8.0, 12.0)]
+# four lanes behind a crossing of 20 m, four before it, and connectors that overlap in it
+LANES = [shapely.box(x, y, x + 20.0, y + 4.0) for x in (40.0, 0.0) for y in (0.0, 4.0, 8.0, 12.0)]
 CROSSING = shapely.box(20.0, 0.0, 40.0, 16.0)
 
 
@@ -34,10 +34,10 @@ class Crossing:
         count = len(self.shapes)
         self.out: list[list[int]] = [[] for _ in range(count)]
         for index, (start, end) in enumerate(pairs, self.num_lanes):
-            self.out[start].append(index)
-            self.out[index].append(4 + end)
+            self.out[4 + start].append(index)
+            self.out[index].append(end)
             if rng.random() < 0.3:
-                self.out[start].append(int(rng.integers(self.num_lanes, count)))
+                self.out[4 + start].append(int(rng.integers(self.num_lanes, count)))
         self.into = [[a for a in range(count) if b in self.out[a]] for b in range(count)]
         self.crossing = [shapely.box(20.0, 3.0, 40.0, 13.0)]
         self.map = SimpleNamespace(

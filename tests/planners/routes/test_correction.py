@@ -5,11 +5,13 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worlds import straight_road
+from strategies import seeds
+from worlds import bent_points, mapped, straight_road
 
 from shiftsim.benchmarks.speed.city import bench_scene
 from shiftsim.errors import PlannerError
-from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.geometry.boxes import boxes_to_corners, wrap_angles
+from shiftsim.geometry.polylines import vertex_headings
 from shiftsim.planners.routes.correction import (
     RouteCorrector,
     Start,
@@ -19,6 +21,8 @@ from shiftsim.planners.routes.correction import (
 )
 from shiftsim.world.build import BlockSpec, build_map
 from shiftsim.world.layers import square_around
+
+BENT = mapped(straight_road(), bent_points)
 
 
 def names(road, blocks):
@@ -40,12 +44,41 @@ def test_the_wider_the_search_the_more_blocks_may_be_the_start():
     assert start_of(road, ["2"], pose, footprint) == ("2", ["2"])
 
 
-def test_off_the_road_the_nearest_block_of_either_kind_is_taken():
+@pytest.mark.parametrize(("x", "found"), [(215.0, ["3", "2"]), (10.0, ["1", "2"])])
+def test_off_the_road_the_nearest_block_of_either_kind_is_taken(x, found):
     road = straight_road()
-    pose = (215.0, 30.0, 0.0)
-    start, candidates = start_of(road, ["1"], pose, square_around(215.0, 30.0, 1.0))
-    assert candidates == ["3", "2"]
-    assert start == "2"
+    start, candidates = start_of(road, ["1"], (x, 30.0, 0.0), square_around(x, 30.0, 1.0))
+    assert candidates == found
+    assert start == ("2" if x > 200.0 else "1")
+
+
+@given(seeds)
+def test_the_start_is_the_nearest_block_that_fits_best_on_the_route(seed):
+    road, rng = BENT, np.random.default_rng(seed)
+    x, turn = rng.uniform(-5.0, 425.0), rng.choice([0.0, 0.7, 0.85, 3.0]) * rng.choice([1.0, -1.0])
+    (px, py), heading = bent_points(np.array([x, rng.uniform(-6.0, 9.0)])), 2.0 + x / 150.0 + turn
+    route = rng.permutation(3)[: rng.integers(1, 4)].tolist()
+    area = square_around(px, py, float(rng.choice([0.5, 2.5, 12.0])))
+    shapes = [road.blocks.shape(block) for block in range(3)]
+    near = [block for block in range(3) if shapes[block].intersects(shapely.Polygon(area))]
+    if not near:
+        away = [shape.distance(shapely.Point(px, py)) for shape in shapes]
+        near = [int(np.argmin(away[:2])), 2]
+    fitting, every = [], []
+    for block in near:
+        rows = []
+        for lane in road.block_edges.at(block).tolist():
+            line = road.baselines.at(lane)
+            apart = np.hypot(*(line - [px, py]).T)
+            error = wrap_angles(vertex_headings(line)[apart.argmin()] - np.array([heading]))[0]
+            rows.append((apart.min(), block))
+            if abs(error) < np.pi / 4 and apart.min() < 3.0:
+                fitting.append(rows[-1])
+        every.append(min(rows))
+    on_route = [row for row in fitting if row[1] in route]
+    chosen = on_route or fitting or every
+    start = find_start(road, route, np.array([px, py, heading]), area)
+    assert start == Start(min(chosen, key=lambda row: row[0])[1], [block for _, block in chosen])
 
 
 def test_a_route_that_misses_its_start_and_a_link_is_completed():
