@@ -5,6 +5,8 @@ from pathlib import Path
 import numpy as np
 import places
 
+from shiftsim.data.readers.build import make_samples
+from shiftsim.data.readers.samples import TrackSamples
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.data.store.recordings import ego_table, frames_table, lights_table, tracks_table
 from shiftsim.data.store.tables import require_ranges
@@ -76,3 +78,23 @@ def require_plausible(scene: Scenario) -> None:
         ego_table(scene.ego, 0),
     ):
         require_ranges(table, f"scenario {scene.token}")
+
+
+def driving(*objects: tuple[float, ...], hz: int = 10) -> TrackSamples:
+    """Objects along +x on the road: first and last time [s], x at time 0, y, speed."""
+    parts = []
+    for number, (first, last, x, y, speed) in enumerate(objects):
+        time = np.arange(round(first * hz), round(last * hz) + 1) / hz
+        parts.append(
+            np.column_stack([np.full(len(time), number), time, x + speed * time, 0 * time])
+        )
+        parts[-1][:, 3] = y
+    rows = np.concatenate(parts)
+    return make_samples(
+        "r",
+        time_us=5_000_000 + np.rint(rows[:, 1] * 1e6).astype(np.int64),
+        ids=rows[:, 0].astype(np.int64),
+        category=np.zeros(len(rows), np.int64),
+        xy=rows[:, 2:],
+        headings=np.zeros(len(rows)),
+    )

@@ -2,35 +2,15 @@
 
 import numpy as np
 import pytest
+from recordings import driving
 from worlds import straight_road
 
-from shiftsim.data.readers.build import make_samples
 from shiftsim.data.readers.scenarios import make_scenarios, require_scenarios
 from shiftsim.data.readers.windows import ConversionConfig, Span, evaluate_windows, window_spans
 from shiftsim.errors import ConfigError, ConversionError
 
 ROAD = straight_road()
 SHORT = ConversionConfig(window_s=3.0, overlap_s=1.0, history_s=1.0, ego_categories=("vehicle",))
-
-
-def driving(*objects, hz=10):
-    """Objects along +x on the road: first and last time [s], x at time 0, y, speed."""
-    parts = []
-    for number, (first, last, x, y, speed) in enumerate(objects):
-        time = np.arange(round(first * hz), round(last * hz) + 1) / hz
-        parts.append(
-            np.column_stack([np.full(len(time), number), time, x + speed * time, 0 * time])
-        )
-        parts[-1][:, 3] = y
-    rows = np.concatenate(parts)
-    return make_samples(
-        "r",
-        time_us=5_000_000 + np.rint(rows[:, 1] * 1e6).astype(np.int64),
-        ids=rows[:, 0].astype(np.int64),
-        category=np.zeros(len(rows), np.int64),
-        xy=rows[:, 2:],
-        headings=np.zeros(len(rows)),
-    )
 
 
 @pytest.mark.parametrize(

@@ -120,6 +120,19 @@ def test_vehicle_that_overlaps_a_long_object_is_not_simulated() -> None:
     assert drive(scenario, steps=1).valid[0].tolist() == [False, True]
 
 
+@pytest.mark.parametrize(("first", "last", "is_placed"), [(0, 9, False), (1, ROWS, True)])
+def test_what_stands_there_at_the_start_takes_the_place(
+    first: int, last: int, is_placed: bool
+) -> None:
+    scenario = scene([(40.0, 0.0, 0.0), (41.0, 0.0, 0.0)], [VEHICLE, CONE])
+    valid = scenario.tracks.valid.copy()
+    valid[:, 1] = False
+    valid[scenario.iteration_rows[0] + first : scenario.iteration_rows[0] + last, 1] = True
+    scenario = replace(scenario, tracks=replace(scenario.tracks, valid=valid))
+
+    assert drive(scenario, steps=0).valid[0, 0] == is_placed
+
+
 @pytest.mark.parametrize(("gone", "stops"), [(1, True), (2, False)])
 def test_a_cone_is_in_the_way_while_it_is_there(gone: int, stops: bool) -> None:
     poses = [(40.0, 0.0, 0.0), (75.0, 9.0, 0.0), (75.0, 0.0, 0.0)]
