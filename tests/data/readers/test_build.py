@@ -127,7 +127,8 @@ def test_objects_with_clocks_of_their_own_get_a_common_one():
         "r",
         time_us=7_000_000 + time_us,
         ids=which,
-        category=0 * which,
+        category=which,
+        categories=["car", "bus", "person", "bicycle"],
         xy=np.column_stack([x, 2.0 * which]),
         headings=0.1 * which,
     )
@@ -144,7 +145,9 @@ def test_objects_with_clocks_of_their_own_get_a_common_one():
     np.testing.assert_allclose(made.headings, 0.1 * name, rtol=0, atol=1e-9)
     np.testing.assert_array_equal(made.headings, made.raw_headings)
     np.testing.assert_array_equal(made.clock, np.arange(21) / 20.0)
-    assert len(made.categories) == len(made.kinds) == len(made.sizes) == 3
+    assert made.categories == ("car", "bus", "bicycle")
+    assert made.kinds.tolist() == [AgentKind.VEHICLE, AgentKind.VEHICLE, AgentKind.BICYCLE]
+    assert made.sizes.tolist() == [[4.6, 1.9], [12.0, 2.5], [1.8, 0.6]]
     assert made.warnings["tracks too short for a row every 0.05 s (left out)"] == 1
 
 

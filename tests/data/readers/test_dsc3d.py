@@ -48,6 +48,13 @@ def test_rotation_angles_rebuild_the_rotation(vector):
     np.testing.assert_allclose(up[0], expected, rtol=0, atol=1e-7)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_pitch_of_what_points_straight_up_or_down_is_a_number(sign):
+    """The sine of it rounds to more than 1."""
+    down = np.array([[1.1109245883766612, -sign * 1.2690097928649733, sign * 1.110924588376661]])
+    assert rotation_angles(down)[0][0, 1] == pytest.approx(-sign * np.pi / 2)
+
+
 def test_reads_a_recording_sorted_by_track_and_frame(tmp_path):
     times = writer.frame_times(5.0)
     folder = _site(tmp_path, [writer.car(7, times, x0=60.0), writer.car(3, times)])

@@ -179,6 +179,7 @@ def test_errors_name_what_to_mend():
 
 
 def test_parameters_are_plain_data():
+    assert PdmClosed().parameters == PdmParameters() == DEFAULT
     planner = load_planner("pdm-closed", {"speed_fractions": "0.5,1", "lateral_offsets": ""})
     scenario = cruise_scenario()
     planner.reset(scene_info(scenario))

@@ -90,6 +90,11 @@ def test_rates_from_two_to_a_hundred_hertz(hz, words):
     assert said(table_of(*[(*car[:5], car[5] * 0.9) for car in CARS], hz=hz), words)
 
 
+def test_accelerations_are_those_over_half_a_second_or_a_row():
+    found = diagnose(table_of(("car", 10.0, 0.0, 6.0, 0.0, 5.0, 3.0), hz=2.0), ROAD, 0.95)
+    assert found.figures["acceleration_mps2"] == pytest.approx(3.0)
+
+
 @pytest.mark.parametrize(
     ("gap", "words"), [(1.0, ""), (1.1, "no object has a row between 5 s and 6.1 s (1 such gaps")]
 )
