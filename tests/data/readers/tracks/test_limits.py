@@ -225,6 +225,16 @@ def test_velocities_are_those_of_positions(given, words, remedy):
     assert remedy in " ".join(error.remedy for error in diagnose(table, ROAD, 0.95).errors)
 
 
+@pytest.mark.parametrize(("wrong", "words"), [([1], ""), ([0, 1], "in 100% of the moving")])
+def test_velocities_that_nothing_explains_are_doubted_where_most_are_wrong(wrong, words):
+    table = table_of(*CARS)
+    table.velocities[:] = np.array([[10.0, 0.0], [12.0, 0.0]])[table.track]
+    random = np.random.default_rng(5).uniform(-20.0, 20.0, table.velocities.shape)
+    rows = np.isin(table.track, wrong)
+    table.velocities[rows] = random[rows]
+    assert said(table, words)
+
+
 def test_rows_that_move_faster_are_those_of_vehicles():
     table = table_of(*CARS, ("pedestrian", 10.0, 9.0, 2.0, 0.0, 9.0))
     fastest = float(table.speed.max())

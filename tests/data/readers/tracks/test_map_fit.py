@@ -98,3 +98,13 @@ def test_a_guess_says_what_to_write(guess, words, remedies):
     assert all(one.startswith(start) for one, start in zip(found, remedies, strict=True))
     twice = Guess("with y mirrored", "m", np.zeros(2), 1.0, 1.0).remedies("x", "-y")
     assert twice[0].startswith("[columns] x = 'x', y = 'y'")
+
+
+@pytest.mark.parametrize(("mirrored", "axes"), [(6, "with y mirrored"), (4, None), (5, None)])
+def test_other_axes_must_fit_better_by_three_percent(mirrored, axes):
+    """Of 100 places 88 are on the road either way, 2 as they are, and some mirrored."""
+    y = np.repeat([0.0, 4.0, -4.0, 99.0], [88, 2, mirrored, 10 - mirrored])
+    places = np.column_stack([np.linspace(1.0, 419.0, 100), y])
+    fit = fit_map(ROAD, places, np.tile([10.0, 0.0], (100, 1)), 0.95, only_metres=True)
+    assert (None if fit.best is None else fit.best.axes) == axes
+    assert (fit.share, fit.is_good) == (0.9, False)
