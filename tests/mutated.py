@@ -20,6 +20,7 @@ EDITED = "parity/test_scenario_edits.py::test_edits"
 OFFICIAL_PLANNERS = "parity/test_pdm.py"
 PDM_TESTS = (
     "planners/pdm/test_scorer.py",
+    "planners/pdm/test_rollout.py",
     "planners/proposals/test_contacts.py",
     *(f"{OFFICIAL_PLANNERS}::{name}" for name in ("test_kernel", "test_steps")),
     "planners/pdm/test_pdm.py",
@@ -33,6 +34,8 @@ IDM_TESTS = (
 )
 READER_TESTS = (
     "data/readers/test_build.py",
+    "data/readers/test_samples.py",
+    "data/readers/test_windows.py",
     "data/readers/test_dsc3d.py",
     "data/readers/test_scenarios.py",
 )

@@ -28,7 +28,7 @@ class Crossing:
     """A map as `route` reads it, and the routes as its description says."""
 
     def __init__(self, rng: np.random.Generator) -> None:
-        pairs = [(int(a), int(b)) for a, b in rng.integers(0, 4, (6, 2))]
+        pairs = [(int(a), int(b)) for a, b in rng.integers(0, 4, (10, 2))]
         self.shapes = [*LANES, *(between(a, b, rng.uniform(1.0, 2.5)) for a, b in pairs)]
         self.num_lanes = len(LANES)
         count = len(self.shapes)

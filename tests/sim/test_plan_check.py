@@ -3,7 +3,7 @@ import re
 import numpy as np
 import pytest
 
-from shiftsim.sim.plan_check import find_fault, is_short
+from shiftsim.sim.plan_check import contiguous, find_fault, is_short
 from shiftsim.world.state import NUM_STATE, Command, Trajectory
 
 NOW, NEXT = 1_600_000_000_000_000, 1_600_000_000_100_000
@@ -62,3 +62,14 @@ def test_a_plan_is_short_that_ends_before_what_the_tracker_reads():
     assert is_short(trajectory([0, 500_000, 999_999]))
     assert not is_short(trajectory([0, 500_000, 1_000_000]))
     assert not is_short(Command(0.0, 0.0))
+
+
+def test_kernels_get_contiguous_arrays_that_can_be_written():
+    array = np.arange(12.0).reshape(3, 4)
+    assert contiguous(array) is array
+    fixed = array.copy()
+    fixed.flags.writeable = False
+    for other in (array[:, ::2], array.T, fixed):
+        found = contiguous(other)
+        assert found.flags.carray
+        np.testing.assert_array_equal(found, other)

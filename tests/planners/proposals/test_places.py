@@ -1,6 +1,7 @@
 """Where proposals are, against shapely."""
 
 import numpy as np
+import pytest
 import shapely
 from hypothesis import given
 from strategies import seeds
@@ -30,8 +31,8 @@ def test_places_are_those_that_shapely_says(seed):
     rng = np.random.default_rng(seed)
     rings, numbers = some_areas(rng, 7), np.arange(7)
     shapes = np.array([shapely.Polygon(shell, holes) for shell, *holes in rings])
-    on_route, limits = rng.random(7) < 0.5, rng.choice([0.0, 5.0, 10.0, 15.0], 7)
-    chosen, by_center = rng.permutation(7)[:6], bool(rng.integers(2))
+    on_route, limits = rng.random(7) < 0.5, rng.permutation(7) * 2.5
+    chosen, by_center = rng.permutation(7)[: rng.integers(1, 7)], bool(rng.integers(2))
     states = np.zeros((3, 12, NUM_STATE))
     states[..., :3] = rng.uniform([-9.0, -9.0, -3.0], [9.0, 9.0, 3.0], (3, 12, 3))
     states[0, :, :2] = rings[1][0][::2]  # on a boundary is not within
@@ -58,3 +59,12 @@ def test_places_are_those_that_shapely_says(seed):
     np.testing.assert_array_equal(
         places.speed_limits, (here * limits[chosen, None, None]).max(axis=0)
     )
+
+
+@pytest.mark.parametrize(("chosen", "limit"), [([1, 3], 9.0), ([3, 1], 9.0), ([1], 5.0), ([], 0.0)])
+def test_the_limit_is_the_largest_of_all_areas_that_hold_the_ego(chosen, limit):
+    ring = np.array([[-9.0, -9.0], [9.0, -9.0], [9.0, 9.0], [-9.0, 9.0]])
+    areas = areas_of(make_polygons([[ring]] * 4), np.ones(4, np.bool_), np.arange(4))
+    limits, numbers = np.array([0.0, 5.0, 0.0, 9.0]), np.array(chosen, np.int64)
+    found = find_places(np.zeros((1, 3, NUM_STATE)), SIZE, areas, numbers, limits, by_center=True)
+    assert found.speed_limits.tolist() == [[limit] * 3]

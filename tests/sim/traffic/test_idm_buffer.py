@@ -34,6 +34,15 @@ def test_a_straight_line_is_buffered_to_its_rectangle() -> None:
     np.testing.assert_allclose(corners, [[4, 1], [4, -1], [0, -1], [0, 1]])
 
 
+@pytest.mark.parametrize("direction", [(0.0, 1.0), (1.0, 0.0), (0.0, -1.0), (0.6, 0.8)])
+def test_vertices_on_one_place_or_line_change_nothing(direction: tuple[float, float]) -> None:
+    ways = np.array([0.0, 2.0, 2.0, 2.0, 3.0, 4.0, 4.0])[:, None] * direction
+    corners = shapely.Polygon(outline(ways, 1.0))
+
+    rectangle = shapely.LineString(ways[[0, -1]]).buffer(1.0, cap_style="flat")
+    assert corners.symmetric_difference(rectangle).area < 1e-9
+
+
 @given(seed=seeds, offset=offsets, distance=st.floats(0.3, 1.2))
 def test_curve_and_geos_buffer_agree(
     seed: int, offset: tuple[float, float], distance: float

@@ -19,6 +19,7 @@ from shiftsim.sim.traffic.learned.features import (
     move_agents,
     observe_agents,
 )
+from shiftsim.sim.traffic.learned.model import SHAPES, Weights, controls
 from shiftsim.world.state import AgentKind
 
 ROAD = mapped(straight_road(12.0), bent_points)
@@ -199,3 +200,30 @@ def test_agents_move_by_the_mean_of_both_speeds_along_the_middle_of_their_turn(
     heading = wrap_angles(np.array([0.3 + 0.5 * turn]))[0]
     np.testing.assert_allclose(moved[1], [*place, heading, speed], rtol=0.0, atol=1e-12)
     np.testing.assert_allclose(moved[0], [9.0, 9.0, 0.0, 0.0], rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("bias", "speed", "expected"),
+    [
+        ((1.0, 0.5), 4.0, (2.0, 0.6)),  # 2 m/s^2, and 0.3 rad/m at 4 m/s
+        ((-4.1, 1.1), 2.0, (-8.0, 0.6)),
+        ((2.1, -1.1), 2.0, (4.0, -0.6)),
+        ((0.0, 1.0), 0.0, (0.0, 0.0)),
+    ],
+)
+def test_controls_are_scaled_and_limited(bias, speed, expected):
+    arrays = {name: np.zeros(shape, np.float32) for name, shape in SHAPES.items()}
+    weights = Weights(**(arrays | {"last_bias": np.array(bias, np.float32)}))
+    found = controls(weights, np.zeros((1, NUM_FEATURES)), np.array([speed]))
+    np.testing.assert_allclose(found, [expected], rtol=0.0, atol=1e-6)
+
+
+def test_controls_are_those_of_two_hidden_layers(rng):
+    arrays = {name: rng.normal(0.0, 0.05, shape) for name, shape in SHAPES.items()}
+    weights = Weights(**{name: array.astype(np.float32) for name, array in arrays.items()})
+    seen, speeds = rng.normal(size=(5, NUM_FEATURES)), rng.uniform(0.0, 9.0, 5)
+    hidden = np.clip(seen @ arrays["first"] + arrays["first_bias"], 0.0, None)
+    hidden = np.clip(hidden @ arrays["second"] + arrays["second_bias"], 0.0, None)
+    out = (hidden @ arrays["last"] + arrays["last_bias"]) * [2.0, 0.3]
+    expected = out * np.column_stack([np.ones(5), speeds])
+    np.testing.assert_allclose(controls(weights, seen, speeds), expected, rtol=0.0, atol=1e-4)
