@@ -213,6 +213,7 @@ def test_a_route_that_cannot_be_driven_block_by_block_falls_back(route):
     [
         ((), "has 0 roadblocks"),
         (("1",), "has 1 roadblocks"),
+        (("x", "2", "3"), "no roadblock 'x', number 0"),
         (("1", "x", "3"), "no roadblock 'x', number 1"),
         (("1", "2", "x"), "no roadblock 'x', number 2"),
     ],

@@ -46,12 +46,12 @@ def test_velocities_contradict_from_a_tenth_of_the_speed_and_three_decimetres_on
     speed, stored, is_wrong
 ):
     """The first and the last second, which are far off, are left out of a track of 4 s."""
-    time, track = np.arange(41) * 0.1, np.zeros(41, np.int64)
-    derived, given = np.full((2, 41, 2), [speed, 0.0])
-    given[:, 0] = np.where((time > 0.95) & (time < 3.05), stored, 99.0)
+    time, track = np.r_[0.0, 0.1, np.arange(41) * 0.1], np.repeat([0, 1], [2, 41])
+    derived, given = np.full((2, 43, 2), [speed, 0.0])
+    given[2:, 0] = np.where((time[2:] > 0.95) & (time[2:] < 3.05), stored, 99.0)
     wrong, share = contradiction(given, derived, time, track)
-    assert wrong.tolist() == [is_wrong]
-    assert share.tolist() == pytest.approx([abs(stored - speed) / max(speed, 0.3)])
+    assert wrong.tolist() == [False, is_wrong]
+    assert share.tolist() == pytest.approx([0.0, abs(stored - speed) / max(speed, 0.3)])
 
 
 def test_medians_are_those_of_each_track():

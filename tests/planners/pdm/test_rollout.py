@@ -72,10 +72,11 @@ def test_the_nearest_of_all_ahead_leads(seed):
     )
     forecast = seen(poses, rng.uniform(-5.0, 5.0, (6, 2)), rings=shapes)
     footprint = boxes_to_corners(rng.uniform([-9, -9, -3], [9, 9, 3]), np.array([5.0, 2.0]))
-    along, row = rng.uniform(0.0, 10.0, 9), int(rng.integers(0, 41))
-    hits = rng.permutation(9)[: rng.integers(1, 9)]
-    ahead = hits[along[hits] > 3.0]
-    if len(ahead):
+    for row in rng.integers(0, 41, 6).tolist():
+        along, hits = rng.uniform(0.0, 10.0, 9), rng.permutation(9)[: rng.integers(1, 10)]
+        ahead = hits[along[hits] > 3.0]
+        if not len(ahead):
+            continue
         rings = [*forecast.others.boxes[row], *shapes]
         away = shapely.distance(shapely.Polygon(footprint), [*map(shapely.Polygon, rings)])
         ranks = forecast_ranks(forecast, row)

@@ -142,6 +142,18 @@ def test_faults_and_times_to_collision_are_those_of_a_slow_search(seed):
     np.testing.assert_array_equal(scores.drivable, ~off_road)
 
 
+def test_what_comes_into_the_way_at_the_last_moment_counts():
+    states = np.zeros((1, STEPS, NUM_STATE))
+    states[..., VX], states[..., 0] = 1.0, 0.1 * np.arange(STEPS)
+    centers = np.full((ROWS, 1, 2), 900.0)
+    centers[-1, 0] = 8.85, 0.0  # at last the front is at 7.0 m, and at 7.9 m 0.9 s later
+    boxes = boxes_to_corners(np.dstack([centers, np.zeros((ROWS, 1))]), np.array([2.0, 2.0]))
+    no, speeds = np.zeros(1, np.bool_), np.full((ROWS, 1), 1e4)
+    others = Obstacles(boxes, centers, centers, speeds, np.sqrt([2.0]), ~no, no)
+    scores = score(states, PLACE, others, SIZE, DEFAULT)
+    assert (scores.ttc_index.tolist(), scores.collision_index.tolist()) == ([40.0], [np.inf])
+
+
 @given(seeds)
 def test_near_is_what_reaches_into_the_square_around_all_proposals(seed):
     rng = np.random.default_rng(seed)

@@ -60,11 +60,12 @@ def test_of_two_objects_that_are_touched_the_lower_one_leads_whatever_their_orde
 
 
 @pytest.mark.parametrize("turned", [0, 1, 2, 3, 4])
-def test_a_vertex_that_is_repeated_changes_no_gap(turned):
+@pytest.mark.parametrize(("tip", "gap"), [((5.0, 0.3), 3.0), ((5.0, 5.0), 5.0)])
+def test_a_vertex_that_is_repeated_changes_no_gap(tip, gap, turned):
     footprint = boxes_to_corners(np.zeros(3), np.array([4.0, 2.0]))
-    corner = np.array([[5.0, 0.3], [5.0, 0.3], [9.0, -4.0], [9.0, 4.0], [9.0, 4.0]])
+    corner = np.array([tip, tip, [14.0, 5.5], [9.0, 14.0], [9.0, 14.0]])
     found = find_lead(footprint, objects_of([np.roll(corner, turned, axis=0)]), np.array([HIT]))
-    assert found == (0, pytest.approx(3.0, abs=1e-12))
+    assert found == (0, pytest.approx(gap, abs=1e-12))
 
 
 @pytest.mark.parametrize("place", [(0.0, 0.0), (-128.0, -64.0), (-128.0, 64.0), (128.0, -64.0)])

@@ -41,9 +41,14 @@ def drive(scenario: Scenario, model: Traffic, steps: int = 40) -> Tracks:
 def test_constant_velocity_moves_agents_straight_on(scenario: Scenario) -> None:
     velocities = scenario.tracks.velocities.copy()
     velocities[scenario.iteration_rows[1] :, :4] = 9.0  # of the recording, which no longer counts
-    scenario = replace(scenario, tracks=replace(scenario.tracks, velocities=velocities))
+    sizes = scenario.tracks.sizes.copy()
+    sizes[scenario.iteration_rows[1] :, :4] = 9.0  # nor do these
+    changed = replace(scenario.tracks, velocities=velocities, sizes=sizes)
+    scenario = replace(scenario, tracks=changed)
 
     tracks = drive(scenario, make_traffic("constant-velocity"))
+
+    np.testing.assert_array_equal(tracks.sizes[40, :4], np.tile([4.5, 2.0], (4, 1)))
 
     # 4 s at (2, 0.5) m/s
     np.testing.assert_allclose(tracks.poses[40, :4], np.add(POSES[:4], [8.0, 2.0, 0.0]))
