@@ -11,8 +11,15 @@ from shiftsim.geometry.boxes import boxes_touch, circle_around, meets_bounds
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.learned.pluto.reference import Drivable
 from shiftsim.planners.learned.pluto.world import World
-from shiftsim.planners.proposals import contacts
 from shiftsim.planners.proposals.comfort import ComfortBounds, comfort
+from shiftsim.planners.proposals.contacts import (
+    NEVER,
+    TTC_STOPPED,
+    Obstacles,
+    first_faults,
+    is_at_fault,
+    near_others,
+)
 from shiftsim.planners.proposals.places import (
     OFF_ROAD,
     OFF_ROUTE,
@@ -21,8 +28,14 @@ from shiftsim.planners.proposals.places import (
     find_places,
 )
 from shiftsim.planners.proposals.tracker import DT, drive_proposals, fit_speed, reference_at
-from shiftsim.sim.dynamics import lqr
 from shiftsim.sim.dynamics.bicycle import step_bicycle
+from shiftsim.sim.dynamics.lqr import (
+    NUPLAN,
+    LqrParameters,
+    command,
+    fit_curvature,
+    is_stopping,
+)
 from shiftsim.world.layers import Polygons, make_polylines, meets_convex, project_on_line
 from shiftsim.world.state import HEADING, NUM_STATE, STEERING_RATE, VX, VY, VehicleParameters, X, Y
 
@@ -78,7 +91,7 @@ def score(
     drivable, obstacles = place.drivable, world.obstacles
     size, areas = ego_box(vehicle), drivable.areas
     at = find_places(driven, size, areas, drivable.selected, drivable.limits, by_center=False)
-    near = contacts.near_others(at, obstacles, driven.shape[1], DT * TTC_STEPS[-1])
+    near = near_others(at, obstacles, driven.shape[1], DT * TTC_STEPS[-1])
     red = run_lights(at.corners, place.lanes, world.lights)
     clear, fault_times = collisions(at, obstacles, near, red)
     ttc = times_to_collision(at, obstacles, near)
@@ -158,7 +171,7 @@ def nearest_line(lines: list[FloatArray], rear: FloatArray) -> FloatArray:
 
 
 def collisions(
-    places: ProposalStates, obstacles: contacts.Obstacles, near: IntArray, first_red: FloatArray
+    places: ProposalStates, obstacles: Obstacles, near: IntArray, first_red: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """At-fault collisions with those of `obstacles` that are `near`, red lights (P,) included.
 
@@ -167,16 +180,16 @@ def collisions(
     rows = np.arange(places.states.shape[1])
     rows[0] = -1
     # nuPlan rule 251: a contact without fault is looked at again
-    scores, first = contacts.first_faults(places, obstacles, near, rows, False)
+    scores, first = first_faults(places, obstacles, near, rows, False)
     # a red light after another fault does not count
-    is_red = (first_red < contacts.NEVER) & (first_red <= first)
+    is_red = (first_red < NEVER) & (first_red <= first)
     return np.where(is_red, 0.0, scores), DT * np.minimum(first, first_red)
 
 
 @kernel
 def run_lights(corners: FloatArray, lanes: Polygons, lights: IntArray) -> FloatArray:
     """(P,) first time indices at which the ego (P, T, 4, 2) is on a red connector, inf if never."""
-    first = np.full(len(corners), contacts.NEVER)
+    first = np.full(len(corners), NEVER)
     for proposal in range(corners.shape[0]):
         # nuPlan rule 241: a red light counts also where the ego stands in it already
         for step in range(1, corners.shape[1]):
@@ -189,9 +202,7 @@ def run_lights(corners: FloatArray, lanes: Polygons, lights: IntArray) -> FloatA
 
 
 @kernel
-def times_to_collision(
-    places: ProposalStates, obstacles: contacts.Obstacles, near: IntArray
-) -> FloatArray:
+def times_to_collision(places: ProposalStates, obstacles: Obstacles, near: IntArray) -> FloatArray:
     """(P,) 0 or 1: whether the ego, moved ahead along its heading, stays clear.
 
     Arguments as for `collisions`.
@@ -201,7 +212,7 @@ def times_to_collision(
     for proposal in range(len(scores)):
         for step in range(1, last + 1):
             state = places.states[proposal, step]
-            if state[VX] < contacts.TTC_STOPPED:
+            if state[VX] < TTC_STOPPED:
                 continue
             cos, sin = np.cos(state[HEADING]), np.sin(state[HEADING])
             for number in range(len(TTC_STEPS)):
@@ -228,7 +239,7 @@ def times_to_collision(
                             obstacles.centroids[number, index],
                         )
                         other = obstacles.boxes[number, index]
-                        if contacts.is_at_fault(then, box, off_lane, speed, center, other):
+                        if is_at_fault(then, box, off_lane, speed, center, other):
                             scores[proposal] = 0.0
             if scores[proposal] == 0.0:
                 break
@@ -247,7 +258,7 @@ def brake(
     out = np.empty((len(proposal), NUM_STATE))
     out[0] = ego
     soft = fault_time > float(np.hypot(ego[VX], ego[VY])) / HARD + REACTION
-    tracker = lqr.NUPLAN._replace(wheel_base=vehicle.wheel_base)
+    tracker = NUPLAN._replace(wheel_base=vehicle.wheel_base)
     _roll_out(np.ascontiguousarray(proposal), soft, tracker, DT, out)
     # nuPlan rule 240: the plan is made without the rates of steering and yaw
     out[:, STEERING_RATE:] = 0.0
@@ -256,18 +267,18 @@ def brake(
 
 @kernel
 def _roll_out(
-    poses: FloatArray, soft: bool, params: lqr.LqrParameters, dt: float, states: FloatArray
+    poses: FloatArray, soft: bool, params: LqrParameters, dt: float, states: FloatArray
 ) -> None:
     """Drive along poses (81, 3) to a standstill; `states` (81, 11) starts with the ego's."""
     count = len(poses) - 1
     speeds, curvatures, ahead = np.empty(count), np.empty(count), np.empty(params.horizon)
     fit_speed(poses, dt, params.jerk_penalty, speeds)
-    lqr.fit_curvature(poses, speeds, dt, params.curvature_rate_penalty, curvatures)
+    fit_curvature(poses, speeds, dt, params.curvature_rate_penalty, curvatures)
     for step in range(count):
         state = states[step]
         reference = reference_at(state, poses, step, 0.0, curvatures, ahead)
-        accel, rate = lqr.command(state, reference, params)
-        if soft or lqr.is_stopping(state[VX], 0.0, params):
+        accel, rate = command(state, reference, params)
+        if soft or is_stopping(state[VX], 0.0, params):
             accel = max(accel, SOFT_ACCEL)
         else:
             accel = HARD_ACCEL

@@ -8,8 +8,9 @@ import pytest
 from recordings import driving
 from worlds import straight_road
 
+from shiftsim.data.maps.builder import BuiltMap
 from shiftsim.data.readers.convert import _key, convert
-from shiftsim.data.readers.reader import Reader, SourceRecording, site_map
+from shiftsim.data.readers.reader import Reader, SourceRecording
 from shiftsim.data.readers.windows import ConversionConfig
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConversionError
@@ -20,7 +21,7 @@ CONFIG = ConversionConfig(window_s=3.0, overlap_s=1.0, history_s=1.0, ego_catego
 class Source(Reader):
     """Recordings by name: how many cars each has, 0 for a broken one."""
 
-    name, settings, site = "toys", {"speed": 5}, site_map(straight_road(), {"repaired": 2})
+    name, settings, site = "toys", {"speed": 5}, BuiltMap(straight_road(), {"repaired": 2}, {}, {})
 
     def __init__(self, source, **counts):
         self.source, self.counts, self.read_ones = source, counts, []
@@ -39,7 +40,7 @@ class Source(Reader):
         if not count:
             raise ConversionError(f"{recording} is broken", "mend it")
         samples = driving(*((0.0, 6.0, 10.0 + 60.0 * n, 0.0, 5.0) for n in range(count)))
-        site = self.site or site_map(straight_road(), {"repaired": 2})
+        site = self.site or BuiltMap(straight_road(), {"repaired": 2}, {}, {})
         return SourceRecording(replace(samples, name=recording), site, CONFIG)
 
     def summarise(self, entries):
