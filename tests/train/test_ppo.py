@@ -27,7 +27,7 @@ def test_advantages_are_those_worked_out_by_hand():
 def part():
     x = torch.tensor([[0.6, 0.5], [0.3, 0.7]])
     policy = Policy(torch.full((2, 2), 2.0), torch.full((2, 2), 3.0))
-    density = ppo.log_density(policy.alpha, policy.beta, x).sum(1)
+    density = ppo.learning.log_density(policy.alpha, policy.beta, x).sum(1)
     gain, wanted = torch.tensor([1.0, -1.0]), torch.tensor([1.0, 0.0])
     told = {"actions": x, "density": density, "advantages": gain, "returns": wanted}
     return policy, {**told, "values": torch.zeros(2)}
