@@ -25,7 +25,7 @@ BUDGETS = {
     "metrics": 2_320,
     "shiftsim/runs": 5_470,  # goal 3_300
     "planners": 4_350,  # goal 4_300
-    "planners/learned": 4_880,  # goal 4_600
+    "planners/learned": 4_890,  # goal 4_600
     "data/maps": 3_700,  # goal 3_000
     "data": 4_950,  # goal 3_900
     "data/nuplan": 2_720,  # goal 2_400
@@ -40,7 +40,7 @@ BUDGETS = {
     "shiftsim/cli": 2_530,  # goal 2_300
     "benchmarks": 780,  # goal 700
 }
-MOST_LINES, MOST_MODULES, MOST_KERNELS = 61_150, 300, 220  # the goal is 52_000 lines
+MOST_LINES, MOST_MODULES, MOST_KERNELS = 61_200, 300, 220  # the goal is 52_000 lines
 LONGEST_MODULE, CROWDED = 450, 16
 # modules of under 80 lines that one other module imports, and why they stand alone
 SMALL_AND_ALONE = {
