@@ -142,8 +142,8 @@ class RunWriter:
         counts = {"expected": 0, **dict.fromkeys(STATUSES, 0)}
         locations = self._write_rollouts()
         tasks = iter(sorted(expected))
-        with ExitStack() as files:
-            tables = {name: files.enter_context(self._table(name)) for name in TABLES}
+        with ExitStack() as stack:
+            tables = {name: stack.enter_context(self._table(name)) for name in TABLES}
             while chunk := list(islice(tasks, _ROW_GROUP)):
                 rows: dict[str, list[dict[str, Any]]] = {name: [] for name in TABLES}
                 for task in chunk:

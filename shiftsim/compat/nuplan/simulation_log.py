@@ -106,25 +106,31 @@ _DEVKIT: Any = SimpleNamespace(
 
 
 @contextmanager
-def _standing_in() -> Iterator[None]:
-    """Have pickle find the classes where the devkit has them.
-
-    Meanwhile no garbage is looked for: among so many objects that takes as long as all the rest.
-    """
-    modules, pauses = {"nuplan": ModuleType("nuplan")}, gc.isenabled()
+def _importable() -> Iterator[None]:
+    """Have pickle find the classes where the devkit has them."""
+    modules = {"nuplan": ModuleType("nuplan")}
     for name, kind in vars(_DEVKIT).items():
         module = modules.setdefault(kind.__module__, ModuleType(kind.__module__))
         setattr(module, name, kind)
     before = {name: sys.modules[name] for name in modules if name in sys.modules}
     sys.modules.update(modules)
-    gc.disable()
     try:
         yield
     finally:
         for name in modules:
             del sys.modules[name]
         sys.modules.update(before)
-        if pauses:
+
+
+@contextmanager
+def _without_collector() -> Iterator[None]:
+    """Look for no garbage: among so many objects that takes as long as all the rest."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
             gc.enable()
 
 
@@ -147,7 +153,7 @@ def write_simulation_log(
     Raises:
         ConversionError: A light belongs to a connector without an integer id.
     """
-    with _standing_in():
+    with _without_collector():
         planner = _DEVKIT.SimplePlanner(
             _compute_trajectory_runtimes=log.planning_seconds.tolist(),
             name=partial(str, task.planner),
@@ -159,7 +165,8 @@ def write_simulation_log(
             planner=planner,
             simulation_history=_history(scenario, log, maps),
         )
-        data = pickle.dumps(found, 5)
+        with _importable():
+            data = pickle.dumps(found, 5)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as part:
         part.write_bytes(lzma.compress(b"\xc6" + pack(">I", len(data)) + data, preset=0))
