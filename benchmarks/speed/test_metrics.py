@@ -5,11 +5,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from json_worlds import read_world
 
 from shiftsim.metrics import compute_metrics, evaluate
 from shiftsim.metrics import measure as measure_rollout
 from shiftsim.sim.log import SimulationLog
-from shiftsim.verify.worlds import read_world
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import Tracks
 

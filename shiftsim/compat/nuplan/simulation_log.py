@@ -10,7 +10,6 @@ import pickle
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from copyreg import __newobj__  # type: ignore[attr-defined]
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -36,8 +35,13 @@ T = TypeVar("T")
 _FLOAT64 = np.dtype(np.float64)
 _COG = 1.67  # m, rear axle to centre of gravity, which nothing here depends on
 _ACTOR, _SIMULATION = "nuplan.common.actor_state", "nuplan.planning.simulation"
+_STATES = f"{_ACTOR}.state_representation"
 _SCENARIO, _MAPS = "nuplan.planning.scenario_builder.nuplan_db", "nuplan.common.maps"
-_SLOTTED = {f"{_ACTOR}.state_representation": "StateSE2 StateVector2D TimePoint"}
+_SLOTS = {  # attributes of classes that keep them in slots, all of one module
+    "StateSE2": ("heading", "x", "y"),
+    "StateVector2D": ("_x", "_y", "_array"),
+    "TimePoint": ("time_us",),
+}
 _PLAIN = {  # classes whose objects are made of their attributes, by module
     f"{_ACTOR}.agent": "Agent",
     f"{_ACTOR}.car_footprint": "CarFootprint",
@@ -78,11 +82,11 @@ class _Plain:
 class _Slotted:
     """An object whose attributes are in slots."""
 
-    def __init__(self, **attributes: Any) -> None:
-        self.attributes = attributes
+    __slots__ = ()
 
-    def __reduce__(self) -> Any:
-        return __newobj__, (type(self),), (None, self.attributes)
+    def __init__(self, **attributes: Any) -> None:
+        for name, value in attributes.items():
+            setattr(self, name, value)
 
 
 class _Called:
@@ -98,10 +102,14 @@ class _Called:
 _DEVKIT: Any = SimpleNamespace(
     **{
         name: type(name, (base,), {"__module__": module})
-        for base, classes in ((_Plain, _PLAIN), (_Slotted, _SLOTTED), (_Called, _CALLED))
+        for base, classes in ((_Plain, _PLAIN), (_Called, _CALLED))
         for module, names in classes.items()
         for name in names.split()
-    }
+    },
+    **{
+        name: type(name, (_Slotted,), {"__module__": _STATES, "__slots__": slots})
+        for name, slots in _SLOTS.items()
+    },
 )
 
 
