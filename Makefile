@@ -42,7 +42,7 @@ types: install
 	$(BIN)/mypy
 
 docs: install
-	$(BIN)/python tools/site.py build/docs
+	$(BIN)/python tools/build_site.py build/docs
 
 bench: install
 	$(BIN)/python -m pytest shiftsim/benchmarks/speed -s -p no:cacheprovider --benchmark-disable-gc --benchmark-columns=median,iqr
