@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: install demo test test-fast test-thorough test-long test-docs test-kill test-browser lint types docs bench bench-smoke verify dist clean-cache
+.PHONY: install demo test test-fast test-thorough test-long test-docs test-kill test-browser lint types docs api-diff lowest bench bench-smoke verify dist clean-cache
 
 install: .venv/installed
 
@@ -42,7 +42,19 @@ types: install
 	$(BIN)/mypy
 
 docs: install
-	$(BIN)/python tools/site.py build/docs
+	$(BIN)/python tools/build_site.py build/docs
+
+# changes of the public API since a revision, which CHANGELOG.md has to name
+REVISION ?= main
+
+api-diff: install
+	$(BIN)/python tools/api_diff.py $(REVISION)
+
+# the oldest packages that pyproject.toml allows, in place of those of constraints.txt
+lowest: install
+	mkdir -p build
+	$(BIN)/python tools/lowest.py > build/lowest.txt
+	$(BIN)/python -m pip install --quiet -r build/lowest.txt
 
 bench: install
 	$(BIN)/python -m pytest shiftsim/benchmarks/speed -s -p no:cacheprovider --benchmark-disable-gc --benchmark-columns=median,iqr

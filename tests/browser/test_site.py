@@ -54,7 +54,7 @@ def site():
     """The built site; Zensical writes nowhere but inside the repository."""
     pytest.importorskip("zensical", reason="needs the dependency group `docs`")
     folder = REPOSITORY / "build" / "browsed"
-    command = [sys.executable, "tools/site.py", "build/browsed"]
+    command = [sys.executable, "tools/build_site.py", "build/browsed"]
     subprocess.run(command, cwd=REPOSITORY, check=True, capture_output=True)
     yield folder
     shutil.rmtree(folder)

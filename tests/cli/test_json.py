@@ -7,6 +7,8 @@ from stores import write_toy_store
 
 from shiftsim.cli import main
 
+pytestmark = pytest.mark.filterwarnings("default")  # planners and metrics warn on purpose
+
 NOISY = """
 import warnings
 import numpy as np

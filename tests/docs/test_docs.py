@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import tarfile
+import tomllib
 from pathlib import Path
 from textwrap import dedent
 from typing import Any
@@ -43,7 +44,7 @@ from shiftsim.data.store import schema
 from shiftsim.data.synthetic import store as synthetic
 from shiftsim.metrics import MULTIPLIERS, PROFILES, SHORT_NAMES, WEIGHTS
 from shiftsim.planners.registry import PLANNERS
-from shiftsim.report.words import LONG
+from shiftsim.report.words import LONG, legend
 from shiftsim.runs import config
 from shiftsim.runs.tables import TABLES
 
@@ -212,8 +213,6 @@ def _parse(block: Block) -> None:
 
 
 def test_blocks_that_install_name_extras_that_exist() -> None:
-    import tomllib
-
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
     extras = set(project["project"]["optional-dependencies"])
     text = "".join(page.read_text("utf-8") for page in PAGES)
@@ -388,10 +387,39 @@ def test_weights_are_those_of_the_score() -> None:
     assert [row[:3] for row in rows] == [[SHORT_NAMES[n], n, role] for n, role in roles.items()]
 
 
-def test_metrics_of_the_readme_stand_in_the_order_of_all_tables() -> None:
-    text = (REPOSITORY / "README.md").read_text("utf-8")
-    assert f"| planner | noise | {' | '.join(LONG)} |" in text
-    assert f"Columns: {', '.join(LONG.values())}." in " ".join(text.split())
+README = REPOSITORY / "README.md"
+README_COLUMNS = ["CLS", "DAC"]
+
+
+def test_columns_of_the_readme_have_the_names_of_all_tables() -> None:
+    text = " ".join(README.read_text("utf-8").split())
+    assert f"| planner | noise | {' | '.join(README_COLUMNS)} |" in text
+    assert f"Two of nine columns: {legend(README_COLUMNS)}." in text
+    assert len(LONG) == 9
+
+
+@pytest.mark.thorough
+@pytest.mark.slow
+def test_numbers_of_the_readme_are_those_of_the_demo(desk: Path) -> None:
+    run = shiftsim.demo(out="whole")
+    lines = [line for line in str(run.table(format="md")).splitlines() if line.startswith("| ")]
+    head, _, *rows = [[cell.strip() for cell in line[1:-1].split("|")] for line in lines]
+    printed = [
+        [row[0], row[1], *(row[head.index(name)] for name in README_COLUMNS)] for row in rows
+    ]
+    assert table_below(README, "The first command prints:\n") == printed
+
+
+def test_badges_of_the_readme_are_true() -> None:
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
+    versions = re.findall(r"Python :: (3\.\d+)", " ".join(project["project"]["classifiers"]))
+    badges = re.findall(r"^!\[(.*)\]\(https://img\.shields\.io", README.read_text("utf-8"), re.M)
+    assert badges == [
+        f"Python {', '.join(versions)}",
+        f"Licence {project['project']['license']}",
+        "Typed: mypy strict",
+    ]
+    assert project["tool"]["mypy"]["strict"]
 
 
 def test_checkpoints_are_those_of_the_planners() -> None:
@@ -423,7 +451,7 @@ def test_the_planning_arithmetic_adds_up() -> None:
 def test_the_site_is_built_without_a_warning() -> None:
     pytest.importorskip("zensical", reason="needs the dependency group `docs`")
     site = REPOSITORY / "build" / "tested"
-    command = [sys.executable, "tools/site.py", str(site.relative_to(REPOSITORY))]
+    command = [sys.executable, "tools/build_site.py", str(site.relative_to(REPOSITORY))]
     done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     for page in DOCS.rglob("*.md"):

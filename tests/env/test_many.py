@@ -150,6 +150,7 @@ def test_a_process_that_is_stopped_is_one_clear_error_in_time(toy):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("default")  # Gymnasium warns of the process that it ends
 def test_an_error_in_a_process_is_that_error(toy):
     envs = DrivingVectorEnv(2, num_workers=2, store=str(toy), observation="none")
     envs.reset(seed=0)

@@ -240,6 +240,7 @@ BROKEN = [
 ]
 
 
+@pytest.mark.filterwarnings("default")  # times that repeat are divided by
 @pytest.mark.parametrize(("planner", "severity", "check", "message"), BROKEN)
 def test_a_broken_rule_is_named_with_a_remedy(planner, severity, check, message):
     findings = check_planner(planner, cruise_scenario(start=(50.0, 0.0, 0.0)))

@@ -1,4 +1,4 @@
-"""Build the pages of docs/ as a site, strictly: python tools/site.py [FOLDER].
+"""Build the pages of docs/ as a site, strictly: python tools/build_site.py [FOLDER].
 
 mkdocstrings finds nothing in folders without `__init__.py`; it reads a copy that has them all.
 FOLDER lies inside the repository, since Zensical writes nowhere else.
@@ -14,10 +14,10 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def copy_modules(target: Path) -> None:
-    """Copy the package to `target`, with an `__init__.py` in every folder."""
+def copy_modules(target: Path, tree: Path = ROOT) -> None:
+    """Copy the package of a source tree to `target`, with an `__init__.py` in every folder."""
     shutil.rmtree(target, ignore_errors=True)
-    shutil.copytree(ROOT / "shiftsim", target, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(tree / "shiftsim", target, ignore=shutil.ignore_patterns("__pycache__"))
     for folder in target.rglob("*/"):
         (folder / "__init__.py").touch()
 
