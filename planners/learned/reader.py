@@ -62,8 +62,9 @@ def read_contents(path: Path) -> Contents:
         text = (str(error) or type(error).__name__).splitlines()[0]
         what = "is damaged, or holds more than tensors and plain values"
         raise CheckpointError(f"checkpoint {str(path)!r} {what}: {text}", _DAMAGED_HINT) from error
-    if not isinstance(contents.entries, dict):
-        what = f"holds one {type(contents.entries).__name__}, not tensors by name"
+    loaded: object = contents.entries  # of torch.load, which may return anything
+    if not isinstance(loaded, dict):
+        what = f"holds one {type(loaded).__name__}, not tensors by name"
         raise CheckpointError(f"checkpoint {str(path)!r} {what}", _WRITTEN_HINT)
     return contents
 

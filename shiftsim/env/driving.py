@@ -180,9 +180,9 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         Raises:
             ConfigError: The episode has ended.
         """
-        episode = self.episode
-        if episode.is_over:
+        if self.episode.is_over:
             raise ConfigError("the episode has ended", hint="call reset()")
+        episode = self.episode
         episode.action = given = bounded(action, self._high)
         episode.advance(plan_of(given, episode.log.ego[episode.iteration]))
         self._actions.append(given)

@@ -345,11 +345,11 @@ def simulate_together(rollouts: Sequence[Rollout]) -> list[SimulationLog | Excep
 
 def _plans(rollouts: Sequence[Rollout]) -> tuple[list[Plan | Exception], list[float]]:
     """The next plan of each, or the error in its place, and how long each took [s]."""
-    planners = [cast(BatchPlanner, rollout.planner) for rollout in rollouts]
+    planners = [rollout.planner for rollout in rollouts]
     seen = [rollout.observe() for rollout in rollouts]
     began = perf_counter()
     if isinstance(planners[0], BatchPlanner):
-        plans = planners[0].plan_batch(planners, seen)
+        plans = planners[0].plan_batch(cast(list[BatchPlanner], planners), seen)
         return [*plans], [(perf_counter() - began) / len(plans)] * len(plans)
     out, seconds = list[Plan | Exception](), list[float]()
     for planner, observation in zip(planners, seen, strict=True):
