@@ -18,12 +18,10 @@ from shiftsim.errors import ConfigError, MissingExtraError, no_attribute
 from shiftsim.files import DEFAULT_STORE, store_path
 from shiftsim.metrics import MetricResult
 from shiftsim.planners import registry
-from shiftsim.runs import results
 from shiftsim.sim import loop
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
 from shiftsim.sim.planner import Observation, Planner, SceneInfo
-from shiftsim.view.still import overview, svg_of
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario, require_scenario
 from shiftsim.world.state import EgoState, Tracks, Trajectory, speeds
@@ -276,11 +274,24 @@ def _with_methods(found: Any) -> "Run":
     return Run(found.path, found.manifest)
 
 
+def _plot(thing: Scenario | VectorMap) -> Any:
+    """A matplotlib figure of a scenario at its first iteration, or of a whole map.
+
+    Raises:
+        MissingExtraError: matplotlib is missing.
+    """
+    from shiftsim.view.still import overview
+
+    return overview(thing)
+
+
 def _picture_of(thing: Scenario | VectorMap) -> str:
     """A scenario or a map as a picture; as text where matplotlib is missing."""
+    from shiftsim.view.still import svg_of
+
     text = f"<pre>{html.escape(repr(thing))}</pre>"
     try:
-        return f"{text}{svg_of(overview(thing))}"
+        return f"{text}{svg_of(_plot(thing))}"
     except MissingExtraError:
         return text
 
@@ -301,7 +312,7 @@ def _table_of(log: SimulationLog) -> str:
     return f"<table>{''.join(cells)}</table>"
 
 
-def _missing(self: Any, name: str) -> Any:
+def missing(self: Any, name: str) -> Any:
     """`__getattr__` of what has no such attribute: says what may be meant."""
     owners = [kind.__name__ for kind in type(self).__mro__]
     # `dir` itself asks for attributes that begin like that
@@ -312,13 +323,13 @@ def _missing(self: Any, name: str) -> Any:
 setattr(SimulationLog, "_repr_html_", _table_of)  # noqa: B010
 for _kind in (Scenario, VectorMap):
     setattr(_kind, "_repr_html_", _picture_of)  # noqa: B010
-    setattr(_kind, "plot", overview)  # noqa: B010
+    setattr(_kind, "plot", _plot)  # noqa: B010
 _kinds: tuple[type, ...] = (
     *(Scenario, ScenarioStore, Observation, SceneInfo, EgoState, Tracks),
-    *(SimulationLog, Trajectory, MetricResult, VectorMap, results.Run),
+    *(SimulationLog, Trajectory, MetricResult, VectorMap),
 )
 for _answering in _kinds:
-    setattr(_answering, "__getattr__", _missing)  # noqa: B010
+    setattr(_answering, "__getattr__", missing)  # noqa: B010
 
 
 def __getattr__(name: str) -> Any:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from shiftsim.api import missing
 from shiftsim.errors import ConfigError, listed
 from shiftsim.runs import results
 from shiftsim.sim.log import SimulationLog
@@ -265,3 +266,6 @@ class Run(results.Run):
 
     def _repr_html_(self) -> str:
         return str(self.table(format="html", allow_partial=True))
+
+
+setattr(Run, "__getattr__", missing)  # noqa: B010
