@@ -5,6 +5,7 @@ import tomllib
 from collections.abc import Iterable, Sequence
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 from types import ModuleType
 
 FAILED = "failed check: "  # begins what a report says of a map that cannot be right
@@ -158,3 +159,11 @@ def no_attribute(
         meant = meant or nearest(name, names)
     more = f"; what you mean may be: {meant}" if meant else ""
     return AttributeError(f"{what} has no attribute {name!r}{more}")
+
+
+def missing_attribute(self: Any, name: str) -> Any:
+    """`__getattr__` of an object that has no such attribute: raises what `no_attribute` says."""
+    owners = [kind.__name__ for kind in type(self).__mro__]
+    # `dir` itself asks for attributes that begin like that
+    names = [] if name[0] == "_" else [other for other in dir(self) if other[0] != "_"]
+    raise no_attribute(f"{type(self).__name__!r} object", owners, name, names)

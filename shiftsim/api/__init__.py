@@ -14,7 +14,7 @@ import shiftsim.edits  # noqa: F401  # attaches Scenario.edited
 from shiftsim.api.stores import demo_store as demo_store
 from shiftsim.data import open_store as open_store
 from shiftsim.data.store.reading import ScenarioStore
-from shiftsim.errors import ConfigError, MissingExtraError, no_attribute
+from shiftsim.errors import ConfigError, MissingExtraError, missing_attribute
 from shiftsim.files import DEFAULT_STORE, store_path
 from shiftsim.metrics import MetricResult
 from shiftsim.planners import registry
@@ -312,14 +312,6 @@ def _table_of(log: SimulationLog) -> str:
     return f"<table>{''.join(cells)}</table>"
 
 
-def missing(self: Any, name: str) -> Any:
-    """`__getattr__` of what has no such attribute: says what may be meant."""
-    owners = [kind.__name__ for kind in type(self).__mro__]
-    # `dir` itself asks for attributes that begin like that
-    names = [] if name[0] == "_" else [other for other in dir(self) if other[0] != "_"]
-    raise no_attribute(f"{type(self).__name__!r} object", owners, name, names)
-
-
 setattr(SimulationLog, "_repr_html_", _table_of)  # noqa: B010
 for _kind in (Scenario, VectorMap):
     setattr(_kind, "_repr_html_", _picture_of)  # noqa: B010
@@ -329,7 +321,7 @@ _kinds: tuple[type, ...] = (
     *(SimulationLog, Trajectory, MetricResult, VectorMap),
 )
 for _answering in _kinds:
-    setattr(_answering, "__getattr__", missing)  # noqa: B010
+    setattr(_answering, "__getattr__", missing_attribute)  # noqa: B010
 
 
 def __getattr__(name: str) -> Any:

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from shiftsim.api import missing
-from shiftsim.errors import ConfigError, listed
+from shiftsim.errors import ConfigError, listed, missing_attribute
 from shiftsim.runs import results
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.scenario import Scenario
@@ -268,4 +267,4 @@ class Run(results.Run):
         return str(self.table(format="html", allow_partial=True))
 
 
-setattr(Run, "__getattr__", missing)  # noqa: B010
+setattr(Run, "__getattr__", missing_attribute)  # noqa: B010
