@@ -5,8 +5,8 @@ import tomllib
 from collections.abc import Iterable, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 from types import ModuleType
+from typing import Any
 
 FAILED = "failed check: "  # begins what a report says of a map that cannot be right
 _MAX_TEXT = 100_000  # characters
