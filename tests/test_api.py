@@ -205,6 +205,7 @@ def test_runs_are_compared_in_pairs(pair, run):
         run.compare(run)
 
 
+@pytest.mark.thorough
 def test_a_run_writes_its_report(pair, run, tmp_path):
     files = pair.report(tmp_path / "a", formats=["latex", "csv"], tables=["scores"])
     assert {"report.tex", "scores.csv", "open-against-closed.pdf"} <= {path.name for path in files}
@@ -238,6 +239,7 @@ def test_open_loop_is_drawn_against_closed_loop(pair, run):
         run.plot_open_against_closed()
 
 
+@pytest.mark.thorough
 def test_a_run_is_scored_again_compared_and_made_self_contained(run, tmp_path):
     again = run.rescore("deepplan", out=tmp_path / "again")
     assert again.manifest["determining"]["thresholds"]["name"] == "deepplan"
@@ -321,6 +323,7 @@ def test_a_scenario_has_a_duration_and_an_ego_its_parts(scenario):
     assert (ego.x, ego.y, ego.heading) == tuple(ego.pose)
 
 
+@pytest.mark.thorough
 def test_a_rollout_is_found_by_the_token_of_its_scenario(run, scenario, store, tmp_path):
     found = run.rollout(scenario.token)
     assert found.token == scenario.token
@@ -349,6 +352,7 @@ def test_a_store_is_checked_filtered_counted_and_exported(tmp_path):
     assert len(shiftsim.open_store(tmp_path / "back")) == len(opened)
 
 
+@pytest.mark.thorough
 def test_recordings_and_tracks_are_converted_from_python(tmp_path):
     columns, road = export_town(tmp_path / "sites", "street")
     site = tmp_path / "sites/street"
@@ -363,6 +367,7 @@ def test_recordings_and_tracks_are_converted_from_python(tmp_path):
         shiftsim.convert_dataset("av", tmp_path, tmp_path / "none")
 
 
+@pytest.mark.thorough
 def test_shards_are_joined_from_python(store, tmp_path):
     shards = [
         shiftsim.run("simple", store=str(store.path), shard=f"{n}/2", out=str(tmp_path / f"{n}"))

@@ -169,7 +169,7 @@ def num_lost(work: Callable[[], object]) -> int:
     return num_kept() - before
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.learned
 def test_no_kernel_loses_an_array(kernels: dict[str, Dispatcher], tmp_path: Path) -> None:
     _nrt_python.memsys_enable_stats()
@@ -204,6 +204,7 @@ def parent(n):
 """
 
 
+@pytest.mark.thorough
 def test_a_kernel_cached_as_a_part_of_another_can_be_called_itself(tmp_path: Path) -> None:
     (tmp_path / "family.py").write_text(CHILD_AND_PARENT)
     search = os.pathsep.join([str(tmp_path), str(PACKAGE.parent)])
@@ -229,6 +230,7 @@ def _search(folder: Path) -> str:
     return os.pathsep.join([str(folder.parent), str(PACKAGE.parent)])
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(sys.platform == "win32", reason="no owners and modes of files")
 @pytest.mark.parametrize("change", ["folder", "part", "file", "group", "owner", "parent"])
 def test_machine_code_that_others_may_have_written_is_not_read(tmp_path: Path, change: str) -> None:

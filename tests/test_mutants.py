@@ -62,6 +62,7 @@ def test_a_sample_hardly_changes_with_the_source() -> None:
     assert len(set(chosen) & set(sample(after, 8, 1))) >= 6
 
 
+@pytest.mark.thorough
 def test_every_group_has_the_same_share_of_a_sample() -> None:
     group_of, chosen = modules(), shared_sample(40, 1)
     assert Counter(group_of[mutant.module] for mutant in chosen) == dict.fromkeys(GROUPS, 8)

@@ -94,6 +94,7 @@ def test_hashes_of_a_store_are_hexadecimal(tmp_path, monkeypatch, home, value):
     assert not list((tmp_path / "cache" / "stores").iterdir())
 
 
+@pytest.mark.thorough
 def test_no_command_opens_a_url_that_only_a_run_names(theirs, monkeypatch):
     url = "file:///nowhere/at/all"
     changed(theirs / "manifest.json", lambda values: values.update(store=url))

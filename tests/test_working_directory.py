@@ -8,6 +8,8 @@ import pytest
 from commands import call
 from stores import write_toy_store
 
+pytestmark = pytest.mark.thorough
+
 STRAY = "open('stray-was-executed', 'a').write(__name__ + ' ')\nraise SystemExit('stray')\n"
 # modules of the standard library that workers import, and packages that may be missing
 NAMES = (
@@ -71,7 +73,6 @@ def folder(tmp_path):
     assert not (tmp_path / "stray-was-executed").exists()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("workers", ["2", pytest.param("1", marks=pytest.mark.thorough)])
 def test_a_run_executes_nothing_that_lies_about(folder, workers):
     words = ["-p", "constant-velocity", "-s", "./toy", "--workers", workers, "--out", "run"]
@@ -79,14 +80,12 @@ def test_a_run_executes_nothing_that_lies_about(folder, workers):
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.slow
 def test_the_console_script_executes_nothing_that_lies_about(folder):
     code = "from shiftsim.cli import main; main(['doctor'])"
     done = subprocess.run([sys.executable, "-P", "-c", code], cwd=folder, check=False)
     assert done.returncode == 0
 
 
-@pytest.mark.slow
 def test_workers_of_a_script_elsewhere_execute_nothing_that_lies_about(folder, tmp_path_factory):
     script = tmp_path_factory.mktemp("elsewhere") / "script.py"
     script.write_text(SCRIPT)
@@ -94,7 +93,6 @@ def test_workers_of_a_script_elsewhere_execute_nothing_that_lies_about(folder, t
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("workers", ["2", pytest.param("1", marks=pytest.mark.thorough)])
 def test_what_the_user_names_is_found_with_all_that_it_imports(tmp_path, workers):
     write_toy_store(tmp_path / "toy")
@@ -107,7 +105,6 @@ def test_what_the_user_names_is_found_with_all_that_it_imports(tmp_path, workers
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.thorough
 def test_each_plugin_alone_is_found(tmp_path):
     write_toy_store(tmp_path / "toy", count=1)
     (tmp_path / "my_plugins.py").write_text(PLUGINS)
@@ -120,7 +117,6 @@ def test_each_plugin_alone_is_found(tmp_path):
         assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.slow
 def test_a_named_module_does_not_replace_one_that_is_installed(folder):
     (folder / "my_planner.py").write_text(
         PLUGINS.replace("import my_helper", "import bisect, heapq")
@@ -168,7 +164,6 @@ def own(tmp_path):
     return tmp_path, words
 
 
-@pytest.mark.slow
 def test_no_import_that_is_tried_in_vain_finds_a_stray_file(own):
     folder, words = own
     probe = [sys.executable, "-P", "-c", PROBE, "run", *words, "--workers", "1", "--out", "probe"]
@@ -182,7 +177,6 @@ def test_no_import_that_is_tried_in_vain_finds_a_stray_file(own):
     assert not (folder / "stray-was-executed").exists()
 
 
-@pytest.mark.slow
 def test_a_planner_in_another_interpreter_finds_its_neighbours_and_no_stray_file(tmp_path):
     write_toy_store(tmp_path / "toy", count=1)
     (tmp_path / "my_planner.py").write_text(ALONE)
@@ -195,7 +189,6 @@ def test_a_planner_in_another_interpreter_finds_its_neighbours_and_no_stray_file
     assert not (tmp_path / "stray-was-executed").exists()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("more", [["--workers", "2"], ["--isolate"]])
 def test_a_planner_in_a_package_of_the_working_directory_is_found(own, more):
     folder, words = own

@@ -77,6 +77,7 @@ def test_a_damaged_store_is_named_and_the_others_are_listed(place):
     assert (second["name"], second["problem"]) == ("toy", "")
 
 
+@pytest.mark.thorough
 def test_the_command_prints_the_same_as_data_and_as_text(place):
     write_toy_store(place / "shiftsim-data" / "toy")
     printed = call(place, "data")

@@ -72,6 +72,7 @@ def made(call, folder):
     return str(path)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("workers", ["1", "2"])
 def test_a_run(call, workers):
     found = call(*RUN.format(name=f"workers-{workers}").split(), "--workers", workers)
@@ -88,6 +89,7 @@ def test_a_benchmark(call):
     assert call(*words.split(), "--out", "runs/dry-bench", "--dry-run")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "words",
     [

@@ -447,7 +447,7 @@ def test_the_planning_arithmetic_adds_up() -> None:
 # --- the site
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_site_is_built_without_a_warning() -> None:
     pytest.importorskip("zensical", reason="needs the dependency group `docs`")
     site = REPOSITORY / "build" / "tested"

@@ -54,6 +54,7 @@ class Acting:
         return command_of(self.actions[observation.iteration], observation.history.ego[-1])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("action", ["command", "trajectory"])
 @pytest.mark.parametrize("observation", ["none", "vector", "raster"])
 def test_gymnasium_has_nothing_to_say(toy, observation, action):

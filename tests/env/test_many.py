@@ -19,6 +19,8 @@ import shiftsim.env
 from shiftsim.env.driving import DrivingEnv, DrivingVectorEnv
 from shiftsim.errors import ConfigError, InvalidTrajectoryError, ShiftsimError
 
+pytestmark = pytest.mark.thorough
+
 COUNT, STEPS = 5, 60  # so many steps are more than two episodes
 
 
@@ -80,7 +82,6 @@ def roll(envs, steps=STEPS):
 NEXT, SAME = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("observation", "mode", "workers"),
     [
@@ -121,7 +122,6 @@ def test_it_does_what_gymnasiums_does_whatever_the_number_of_workers(
         assert same(one, other)
 
 
-@pytest.mark.slow
 def test_a_process_that_dies_is_one_clear_error(toy):
     envs = DrivingVectorEnv(2, num_workers=2, store=str(toy), observation=Dying())
     envs.reset(seed=0)
@@ -135,7 +135,6 @@ def test_a_process_that_dies_is_one_clear_error(toy):
     assert not any(process.is_alive() for process in processes)
 
 
-@pytest.mark.slow
 def test_a_process_that_is_stopped_is_one_clear_error_in_time(toy):
     envs = DrivingVectorEnv(2, num_workers=2, store=str(toy), observation="none", timeout=60.0)
     envs.reset(seed=0)
@@ -149,7 +148,6 @@ def test_a_process_that_is_stopped_is_one_clear_error_in_time(toy):
     assert not any(process.is_alive() for process in processes)
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # Gymnasium warns of the process that it ends
 def test_an_error_in_a_process_is_that_error(toy):
     envs = DrivingVectorEnv(2, num_workers=2, store=str(toy), observation="none")
@@ -222,7 +220,6 @@ def main():
 """
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("guard", [True, pytest.param(False, marks=pytest.mark.thorough)])
 def test_a_script_needs_its_guard_and_nothing_else(toy, tmp_path, guard):
     script = tmp_path / "script.py"

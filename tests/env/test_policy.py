@@ -54,7 +54,7 @@ def check_scores(run, env, act):
         assert scores == {name: row[name] for name in scores}
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("noise", ["none", "ou-high"])
 @pytest.mark.parametrize("action", ["command", "trajectory"])
 @pytest.mark.parametrize("observation", ["none", "vector", "raster"])
@@ -223,7 +223,7 @@ def command_line(folder, *words):
 
 
 @pytest.mark.learned
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("kind", "observation", "action"),
     [
@@ -270,7 +270,7 @@ def test_a_file_is_told_from_another_by_its_content(tmp_path):
 
 
 @pytest.mark.learned
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_file_obeys_the_contract_on_the_command_line(toy, tmp_path):
     write_network(tmp_path, "export")
     done = command_line(tmp_path, "planners", "check", "policy:policy.pt2", "--store", toy)

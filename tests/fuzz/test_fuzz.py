@@ -182,7 +182,7 @@ STRANGE = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("target", STRANGE)
 def test_what_no_program_writes_is_refused(target):
     """Deep nesting, numbers of thousands of digits, nulls, columns twice, absurd lengths."""

@@ -235,7 +235,7 @@ def check_files(paths: list[Path], count: int) -> int:
     return num_holes
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_ten_thousand_boxes_in_the_towns_of_the_demo_agree_with_shapely(tmp_path):
     for town in DEMO_TOWNS:
         xml = generate_town(town)[0].xml()

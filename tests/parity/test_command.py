@@ -27,7 +27,7 @@ def run(folder: Path) -> tuple[int, str]:
     return done.returncode, done.stdout.splitlines()[-1]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_folder_is_compared_and_its_last_line_sums_up(tmp_path):
     shutil.copy(GOLDEN / "idm_steps.npz", tmp_path)
     code, line = run(tmp_path)

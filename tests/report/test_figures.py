@@ -92,6 +92,7 @@ LEVELS = ("low", "mid", "high")
 ALL = ("none", *(f"{kind}-{level}" for kind in ("awgn", "ou") for level in LEVELS))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("names", "noise", "split"),
     [(PAPER, ALL, "deepplan"), (OWN, ("none", "ou-low"), "a-split-with-quite-a-long-name-indeed")],
@@ -136,6 +137,7 @@ def test_clean_is_full_and_solid_and_noise_hollow_and_dashed(groups):
     assert thin.get_ydata()[0] == pytest.approx(groups[0].estimate().value)
 
 
+@pytest.mark.thorough
 def test_a_report_in_latex_holds_the_pictures_as_pdf(groups, tmp_path):
     figures = [*drawn(groups).values()]
     write_report(tmp_path, "made up", [groups[0].run], [], figures, ["latex"])

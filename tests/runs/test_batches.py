@@ -95,6 +95,7 @@ def test_fallback_steps_are_counted_or_fail_a_strict_run(toy, tmp_path, size):
     assert "lost" in failed[0]["error"]
 
 
+@pytest.mark.thorough
 def test_a_traffic_network_moves_the_scenarios_of_a_batch_together(toy, tmp_path):
     values = {"planners": ["constant-velocity"], "planner_args": {}, "noise": ["none"]}
     values |= {"traffic": "learned", "batch_size": 2}

@@ -11,6 +11,8 @@ from commands import call
 import shiftsim
 from shiftsim.planners.contract import check_planner
 
+pytestmark = pytest.mark.thorough
+
 FOLDER = str(Path(__file__).parent)
 sys.path.append(FOLDER)
 RESULTS = ("scores.parquet", "metrics.parquet")
@@ -45,7 +47,6 @@ def test_the_check_names_a_planner_whose_class_remembers(toy):
     assert f"after scenario {scenes[1].token} the planner differs at iteration 0" in found.message
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("workers", ["1", "2"])
 def test_what_planners_print_does_not_mix_with_json(workers, toy, tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([*sys.path]))

@@ -15,6 +15,8 @@ from shiftsim.report.groups import read_groups
 from shiftsim.runs.edited import EditedStore, edits_text, make_edits
 from shiftsim.runs.scenarios import open_run_store
 
+pytestmark = pytest.mark.thorough
+
 EDITS = """
 [[edit]]
 name = "parked"

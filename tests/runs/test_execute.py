@@ -45,6 +45,7 @@ def test_two_workers_give_the_same_bytes_as_one(clean_run, toy, tmp_path):
     assert same_results(clean_run, other) == [True, True]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("workers", [1, 2])
 def test_short_plans_are_warned_of_once_per_run_and_planner(toy, tmp_path, workers, caplog, capfd):
     planners = ["drivers:Short", "constant-velocity"]
@@ -241,6 +242,7 @@ class Local:
         return self.inner.plan(observation)
 
 
+@pytest.mark.thorough
 def test_classes_and_instances_run_like_names(toy, tmp_path, clean_run):
     runs = [
         shiftsim.run(source, store=str(toy), workers=workers, out=str(tmp_path / f"{number}"))

@@ -66,6 +66,7 @@ def test_whatever_happens_there_is_the_planner_s_error_and_costs_one_task(toy, t
     assert "drivers.py" in tasks["raises"]["traceback"]
 
 
+@pytest.mark.thorough
 def test_a_socket_that_the_planner_writes_to_costs_one_task_each(toy, tmp_path):
     first, second = shiftsim.open_store(str(toy)).tokens[:2]
     for what in ("surplus", "endless", "large", "deep"):

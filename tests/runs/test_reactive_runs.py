@@ -1,9 +1,12 @@
 """Reactive traffic through a whole run."""
 
+import pytest
+
 import shiftsim
 from shiftsim.runs.derive import rescore
 
 
+@pytest.mark.thorough
 def test_workers_do_not_change_reactive_results(toy, tmp_path):
     runs = [
         shiftsim.run(

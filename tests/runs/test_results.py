@@ -50,6 +50,7 @@ def test_a_rollout_is_read_back_as_it_was_driven(clean_run, toy):
     assert (stored.token, stored.route) == (driven.token, driven.route)
 
 
+@pytest.mark.thorough
 def test_noise_comes_from_its_key_and_from_the_file_where_only_its_author_knows_it(
     clean_run, toy, tmp_path
 ):

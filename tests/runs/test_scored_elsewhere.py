@@ -88,6 +88,7 @@ def test_reactive_rollouts_bring_their_boxes(toy, tmp_path):
     assert again.scores.equals(run.scores)
 
 
+@pytest.mark.thorough
 def test_poses_alone_are_scored_and_say_so(clean_run, part, toy, tmp_path):
     pq.write_table(pq.read_table(part, columns=[*POSES]), tmp_path / "poses.parquet")
     source = read_source(tmp_path / "poses.parquet")

@@ -17,6 +17,8 @@ from shiftsim.runs.config import make_config
 from shiftsim.runs.execute import execute
 from shiftsim.runs.prepare import prepare
 
+pytestmark = pytest.mark.thorough
+
 sys.path.append(str(Path(__file__).parent))  # worker processes import `drivers`, too
 
 BAD = "0001cafe"
@@ -69,7 +71,6 @@ def test_an_error_of_the_network_is_that_of_its_scenario(toy, tmp_path, without,
     assert ours.scores.to_pylist() == good
 
 
-@pytest.mark.slow
 def test_where_the_process_ends_once_it_is_asked_again(toy, tmp_path, without):
     ours = run(toy, tmp_path / "run", trouble="die once", notes=tmp_path / "notes")
     assert content(ours) == content(without)
@@ -77,8 +78,6 @@ def test_where_the_process_ends_once_it_is_asked_again(toy, tmp_path, without):
     assert len(pids) == 2
 
 
-@pytest.mark.thorough
-@pytest.mark.slow
 def test_a_scenario_that_ends_the_process_fails_and_the_others_go_on(toy, tmp_path, without):
     ours = run(
         toy, tmp_path / "run", trouble="die", notes=tmp_path / "notes", workers=1, timeout=60
@@ -99,8 +98,6 @@ def have_torch():
 
 
 @pytest.mark.learned
-@pytest.mark.thorough
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("names", "traffic"),
     [
@@ -147,8 +144,6 @@ def when_it_infers(folder, count=30):
     return int(lines[0].split()[0])
 
 
-@pytest.mark.thorough
-@pytest.mark.slow
 def test_kills_and_interrupts_leave_nobody_and_the_rest_is_resumed(toy, tmp_path):
     first = start(toy, tmp_path)
     owner = when_it_infers(tmp_path)

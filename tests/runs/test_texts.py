@@ -97,6 +97,7 @@ def _with(metric):
     return compute
 
 
+@pytest.mark.thorough
 def test_a_folder_whose_name_is_no_text_can_hold_runs(toy, tmp_path):
     folder = tmp_path / os.fsdecode(b"a\xff")
     store = write_toy_store(tmp_path / "toy")

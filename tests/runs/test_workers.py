@@ -50,6 +50,7 @@ def test_a_worker_that_dies_costs_one_task_and_is_named():
     assert [outcomes[n].result[1] for n in (1, 2, 3, 4)] == [1, 4, 9, 16]
 
 
+@pytest.mark.thorough
 def test_every_task_may_kill_its_worker():
     assert [o.death != "" for o in run([13] * 6, 2)] == [True] * 6
 
@@ -72,6 +73,7 @@ def test_leading_tasks_are_done_one_at_a_time():
     assert all(before[1] <= after[0] for before, after in pairwise(spans[:4]))
 
 
+@pytest.mark.thorough
 def test_leading_tasks_come_first_whatever_their_groups():
     groups = [0, 0, 0, 1, 2, 1]
     for _ in range(3):
@@ -139,6 +141,7 @@ class Compiles:
         return task
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("alone", [0, 2])
 def test_a_task_that_compiles_is_given_more_time(alone, tmp_path, monkeypatch):
     monkeypatch.setattr("shiftsim.runs.workers._TIME_TO_LOAD", 0.0)

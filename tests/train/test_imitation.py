@@ -221,6 +221,7 @@ def test_a_batch_hides_last_actions_and_mirrors_with_the_sign_of_steering(states
     assert np.array_equal(again.measurements, batch.measurements)
 
 
+@pytest.mark.thorough
 def test_learning_depends_on_the_seed_and_not_on_the_number_of_threads(states):
     def learnt(threads, seed):
         learner = Learner("cpu", threads, total=4, seed=seed)

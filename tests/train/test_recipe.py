@@ -18,6 +18,8 @@ from shiftsim.train.driving import Driver, Job, PolicyPlanner, Start, divide
 from shiftsim.train.folder import BEST, LATEST, STATE, Settings
 from shiftsim.train.recipe import Training
 
+pytestmark = pytest.mark.thorough
+
 
 def curve_of(settings):
     return pq.read_table(settings.out / "curve.parquet").to_pylist()
@@ -27,7 +29,6 @@ def train(settings, **options):
     Training(settings, lambda text: None, **options).run()
 
 
-@pytest.mark.thorough
 def test_the_same_seed_gives_the_same_curve_and_network(small, trained):
     first, _ = trained
     again, other = small("again"), small("other", seed=6)
@@ -142,7 +143,6 @@ def test_numbers_that_make_no_training_are_refused(tmp_path, changes):
         Settings(store="demo", out=tmp_path, **changes)
 
 
-@pytest.mark.thorough
 def test_a_killed_command_goes_on(small, toy):
     whole, killed = small("whole", samples=6_400), small("killed", samples=6_400)
     train(whole)

@@ -131,6 +131,7 @@ def test_the_shipped_weights_are_nearer_than_constant_velocity(store):
     assert by_name["learned"]["collided"] <= by_name["straight"]["collided"]
 
 
+@pytest.mark.thorough
 def test_the_commands(store, tmp_path, weights):
     small = [word for name, value in SMALL.items() for word in (f"--{name}", value)]
     done = call(tmp_path, "train", "traffic", "--store", store, "--out", "out", *map(str, small))

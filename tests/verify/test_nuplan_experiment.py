@@ -171,6 +171,7 @@ LOG_NUMBERS = [
 ]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("part", "column", "row", "form", "named"), LOG_NUMBERS)
 def test_a_changed_number_of_a_log_is_named(
     folder, nuplan_reference, recorded, part, column, row, form, named
@@ -226,6 +227,7 @@ def test_a_damaged_log_is_one_error_that_names_it(folder, content):
         read_simulation_log(log_of(folder), Report())
 
 
+@pytest.mark.thorough
 def test_a_log_of_another_version_is_said_to_be_one(folder, nuplan_reference):
     keep(folder, LOGGED)
     change_log(log_of(folder), b"_car_footprint", b"_car_outlining")
@@ -323,7 +325,7 @@ def test_what_is_missing_is_said_with_a_remedy(folder, nuplan_reference, monkeyp
     assert "shiftsim[nuplan]" in missing.value.hint
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_command_compares_with_the_scenarios_of_a_store(nuplan_reference, folder, tmp_path):
     keep(folder, LOGGED)
     logs, maps = nuplan_reference / "logs" / "s10_lane_change.db", nuplan_reference / "maps"

@@ -202,6 +202,7 @@ def test_a_log_is_a_rollout_to_score(
     assert log_source(tmp_path.parent / "none.csv") is None
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not REAL_LOGS.is_dir(), reason="needs the genuine logs")
 def test_genuine_logs_are_rollouts_to_score() -> None:
     source = log_source(REAL_LOGS)
@@ -217,6 +218,7 @@ def test_genuine_logs_are_rollouts_to_score() -> None:
         )
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not REAL_LOGS.is_dir(), reason="needs the genuine logs")
 def test_genuine_logs_were_played_back(tmp_path: Path) -> None:
     folder = tmp_path / "closed_loop_nonreactive_agents" / "simulation_log" / "SimplePlanner"

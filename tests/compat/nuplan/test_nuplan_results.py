@@ -26,7 +26,7 @@ from shiftsim.verify.report import Report
 from shiftsim.verify.rollouts import ego_columns, light_columns, object_columns, plan_at
 from shiftsim.verify.simulation_log import read_simulation_log
 
-pytestmark = [pytest.mark.golden, pytest.mark.slow]
+pytestmark = [pytest.mark.golden, pytest.mark.thorough]
 GOLDEN = places.GOLDEN / "nuplan_experiment/closed_loop_nonreactive_agents/simple_planner"
 REAL_LOGS = places.REPOSITORY.parent / "shared" / "reference" / "nuplan_real_logs"
 DEVKIT = os.environ.get("NUPLAN_DEVKIT_PYTHON", "")

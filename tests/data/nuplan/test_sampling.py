@@ -266,6 +266,7 @@ def test_a_filter_that_takes_nothing_says_what_each_key_left(
     assert not store.exists()
 
 
+@pytest.mark.thorough
 def test_the_command_line_ends_with_3_where_a_filter_takes_nothing(
     log_path: Path, tmp_path: Path
 ) -> None:

@@ -155,7 +155,7 @@ def test_a_log_that_does_not_say_where_its_map_is_is_skipped_and_named(tmp_path)
     assert "sync.arrow: cannot be read" in report.skipped[str(bad)]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_command_converts_and_says_what_comes_next(tmp_path):
     write_commonroad(tmp_path / "files")
     done = call(tmp_path, "convert", "commonroad", "files", "--store", "./s", "--workers", "1")

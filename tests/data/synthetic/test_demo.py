@@ -22,6 +22,8 @@ from shiftsim.runs.scenarios import find_split
 from shiftsim.sim.loop import simulate
 from shiftsim.world.state import AgentKind
 
+pytestmark = pytest.mark.thorough
+
 TOWNS = ("avenue", "junction", "parking", "roundabout", "shared", "street")
 
 
@@ -57,7 +59,6 @@ def _digest(folder):
     return digest.hexdigest()
 
 
-@pytest.mark.thorough
 def test_the_demo_is_the_same_bytes_every_time(recordings, tmp_path):
     write_demo(tmp_path)
     assert _digest(tmp_path) == _digest(recordings)
@@ -102,7 +103,6 @@ def test_the_small_split_samples_every_town_and_passes_the_filter(store, verdict
     assert {store.read(token).city for token in split.tokens} == set(TOWNS) == set(store.cities)
 
 
-@pytest.mark.slow
 def test_better_planners_score_higher_in_every_demo(store):
     tokens = find_split("demo-mini", store.path, store.tokens).tokens
     means = [
@@ -165,8 +165,6 @@ def test_an_existing_demo_store_is_kept(store):
     assert (store.path / "store.json").stat().st_mtime_ns == before
 
 
-@pytest.mark.thorough
-@pytest.mark.slow
 def test_the_benchmark_city_is_large_and_its_agents_are_near():
     scene = bench_scene(40, 0)
     again = bench_scene(40, 0)

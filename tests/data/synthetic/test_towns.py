@@ -50,6 +50,7 @@ def _files(store):
 # ---- the store
 
 
+@pytest.mark.thorough
 def test_a_store_says_what_generated_it(store):
     assert store.generator == {"name": "towns", "seed": 5, "towns": 2}
     assert store.cities == ("town-5-001", "town-5-002")

@@ -313,6 +313,7 @@ def test_diffusion_planner_wants_its_args(tmp_path):
 # --- safetensors
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("planner", LEARNED)
 def test_a_converted_file_loads_with_equal_tensors(tmp_path, planner):
     state = state_of(planner)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -223,6 +224,7 @@ def test_lanes_that_share_their_nearest_vertex_come_by_area_then_as_listed():
     assert nearest_lanes(np.arange(4), areas, lines, 0.0, 0.0, 2).tolist() == [1, 3]
 
 
+@pytest.mark.thorough
 def test_in_a_city_seventy_lanes_are_seen():
     scenario = bench_scene(100, 0)
     features, _ = first_look(scenario)

@@ -70,6 +70,7 @@ def test_every_iteration_has_its_own_noise(planner):
     assert not np.array_equal(noises[0], noises[1])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("weights", [pytest.param("base", marks=pytest.mark.thorough), "drive"])
 def test_a_batch_agrees_with_one_by_one(weights, rng):
     planner = DiffusionPlanner(f"deterministic:{weights}")

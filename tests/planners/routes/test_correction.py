@@ -123,6 +123,7 @@ def city():
     return bench_scene(0, 0)
 
 
+@pytest.mark.thorough
 @settings(max_examples=40)
 @given(st.data())
 def test_what_is_kept_is_what_a_new_correction_gives(city, data):

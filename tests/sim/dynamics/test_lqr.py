@@ -56,6 +56,7 @@ def dense_curvature(
     return sums @ np.linalg.pinv(rows.T @ rows + penalties, rcond=1e-15) @ rows.T @ turns
 
 
+@pytest.mark.thorough
 @given(st.integers(0, 2**32 - 1), st.integers(3, 161), st.sampled_from([0.0, 0.1, 5.0, 30.0]))
 def test_banded_fits_agree_with_the_pseudo_inverse(seed, count, speed):
     poses = wobbly(np.random.default_rng(seed), count, speed)
