@@ -19,7 +19,7 @@ _HERE = Path(__file__).parent
 _FILES = {  # style and script of each page; its body is the file of its name
     "list": (["list.css"], ["list.js"]),
     "live": (["list.css", "live.css"], ["live.js"]),
-    "replay": (["replay.css"], ["codec.js", "world.js", "strips.js", "replay.js"]),
+    "replay": (["replay.css"], ["codec.js", "world.js", "strips.js", "waterfall.js", "replay.js"]),
     "review": (["replay.css", "review.css"], ["codec.js", "world.js", "review.js"]),
 }
 # of pages that are files; those of a server come with a header

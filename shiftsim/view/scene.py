@@ -13,6 +13,7 @@ import shapely
 
 from shiftsim.kernels import FloatArray
 from shiftsim.metrics import SHORT_NAMES
+from shiftsim.report.explain import losses
 from shiftsim.report.palette import planner_styles
 from shiftsim.report.words import REASONS, violation_words, violations
 from shiftsim.sim.log import SimulationLog
@@ -140,6 +141,7 @@ def describe_scene(replay: Replay) -> dict[str, Any]:
                 "colour": styles[item.planner].colour,
                 "marker": styles[item.planner].marker,
                 "violations": describe_violations(item),
+                "losses": _losses(item),
                 "scores": _scores(item.metrics),
                 "degraded": int(item.log.degraded.sum()),
                 "tracks": _track_names(item.log.tracks) if own else None,
@@ -210,6 +212,20 @@ def describe_violations(item: ShownRollout) -> list[dict[str, Any]]:
         for one in violations(item.metrics)
         if one.time is not None
     ]
+
+
+def _losses(item: ShownRollout) -> list[dict[str, Any]]:
+    """What takes points from a score of 100, in order of time, as JSON values; see `losses`."""
+    if item.cls is None:
+        return []
+    out = []
+    for row, points in losses(item.metrics):
+        name, time = row["metric"], row["first_violation_s"]
+        reason = REASONS.get(name, name.replace("_", " "))
+        words = violation_words(row, item.log.tracks)
+        words += f", {100.0 * row['score']:.0f} of 100" if time is None else ""
+        out.append({"metric": name, "t": time, "points": points, "reason": reason, "words": words})
+    return out
 
 
 def _scores(metrics: Iterable[Mapping[str, Any]]) -> dict[str, float]:
