@@ -4,6 +4,7 @@ import html
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -190,6 +191,8 @@ class Gallery:
         """
         self.tasks(token)
         scenario, links, first = self.store.read(token), [], 1
+        shown = [self.shown(token, scenario, part) for part in range(len(self.parts(token)))]
+        seeds = list(chain(*shown))
         for part, tasks in enumerate(self.parts(token)):
             links.append((f"{first}–{first + len(tasks) - 1}", page_name(token, part)))
             first += len(tasks)
@@ -200,17 +203,15 @@ class Gallery:
                 "shown": self.shown_words(token, part),
                 "settings": self.settings_words(token, part),
             }
-            out[name] = replay_page(
-                scenario, self.shown(token, scenario, part), back=back, more=more
-            )
+            out[name] = replay_page(scenario, shown[part], seeds=seeds, back=back, more=more)
         return out
 
     def page(self, token: str) -> Page:
         """The first replay of one scenario as HTML, alone."""
-        scenario = self.store.read(token)
-        shown = self.shown(token, scenario)
+        scenario, parts = self.store.read(token), range(len(self.parts(token)))
+        shown = [self.shown(token, scenario, part) for part in parts or [0]]
         more = {"shown": self.shown_words(token), "settings": self.settings_words(token)}
-        return replay_page(scenario, shown, more=more)
+        return replay_page(scenario, shown[0], seeds=list(chain(*shown)), more=more)
 
     def rows(self, token: str, *, with_pages: bool = True) -> list[dict[str, Any]]:
         """Rows of the scenario list: labels, scores and violated metrics of every rollout."""

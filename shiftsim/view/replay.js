@@ -5,6 +5,8 @@ const MAX_SCALE = 60; // pixels per metre
 const MIN_SCALE = 0.5;
 const SMALL = 680; // pixels of window height below which only the speed is drawn as a curve
 const NOISES = [["acceleration", "m/s²", 0.5, 2], ["steering rate", "rad/s", 0.05, 3]];
+const SPREADS = ["across", "along"];
+const LOW = 44; // height of lesser curves
 const CLEAN = [];
 const NOISY = [7, 5];
 const CLOSE = 14; // pixels per metre at least where a violation is looked at
@@ -40,7 +42,7 @@ let zoomed = false; // whether the link said how near
 let planned = 0; // how much of the plans beyond their first second is seen, 0 to 1
 const rollouts = meta.rollouts.map(() => null); // fields, once decoded
 let scene, map, times, strips, waterfall, panels, highlighted = -1;
-let tubes = []; // of the rollouts that are shown
+let tubes = []; // the seeds of each planner together: {planner, noise, colour, dots, area, across, along}
 
 const canvas = byId("scene");
 const context = canvas.getContext("2d", { alpha: false });
@@ -187,7 +189,6 @@ function changed() {
     element.querySelector("input").checked = state.shown[index];
   }
   byId("violation").disabled = !violations().length;
-  tubes = seedGroups(visible()).map((members) => ({ members, ...tubeOf(members) }));
   showCurves();
   layOut();
   saveState();
@@ -197,20 +198,15 @@ function visible() {
   return rollouts.map((fields, index) => index).filter((i) => state.shown[i] && rollouts[i]);
 }
 
-// rollouts that differ in their seed alone, where there are several
-function seedGroups(indices) {
-  const groups = new Map();
-  for (const index of indices.filter((i) => isNoisy(meta.rollouts[i]))) {
-    const { planner, noise } = meta.rollouts[index];
-    const key = `${planner}\n${noise}`;
-    groups.set(key, [...(groups.get(key) || []), index]);
-  }
-  return [...groups.values()].filter((members) => members.length > 1);
+// the tubes of some rollouts' planners
+function tubesOf(members) {
+  const planners = new Set(members.map((index) => meta.rollouts[index].planner));
+  return state.tube ? tubes.filter((tube) => planners.has(tube.planner)) : [];
 }
 
-function tubeOf(members) {
-  const dataOf = (name) => members.map((index) => rollouts[index].get(name).data);
-  return makeTube(dataOf("ego.xy"), dataOf("ego.heading"));
+function readTube(tube, number) {
+  const [across, along] = ["across", "along"].map((name) => scene.get(`tube${number}.${name}`).data);
+  return { ...tube, across, along, area: layerPath(scene, `tube${number}`, true) };
 }
 
 // ---- drawing ----
@@ -287,28 +283,28 @@ function drawPanel(panel, members, leading, at) {
     drawEgo(context, poseAt(scene, "expert", 1, 0, at), meta.vehicle, panel, COLOURS.recorded, false);
   }
   const order = members.filter((i) => i !== leading).concat(leading);
-  const drawn = state.tube ? tubes.filter((tube) => tube.members.some((i) => members.includes(i))) : [];
-  const inTube = new Set(drawn.flatMap((tube) => tube.members));
-  for (const tube of drawn) drawTube(context, tube, panel, meta.rollouts[tube.members[0]].colour);
+  const drawn = tubesOf(members);
+  const inTube = new Set(order.filter((i) => i !== leading && drawn.some((tube) => holds(tube, meta.rollouts[i]))));
+  for (const tube of drawn) drawTube(context, tube, panel, tube.colour);
   for (const index of order) {
     const rollout = meta.rollouts[index];
     const xy = rollouts[index].get("ego.xy").data;
-    const width = index === leading ? 2.6 : inTube.has(index) ? 0.9 : 1.8;
+    const width = index === leading ? 2.6 : inTube.has(index) ? 1 : 1.8;
     drawPath(context, xy, at, panel, rollout.colour, dashOf(rollout), width);
   }
-  for (const tube of drawn) drawAcross(panel, tube, at);
+  for (const tube of drawn) drawDots(panel, tube);
   for (const index of order) {
     const rollout = meta.rollouts[index];
-    if (state.plans && (index === leading || !inTube.has(index))) drawPlan(context, rollouts[index], panel, at, rollout.colour, planned);
     const pose = egoPose(index, at);
-    drawEgo(context, pose, meta.vehicle, panel, rollout.colour, index === leading, isNoisy(rollout) ? [4, 3] : []);
     const reach = meta.vehicle[2];
     const where = [pose[0] + reach * Math.cos(pose[2]), pose[1] + reach * Math.sin(pose[2])];
     const place = panel.toScreen(...where);
-    if (index !== leading && inTube.has(index)) {
+    if (inTube.has(index)) {
       drawMarker(context, rollout.marker, ...place, 4, rollout.colour, true);
       continue;
     }
+    if (state.plans) drawPlan(context, rollouts[index], panel, at, rollout.colour, planned);
+    drawEgo(context, pose, meta.vehicle, panel, rollout.colour, index === leading, isNoisy(rollout) ? [4, 3] : []);
     drawDisc(context, ...place, 7.5); // so that the marker looks as in the list
     drawMarker(context, rollout.marker, ...place, 5, rollout.colour, isNoisy(rollout));
   }
@@ -324,21 +320,14 @@ function drawPanel(panel, members, leading, at) {
   if (state.side) captionPanel(panel, meta.rollouts[leading], rollouts[leading], at);
 }
 
-// where the seeds of a tube are now, one line from side to side, and what they ever violate
-function drawAcross(panel, { members }, at) {
-  const { colour } = meta.rollouts[members[0]];
-  const poses = members.map((index) => egoPose(index, at));
-  const aside = ([x, y]) => y * Math.cos(poses[0][2]) - x * Math.sin(poses[0][2]);
-  context.strokeStyle = colour;
-  const sideways = poses.sort((a, b) => aside(a) - aside(b));
-  strokePoints(context, sideways.map((pose) => panel.toScreen(...pose.slice(0, 2))), 2);
-  for (const index of members) {
-    for (const item of meta.rollouts[index].violations) {
-      const place = panel.toScreen(...egoPose(index, sampleAt(item.t)).slice(0, 2));
-      drawMarker(context, "o", ...place, 4.5, COLOURS.alarm);
-      const words = `${labelOf(meta.rollouts[index])} at ${item.t.toFixed(1)} s: ${item.words}`;
-      state.dots.push([...place, words]);
-    }
+const holds = (tube, { planner, noise }) => tube.planner === planner && tube.noise === noise;
+
+// what the seeds of a tube ever violate
+function drawDots(panel, tube) {
+  for (const [x, y, words] of tube.dots) {
+    const place = panel.toScreen(x, y);
+    drawMarker(context, "o", ...place, 4.5, COLOURS.alarm);
+    state.dots.push([...place, words]);
   }
 }
 
@@ -437,9 +426,9 @@ function showCurves() {
     curves.push({ label: "acceleration", unit: "m/s²", least: 1, lines: lines("accel") });
     curves.push(...noiseCurves(order));
   }
-  if (state.tube && tubes.length) {
-    const apart = tubes.map((tube) => lineOf(tube.members[0], tube.across));
-    curves.push({ label: "seeds apart, across the path", unit: "m", least: 1, lines: apart });
+  for (const name of SPREADS.slice(0, window.innerHeight < SMALL ? 1 : 2)) {
+    const lines = tubesOf(members).map((tube) => ({ ...tube, hollow: true, dash: [5, 3], values: tube[name] }));
+    if (lines.length) curves.push({ label: `seeds apart, ${name}`, unit: "m", least: 1, height: LOW, lines });
   }
   const rows = members.filter((i) => meta.rollouts[i].violations.length);
   strips.show(curves, rows.flatMap(marksOf), times);
@@ -465,13 +454,14 @@ function noiseCurves(members) {
   }
   const inFocus = (one) => one.of.includes(state.focus);
   const { noise, seed } = meta.rollouts[state.focus];
-  const which = found.some(inFocus) ? `${noise}, seed ${seed}` : `${found.length} different`;
+  const all = new Set(found.map((one) => labelOf({ ...meta.rollouts[one.of[0]], planner: "" })));
+  const which = found.some(inFocus) ? `${noise} #${seed}` : [...all].join(",");
   const curveOf = ([name, unit, least, digits], column) => ({
     label: `noise on ${name} (${which})`,
     unit,
     least,
     digits,
-    height: 44,
+    height: LOW,
     lines: found.sort((a, b) => inFocus(a) - inFocus(b)).map((one) => ({
       values: one.data.filter((_, i) => i % 2 === column),
       colour: inFocus(one) ? COLOURS.ink : COLOURS.edged,
@@ -497,6 +487,7 @@ function marksOf(index, row) {
 // ---- controls ----
 
 function listRollouts() {
+  for (const { losses } of meta.rollouts) tellLosses(losses);
   byId("rollouts").replaceChildren();
   for (const [index, rollout] of meta.rollouts.entries()) {
     const box = document.createElement("div");
@@ -528,7 +519,7 @@ function listRollouts() {
 function lossLine(loss) {
   const line = document.createElement("div");
   line.className = "scores";
-  line.textContent = `${loss.words} ${lostWords(loss)}`;
+  line.textContent = `${loss.words} ${loss.told}`;
   return line;
 }
 
@@ -588,7 +579,7 @@ function violationButton(violation, index) {
   const words = violation.words.replace(/(\d) (?=m|s|rad)/g, "$1\u00a0"); // a number keeps its unit
   button.textContent = `${violation.t.toFixed(1)}\u00a0s  ${words}`;
   const loss = meta.rollouts[index].losses.find((one) => one.metric === violation.metric);
-  if (loss) button.append(" ", Object.assign(document.createElement("b"), { textContent: lostWords(loss) }));
+  if (loss) button.append(" ", Object.assign(document.createElement("b"), { textContent: loss.told }));
   const limit = violation.threshold === null ? "" : `, bound ${violation.threshold}`;
   button.title = `${violation.metric} (${violation.short})${limit}`;
   button.addEventListener("click", (event) => {
@@ -645,9 +636,9 @@ const isDark = () => document.documentElement.dataset.theme === "dark";
 function setTheme(dark) {
   document.documentElement.dataset.theme = dark ? "dark" : "light";
   readColours();
-  for (const rollout of meta.rollouts) {
-    rollout.given ??= rollout.colour;
-    rollout.colour = dark ? lightened(rollout.given) : rollout.given;
+  for (const item of [...meta.rollouts, ...tubes]) {
+    item.given ??= item.colour;
+    item.colour = dark ? lightened(item.given) : item.given;
   }
   if (!map) return;
   map.version++;
@@ -790,7 +781,7 @@ const KEYS = {
   e: () => setOption("expert", !state.expert),
   p: () => setOption("plans", !state.plans),
   u: () => setOption("up", !state.up),
-  n: () => canTube() && setOption("tube", !state.tube),
+  n: () => tubes.length && setOption("tube", !state.tube),
   d: toggleTheme,
   r: () => setOption("route", !map.layers.route),
   l: () => setOption("lanes", !map.layers.lanes),
@@ -803,10 +794,6 @@ const KEYS = {
   "=": () => zoom(1.25, canvas.clientWidth / 2, canvas.clientHeight / 2),
   "-": () => zoom(0.8, canvas.clientWidth / 2, canvas.clientHeight / 2),
 };
-
-function canTube() {
-  return seedGroups([...meta.rollouts.keys()]).length > 0;
-}
 
 function onKey(event) {
   if (event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;
@@ -933,7 +920,7 @@ async function loadState() {
   zoomed = given.has("zoom");
   state.scale = Math.min(Math.max(number("zoom", state.scale), MIN_SCALE), MAX_SCALE);
   for (const name of ["side", "up", "tube"]) state[name] = given.get(name) === "1";
-  state.tube &&= canTube();
+  state.tube &&= tubes.length > 0;
   const at = (given.get("at") || "").split(",").map(Number.parseFloat);
   state.follow = !(at.length === 2 && at.every(Number.isFinite));
   if (!state.follow) [state.centre, state.up] = [at, false];
@@ -944,7 +931,6 @@ async function loadState() {
 }
 
 async function start() {
-  startTheme();
   byId("token").textContent = meta.token;
   byId("about").textContent = [meta.type, meta.city, meta.log].filter(Boolean).join(" · ");
   byId("settings").textContent = meta.settings || "";
@@ -967,10 +953,12 @@ async function start() {
   }
   scene = await readSection("scene");
   times = scene.get("time").data;
-  map = new MapPicture(scene);
   strips = new Strips(byId("curves"), duration());
   waterfall = new Waterfall(byId("waterfall"), showLoss);
-  byId("tube").parentElement.hidden = !canTube();
+  tubes = meta.tubes.map(readTube);
+  startTheme();
+  map = new MapPicture(scene);
+  byId("tube").parentElement.hidden = !tubes.length;
   listRollouts();
   await loadState();
   listLegend();

@@ -6,15 +6,17 @@ Positions are relative to a whole-metre origin near the scene, so that quantised
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import permutations
 from typing import Any, TypeAlias
 
 import numpy as np
 import shapely
+from shapely.ops import substring
 
 from shiftsim.kernels import FloatArray
 from shiftsim.metrics import SHORT_NAMES
 from shiftsim.report.explain import losses
-from shiftsim.report.palette import planner_styles
+from shiftsim.report.palette import Style, planner_styles
 from shiftsim.report.words import REASONS, violation_words, violations
 from shiftsim.sim.log import SimulationLog
 from shiftsim.view.pack import Quantised
@@ -51,6 +53,7 @@ class Replay:
 
     scenario: Scenario
     shown: Sequence[ShownRollout]
+    seeds: Sequence[ShownRollout] = ()  # all of the scenario, also those of other pages
 
     @property
     def paths(self) -> list[FloatArray]:
@@ -66,6 +69,15 @@ class Replay:
     def origin(self) -> FloatArray:
         """(2,) whole metres that positions are relative to."""
         return np.rint((self.box[:2] + self.box[2:]) / 2.0)
+
+    @cached_property
+    def tubes(self) -> list[list[ShownRollout]]:
+        """Rollouts that differ in their seed alone, where there are several."""
+        groups: dict[tuple[str, str], list[ShownRollout]] = {}
+        for item in self.seeds or self.shown:
+            if item.noise != "none":
+                groups.setdefault((item.planner, item.noise), []).append(item)
+        return [members for members in groups.values() if len(members) > 1]
 
     @cached_property
     def own_tracks(self) -> bool:
@@ -96,7 +108,36 @@ def scene_fields(replay: Replay) -> Fields:
     fields["lights.status"] = (log.traffic_lights.status + 1).astype(np.uint8)
     if not replay.own_tracks:
         fields |= _track_fields(log.tracks, origin)
+    for number, members in enumerate(replay.tubes):
+        fields |= _tube_fields(f"tube{number}", [item.log.ego[:, :2] - origin for item in members])
     return fields
+
+
+def _tube_fields(name: str, paths: Sequence[FloatArray]) -> Fields:
+    """The area between paths (T, 2) of several seeds, and how far these are apart at each sample.
+
+    `across` is the largest distance of one seed from the path of another, as far as that reaches;
+    `along` is the difference of the distances driven [m].
+    """
+    count = min(map(len, paths))
+    lines = [shapely.LineString(path[:count]) for path in paths]
+    across, areas = np.zeros(count), []
+    for one, other in permutations(lines, 2):
+        points = shapely.points(shapely.get_coordinates(one))
+        where = shapely.line_locate_point(other, points)
+        far = shapely.distance(points, other)
+        across = np.maximum(across, np.where(where < other.length, far, 0.0))
+        common = substring(other, 0.0, where[-1]), substring(one, 0.0, one.length)
+        corners = [shapely.get_coordinates(line) for line in common]
+        if where[-1] < other.length:  # the other one goes on beyond its end
+            areas.append(shapely.Polygon(np.concatenate([corners[0], corners[1][::-1]])))
+    steps = [np.hypot(*np.diff(path[:count], axis=0, prepend=path[:1]).T) for path in paths]
+    along = np.ptp(np.cumsum(steps, axis=1), axis=0)
+    rings = _rings(areas, box_around(paths, 1.0))
+    apart = {"across": across, "along": along}
+    return line_fields(name, rings, np.zeros(2)) | {
+        f"{name}.{key}": Quantised(values, _METRES) for key, values in apart.items()
+    }
 
 
 def rollout_fields(replay: Replay, index: int) -> Fields:
@@ -120,7 +161,7 @@ def describe_scene(replay: Replay) -> dict[str, Any]:
     """Everything that is text or a single number, as JSON values."""
     scenario, shown, own = replay.scenario, replay.shown, replay.own_tracks
     script = scenario.script
-    styles = planner_styles(item.planner for item in shown)
+    styles = planner_styles(item.planner for item in (*shown, *replay.seeds))
     return {
         "token": scenario.token,
         "type": scenario.scenario_type,
@@ -132,6 +173,7 @@ def describe_scene(replay: Replay) -> dict[str, Any]:
         "vehicle": [PACIFICA.length, PACIFICA.width, PACIFICA.rear_axle_to_center],
         "ownTracks": own,
         "tracks": None if own else _track_names(shown[0].log.tracks),
+        "tubes": [_describe_tube(replay, members, styles) for members in replay.tubes],
         "rollouts": [
             {
                 "planner": item.planner,
@@ -149,6 +191,22 @@ def describe_scene(replay: Replay) -> dict[str, Any]:
             for item in shown
         ],
     }
+
+
+def _describe_tube(
+    replay: Replay, members: Sequence[ShownRollout], styles: Mapping[str, Style]
+) -> dict[str, Any]:
+    """Several seeds of a planner as JSON values; `dots` are where each violated something."""
+    planner, noise = members[0].planner, members[0].noise
+    dots = []
+    for item in members:
+        seconds = (item.log.time_us - item.log.time_us[0]) * 1e-6
+        for one in describe_violations(item):
+            row = int(np.searchsorted(seconds, one["t"] - 1e-6))
+            x, y = (item.log.ego[min(row, len(seconds) - 1), :2] - replay.origin).tolist()
+            words = f"{planner} {noise} #{item.seed} at {one['t']:.1f} s: {one['words']}"
+            dots.append([round(x, 2), round(y, 2), words])
+    return {"planner": planner, "noise": noise, "dots": dots, **styles[planner]._asdict()}
 
 
 def line_fields(name: str, lines: Sequence[FloatArray], origin: FloatArray) -> Fields:

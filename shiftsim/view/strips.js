@@ -174,9 +174,11 @@ class Strips {
     let left = curve.told;
     for (const { values, marker, colour, hollow } of told) {
       drawMarker(context, marker, this.x(t), curve.axis.y(values[row]), 3.5, colour, hollow);
-      const text = values[row].toFixed(curve.digits ?? 1);
+      const text = values[row].toFixed(curve.digits ?? 1).replace(/^-(?=[0.]+$)/, "");
       const width = context.measureText(text).width;
       if (left + 10 + width > this.width) continue;
+      context.fillStyle = COLOURS.paper; // over the cursor
+      context.fillRect(left - 2, curve.axis.y(curve.axis.high) - 14, 16 + width, 12);
       drawMarker(context, marker, left + 4, curve.axis.y(curve.axis.high) - 9, 4, colour, hollow);
       context.fillStyle = COLOURS.ink;
       context.fillText(text, left + 11, curve.axis.y(curve.axis.high) - 5);

@@ -20,7 +20,7 @@ class Waterfall {
     this.choose = choose;
   }
 
-  // name: of the rollout; cls: its score in [0, 1]; losses: [{t, points, reason, words}] in order of
+  // name: of the rollout; cls: its score in [0, 1]; losses: [{t, points, told, reason, words}] in order of
   // time, those without a moment last; x: place of a time
   show({ name, colour, cls, losses, duration, x }) {
     const y = (score) => FALL_TOP + (1 - score / 100) * FALL_HEIGHT;
@@ -30,11 +30,13 @@ class Waterfall {
     for (const loss of losses) {
       const at = x(loss.t ?? duration);
       corners.push([at, y(score)], [at, y(score - loss.points)]);
-      parts.push({ loss, at, top: y(score), bottom: y(score - loss.points) });
+      const others = losses.map((other) => Math.abs(x(other.t ?? duration) - at) / 2);
+      const reach = Math.min(12, ...others.filter(Boolean)); // up to where it can be clicked
+      parts.push({ loss, at, reach, top: y(score), bottom: y(score - loss.points) });
       score -= loss.points;
     }
     corners.push([x(duration), y(score)], [x(duration), y(0)]);
-    const result = cls === null ? "no score" : `score ${(100 * cls).toFixed(1)}`;
+    const result = cls === null ? "no score" : `score ${Number((100 * cls).toFixed(2))}`;
     const words = svgElement("text", { class: "name", x: x(0) + 4, y: 11 }, `${result} of ${name}`);
     const axis = [100, 0].map((value) =>
       svgElement("text", { x: x(0) - 5, y: y(value) + 4, "text-anchor": "end" }, `${value}`),
@@ -45,7 +47,7 @@ class Waterfall {
     this.cursor = svgElement("line", { y1: 0, y2: "100%", stroke: "var(--ink)", "stroke-width": 1.5 });
     const shown = cls === null ? [] : [...axis, area, ...parts.map((part) => this.part(part))];
     this.element.replaceChildren(words, this.cursor, ...shown);
-    this.label(parts, x(duration));
+    this.label(cls === null ? [] : parts, x(duration));
   }
 
   // shows a time by its place
@@ -55,15 +57,15 @@ class Waterfall {
   }
 
   part(one) {
-    const { loss, at, top, bottom } = one;
+    const { loss, at, top, bottom, reach } = one;
     const when = loss.t === null ? "at the end" : `at ${loss.t.toFixed(1)} s`;
-    const words = `${lostWords(loss)} ${when}: ${loss.words}`;
-    const height = Math.max(bottom - top, 2);
-    const box = { x: at - FALL_WIDTH / 2, y: Math.min(top, bottom - height), width: FALL_WIDTH, height };
-    const reach = { class: "reach", x: at - 12, y: FALL_TOP - 4, width: 24, height: FALL_HEIGHT + 8 };
+    const words = `${loss.told} ${when}: ${loss.words}`;
+    const height = Math.max(bottom - top, 3);
+    const box = { x: at - FALL_WIDTH / 2, y: bottom - height, width: FALL_WIDTH, height };
+    const around = { x: at - reach, y: 0, width: 2 * reach, height: FALL_TOP + FALL_HEIGHT + 4 };
     one.element = svgElement(
       "g", { class: "loss", role: "button", tabindex: 0, "aria-label": words },
-      svgElement("title", {}, words), svgElement("rect", reach), svgElement("rect", box),
+      svgElement("title", {}, words), svgElement("rect", { ...around, class: "reach" }), svgElement("rect", box),
     );
     one.element.addEventListener("click", () => this.choose(loss));
     one.element.addEventListener("keydown", (event) => {
@@ -75,24 +77,35 @@ class Waterfall {
     return one.element;
   }
 
-  // words beside the losses, where there is room: right of them, else left
+  // words beside the losses where there is room: right of them, else left
   label(parts, end) {
-    let free = 0; // up to where is written
-    parts.forEach(({ loss, at, top, bottom, element }, i) => {
-      const y = Math.min(Math.max((top + bottom) / 2 + 4, FALL_TOP + 9), FALL_TOP + FALL_HEIGHT);
-      const text = svgElement("text", { y }, `${lostWords(loss)} ${loss.reason}`);
-      element?.append(text);
-      const width = element ? text.getComputedTextLength() + 8 : 0;
-      const next = parts.slice(i + 1).find((other) => other.at > at);
-      const [right, left] = [at + width <= (next ? next.at - 6 : end), at - width >= free];
-      if (right || left) text.setAttribute("x", right ? at + 8 : at - width);
-      else text.remove();
-      free = Math.max(free, right ? at + width : at + 8);
-    });
+    const taken = parts.map(({ at, top, bottom }) => [at - 5, Math.min(top, bottom - 3), at + 5, bottom]);
+    for (const { loss, at, top, bottom, element } of parts) {
+      const y = Math.min(Math.max((top + bottom) / 2 + 4, FALL_TOP + 10), FALL_TOP + FALL_HEIGHT - 4);
+      const text = svgElement("text", { y }, `${loss.told} ${loss.reason}`);
+      element.append(text);
+      const width = text.getComputedTextLength();
+      const boxAt = (left) => [left, y - 9, left + width, y + 2];
+      const fits = ([left, , right]) => left > 0 && right <= end;
+      const free = (a) => taken.every((b) => a[2] <= b[0] || b[2] <= a[0] || a[3] <= b[1] || b[3] <= a[1]);
+      const box = [at + 8, at - 8 - width].map(boxAt).find((one) => fits(one) && free(one));
+      if (!box) {
+        text.remove();
+        continue;
+      }
+      text.setAttribute("x", box[0]);
+      taken.push(box);
+    }
   }
 }
 
-// what a loss takes, as "−31.2"
-function lostWords(loss) {
-  return loss.points < 0.05 ? "−0" : `−${loss.points.toFixed(1)}`;
+// what each loss takes, in words; told are the steps of the score to two digits, so that they add up
+function tellLosses(losses) {
+  const rounded = (value) => Math.round(100 * value) / 100;
+  let score = 100;
+  for (const loss of losses) {
+    const step = rounded(score) - rounded(score - loss.points);
+    loss.told = `−${rounded(step)}`;
+    score -= loss.points;
+  }
 }

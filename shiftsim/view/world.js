@@ -266,44 +266,11 @@ function drawPath(context, xy, at, panel, colour, dash, width) {
   context.setLineDash([]);
 }
 
-// The ground that several paths cover together, as one area: hulls of where they are at one sample
-// and the next; and how far apart they are at each sample, across their mean heading [m].
-function makeTube(paths, headings) {
-  const count = Math.min(...headings.map((values) => values.length));
-  const area = new Path2D();
-  const at = (row) => paths.map((xy) => [xy[2 * row], xy[2 * row + 1]]);
-  const across = new Array(count);
-  for (let row = 0; row < count; row++) {
-    const heading = headings.reduce((sum, values) => sum + values[row], 0) / headings.length;
-    const aside = at(row).map(([x, y]) => y * Math.cos(heading) - x * Math.sin(heading));
-    across[row] = Math.max(...aside) - Math.min(...aside);
-    if (row + 1 < count) polygon(area, hull([...at(row), ...at(row + 1)]));
-  }
-  return { area, across };
-}
-
-// corners of the convex hull of points, always in the same direction
-function hull(points) {
-  const sorted = [...points].sort((a, b) => a[0] - b[0] || a[1] - b[1]);
-  const half = (order) => {
-    const out = [];
-    for (const p of order) {
-      while (out.length > 1) {
-        const [a, b] = out.slice(-2);
-        if ((b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0]) > 0) break;
-        out.pop();
-      }
-      out.push(p);
-    }
-    return out.slice(0, -1);
-  };
-  return [...half(sorted), ...half(sorted.reverse())];
-}
-
+// the ground between the paths of a planner's seeds
 function drawTube(context, { area }, panel, colour) {
   context.globalAlpha = 0.35;
   context.fillStyle = colour;
-  panel.inWorld(context, () => context.fill(area));
+  panel.inWorld(context, () => context.fill(area, "evenodd"));
   context.globalAlpha = 1;
 }
 
