@@ -30,6 +30,7 @@ const state = {
   expert: true,
   plans: true,
   up: false, // whether the ego's forward is up
+  fork: false, // whether what could have been driven in place of a collision is drawn
   tube: false, // whether the seeds of a planner are drawn together
   scale: 6,
   centre: null,
@@ -282,7 +283,8 @@ function drawPanel(panel, members, leading, at) {
     drawPath(context, scene.get("expert.xy").data, at, panel, COLOURS.recorded, [2, 3], 1.5);
     drawEgo(context, poseAt(scene, "expert", 1, 0, at), meta.vehicle, panel, COLOURS.recorded, false);
   }
-  const order = members.filter((i) => i !== leading).concat(leading);
+  const fork = state.fork && meta.rollouts[leading].fork;
+  const order = fork ? [leading] : members.filter((i) => i !== leading).concat(leading);
   const drawn = tubesOf(members);
   const inTube = new Set(order.filter((i) => i !== leading && drawn.some((tube) => holds(tube, meta.rollouts[i]))));
   for (const tube of drawn) drawTube(context, tube, panel, tube.colour);
@@ -303,14 +305,15 @@ function drawPanel(panel, members, leading, at) {
       drawMarker(context, rollout.marker, ...place, 4, rollout.colour, true);
       continue;
     }
-    if (state.plans) drawPlan(context, rollouts[index], panel, at, rollout.colour, planned);
+    if (state.plans && !fork) drawPlan(context, rollouts[index], panel, at, rollout.colour, planned);
     drawEgo(context, pose, meta.vehicle, panel, rollout.colour, index === leading, isNoisy(rollout) ? [4, 3] : []);
     drawDisc(context, ...place, 7.5); // so that the marker looks as in the list
     drawMarker(context, rollout.marker, ...place, 5, rollout.colour, isNoisy(rollout));
   }
+  const labels = fork ? drawFork(panel, leading, fork, at) : [];
   const violated = order.reverse().flatMap((index) => violatedNow(panel, index));
   // what words may not cover: [left, top, right, bottom]
-  const taken = violated.map(({ x, y }) => [x - 10, y - 10, x + 10, y + 10]);
+  const taken = [...labels, ...violated.map(({ x, y }) => [x - 10, y - 10, x + 10, y + 10])];
   const told = toldOf(violated.filter(({ index }) => index === leading));
   for (const one of violated.filter((item) => item !== told)) {
     drawMarker(context, "burst", one.x, one.y, 6, COLOURS.alarm);
@@ -318,6 +321,48 @@ function drawPanel(panel, members, leading, at) {
   if (told) tellViolation(panel, told, taken);
   state.pins.push(...violated.map(({ item, index, x, y }) => [x, y, `${labelOf(meta.rollouts[index])}: ${item.words}`]));
   if (state.side) captionPanel(panel, meta.rollouts[leading], rollouts[leading], at);
+}
+
+// what is driven from a fork on, up to a collision; returns the boxes of the words at the ends
+function drawFork(panel, index, { t, row, branches }, at) {
+  const fields = rollouts[index];
+  const boxes = [];
+  branches.forEach(({ name, colour, marker, hit }, number) => {
+    const xy = fields.get(`branch${number}.xy`).data;
+    const ink = colour || COLOURS.ink;
+    const last = xy.length / 2 - 1;
+    context.lineWidth = 3;
+    strokeLine(context, xy, 0, last + 1, panel, ink);
+    const rowNow = Math.min(Math.max(at.row - row, 0), last);
+    const now = { row: rowNow, next: Math.min(rowNow + 1, last), share: state.t > t ? at.share : 0 };
+    drawEgo(context, poseAt(fields, `branch${number}`, 1, 0, now), meta.vehicle, panel, ink, false);
+    const [x, y] = panel.toScreen(xy[2 * last], xy[2 * last + 1]);
+    if (hit === null) drawMarker(context, marker || "s", x, y, 5, ink);
+    else drawMarker(context, "burst", x, y, 7, COLOURS.alarm);
+    boxes.push(nameBranch(panel, hit === null ? `${name}: clear` : `${name}: hits`, x, y, ink, boxes));
+  });
+  const xy = fields.get("branch0.xy").data;
+  if (branches.length) drawMarker(context, "o", ...panel.toScreen(xy[0], xy[1]), 6, COLOURS.ink, true);
+  return boxes;
+}
+
+// the name of a branch beside its end, below those that are there
+function nameBranch(panel, words, x, y, colour, taken) {
+  context.font = "600 12px system-ui, sans-serif";
+  const width = context.measureText(words).width + 10;
+  const right = x + 12 + width < panel.left + panel.width;
+  const left = right ? x + 12 : x - 12 - width;
+  const boxAt = (k) => [left, y - 9 + 20 * k, left + width, y + 9 + 20 * k];
+  const meets = (a, b) => a[0] < b[2] && b[0] < a[2] && a[1] < b[3] && b[1] < a[3];
+  const box = [0, -1, 1, -2, 2, -3, 3].map(boxAt).find((one) => !taken.some((other) => meets(one, other)));
+  const [, top] = box || boxAt(4);
+  context.fillStyle = COLOURS.glass;
+  context.fillRect(left, top, width, 18);
+  context.fillStyle = colour;
+  context.fillRect(right ? left : left + width - 3, top, 3, 18);
+  context.fillStyle = COLOURS.ink;
+  context.fillText(words, left + 6, top + 13);
+  return [left, top, left + width, top + 18];
 }
 
 const holds = (tube, { planner, noise }) => tube.planner === planner && tube.noise === noise;
@@ -477,11 +522,35 @@ function marksOf(index, row) {
   const { colour, marker, violations: all } = meta.rollouts[index];
   const hollow = isNoisy(meta.rollouts[index]);
   const moments = [...new Set(all.map((item) => item.t))];
-  return moments.map((t) => {
+  const { fork } = meta.rollouts[index];
+  const chance = fork?.branches.length && { t: fork.t, row, text: "last chance", words: forkWords(fork), colour: COLOURS.ink, marker: "o", hollow: true };
+  const marks = moments.map((t) => {
     const here = all.filter((item) => item.t === t);
     const [text, words] = [here.map((item) => item.short).join(" "), here.map((item) => item.words).join("; ")];
     return { t, row, text, words, colour, marker, hollow };
   });
+  return chance ? [...marks, chance].sort((a, b) => a.t - b.t) : marks;
+}
+
+function forkWords({ t, branches }) {
+  if (!branches.length) return `no braking and no PDM-Closed avoids the collision, from ${t.toFixed(1)} s on`;
+  const told = branches.map(({ name, words }) => `${name} ${words}`);
+  return `last chance to avoid the collision at ${t.toFixed(1)} s: ${told.join("; ")}`;
+}
+
+// the moment at which the rollout in focus forks, else the first that does
+function showFork() {
+  const forks = (index) => meta.rollouts[index].fork?.branches.length;
+  const index = [state.focus, ...rollouts.keys()].find(forks);
+  if (index === undefined) return;
+  if (index === state.focus && state.fork) return setOption("fork", false);
+  pause();
+  setFocus(index);
+  [state.fork, state.follow, state.centre] = [true, true, null];
+  state.scale = Math.max(state.scale, CLOSE);
+  syncOptions();
+  say(forkWords(meta.rollouts[index].fork));
+  seek(meta.rollouts[index].fork.t);
 }
 
 // ---- controls ----
@@ -510,7 +579,7 @@ function listRollouts() {
     name.append(check, swatch(rollout), label, cls);
     const buttons = rollout.violations.map((item) => violationButton(item, index));
     const rest = rollout.losses.filter((loss) => loss.t === null).map(lossLine);
-    box.append(name, noiseOf(rollout), scoresOf(rollout), ...buttons, ...rest);
+    box.append(name, noiseOf(rollout), scoresOf(rollout), ...buttons, ...rest, ...forkLines(rollout, index));
     byId("rollouts").append(box);
   }
 }
@@ -521,6 +590,21 @@ function lossLine(loss) {
   line.className = "scores";
   line.textContent = `${loss.words} ${loss.told}`;
   return line;
+}
+
+// from where on a collision could not be avoided, and what is driven from there
+function forkLines({ fork }, index) {
+  if (!fork) return [];
+  const line = (words) => Object.assign(document.createElement("div"), { className: "scores", textContent: words });
+  if (!fork.branches.length) return [line(forkWords(fork))];
+  const button = document.createElement("button");
+  button.textContent = `${fork.t.toFixed(1)}\u00a0s  last chance to avoid the collision`;
+  button.addEventListener("click", (event) => {
+    event.stopPropagation();
+    [state.focus, state.fork] = [index, false];
+    showFork();
+  });
+  return [button, ...fork.branches.map(({ name, words }) => line(`${name}: ${words}`))];
 }
 
 // a loss leads to its violation; one without a moment to the end
@@ -606,7 +690,8 @@ function listLegend() {
   }
 }
 
-const OPTIONS = ["follow", "side", "expert", "plans", "up", "tube"];
+const LINKED = ["side", "up", "tube", "fork"]; // of them, what the link says
+const OPTIONS = ["follow", "side", "expert", "plans", "up", "tube", "fork"];
 function syncOptions() {
   for (const name of OPTIONS) byId(name).checked = state[name];
   byId("route").checked = map.layers.route;
@@ -636,7 +721,8 @@ const isDark = () => document.documentElement.dataset.theme === "dark";
 function setTheme(dark) {
   document.documentElement.dataset.theme = dark ? "dark" : "light";
   readColours();
-  for (const item of [...meta.rollouts, ...tubes]) {
+  const branches = meta.rollouts.flatMap(({ fork }) => fork?.branches || []);
+  for (const item of [...meta.rollouts, ...tubes, ...branches].filter(({ colour }) => colour)) {
     item.given ??= item.colour;
     item.colour = dark ? lightened(item.given) : item.given;
   }
@@ -782,6 +868,7 @@ const KEYS = {
   p: () => setOption("plans", !state.plans),
   u: () => setOption("up", !state.up),
   n: () => tubes.length && setOption("tube", !state.tube),
+  k: showFork,
   d: toggleTheme,
   r: () => setOption("route", !map.layers.route),
   l: () => setOption("lanes", !map.layers.lanes),
@@ -825,7 +912,10 @@ function connect() {
   byId("time").addEventListener("pointerdown", pause);
   byId("rate").addEventListener("change", (e) => (state.rate = Number(e.target.value)));
   for (const name of [...OPTIONS, "route", "lanes"]) {
-    byId(name).addEventListener("change", (e) => setOption(name, e.target.checked));
+    byId(name).addEventListener("change", (e) => {
+      if (name === "fork") showFork();
+      else setOption(name, e.target.checked);
+    });
   }
   canvas.addEventListener("pointerdown", drag);
   canvas.addEventListener("pointermove", hover);
@@ -895,7 +985,7 @@ function saveState() {
   const shown = state.shown.map((on, i) => (on ? i + 1 : 0)).filter(Boolean);
   const parts = [`t=${state.t.toFixed(2)}`, `on=${shown}`, `focus=${state.focus + 1}`];
   parts.push(`zoom=${state.scale.toFixed(2)}`);
-  for (const name of ["side", "up", "tube"]) if (state[name]) parts.push(`${name}=1`);
+  for (const name of LINKED) if (state[name]) parts.push(`${name}=1`);
   if (!state.follow && state.centre) parts.push(`at=${state.centre.map((v) => v.toFixed(1))}`);
   written = parts.join("&");
   try {
@@ -919,7 +1009,7 @@ async function loadState() {
   state.focus = state.shown[focus] ? focus : state.shown.indexOf(true);
   zoomed = given.has("zoom");
   state.scale = Math.min(Math.max(number("zoom", state.scale), MIN_SCALE), MAX_SCALE);
-  for (const name of ["side", "up", "tube"]) state[name] = given.get(name) === "1";
+  for (const name of LINKED) state[name] = given.get(name) === "1";
   state.tube &&= tubes.length > 0;
   const at = (given.get("at") || "").split(",").map(Number.parseFloat);
   state.follow = !(at.length === 2 && at.every(Number.isFinite));
@@ -959,6 +1049,7 @@ async function start() {
   startTheme();
   map = new MapPicture(scene);
   byId("tube").parentElement.hidden = !tubes.length;
+  byId("fork").parentElement.hidden = !meta.rollouts.some(({ fork }) => fork?.branches.length);
   listRollouts();
   await loadState();
   listLegend();

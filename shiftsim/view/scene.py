@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import permutations
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import shapely
@@ -15,6 +15,7 @@ from shapely.ops import substring
 
 from shiftsim.kernels import FloatArray
 from shiftsim.metrics import SHORT_NAMES
+from shiftsim.metrics.result import Collision
 from shiftsim.report.explain import losses
 from shiftsim.report.palette import Style, planner_styles
 from shiftsim.report.words import REASONS, violation_words, violations
@@ -23,7 +24,7 @@ from shiftsim.view.pack import Quantised
 from shiftsim.world.layers import Layer
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import AX, PACIFICA, Tracks, speeds
+from shiftsim.world.state import AX, PACIFICA, AgentKind, Tracks, speeds
 
 Fields: TypeAlias = dict[str, Quantised | np.ndarray]
 
@@ -33,6 +34,21 @@ _COARSE = 0.05  # m, of plans beyond their first second
 _FIRST_SECOND = 11  # poses of a plan up to 1 s ahead
 _MAP_STEP = 0.05  # m
 _TOLERANCE = 0.05  # m, of simplified map lines
+
+
+class Branch(NamedTuple):
+    """What is driven from the fork of a rollout on."""
+
+    name: str  # of the planner, or "braking"
+    poses: FloatArray  # (K, 3) rear axle from the fork on
+    hit: Collision | None  # the first collision at fault
+
+
+class Fork(NamedTuple):
+    """The last moment at which a collision could be avoided."""
+
+    start: int  # its iteration; without branches how far back there is none
+    branches: tuple[Branch, ...]
 
 
 @dataclass(frozen=True)
@@ -45,6 +61,7 @@ class ShownRollout:
     log: SimulationLog  # the rollout
     cls: float | None = None  # its score in [0, 1]; None where it was not scored
     metrics: Sequence[Mapping[str, Any]] = ()  # rows of `metrics.parquet`
+    fork: Fork | None = None  # where it was searched for
 
 
 @dataclass(frozen=True)
@@ -152,6 +169,9 @@ def rollout_fields(replay: Replay, index: int) -> Fields:
     fields["rest"] = Quantised(plans[:, _FIRST_SECOND - 1 :], _COARSE)
     fields["noise"] = Quantised(log.noise, _RADIANS)
     fields["degraded"] = log.degraded
+    fork = replay.shown[index].fork
+    for number, branch in enumerate(fork.branches if fork else ()):
+        fields |= _poses(f"branch{number}", branch.poses[:, None], origin)
     if replay.own_tracks:
         fields |= _track_fields(log.tracks, origin)
     return fields
@@ -161,7 +181,8 @@ def describe_scene(replay: Replay) -> dict[str, Any]:
     """Everything that is text or a single number, as JSON values."""
     scenario, shown, own = replay.scenario, replay.shown, replay.own_tracks
     script = scenario.script
-    styles = planner_styles(item.planner for item in (*shown, *replay.seeds))
+    branched = [one.name for item in shown if item.fork for one in item.fork.branches[1:]]
+    styles = planner_styles([*(item.planner for item in (*shown, *replay.seeds)), *branched])
     return {
         "token": scenario.token,
         "type": scenario.scenario_type,
@@ -184,6 +205,7 @@ def describe_scene(replay: Replay) -> dict[str, Any]:
                 "marker": styles[item.planner].marker,
                 "violations": describe_violations(item),
                 "losses": _losses(item),
+                "fork": _describe_fork(item, styles),
                 "scores": _scores(item.metrics),
                 "degraded": int(item.log.degraded.sum()),
                 "tracks": _track_names(item.log.tracks) if own else None,
@@ -284,6 +306,24 @@ def _losses(item: ShownRollout) -> list[dict[str, Any]]:
         words += f", {100.0 * row['score']:.0f} of 100" if time is None else ""
         out.append({"metric": name, "t": time, "points": points, "reason": reason, "words": words})
     return out
+
+
+def _describe_fork(item: ShownRollout, styles: Mapping[str, Style]) -> dict[str, Any] | None:
+    """A fork as JSON values, times in s from the start."""
+    if item.fork is None:
+        return None
+    seconds = (item.log.time_us - item.log.time_us[0]) * 1e-6
+    branches = []
+    for one in item.fork.branches:
+        words, hit = "nothing hit", None
+        if one.hit is not None:
+            hit = float(seconds[one.hit.iteration])
+            kind = AgentKind(one.hit.kind).name.lower().replace("_", " ")
+            words = f"hits {kind} {one.hit.token} at {hit:.1f} s, Δv {one.hit.delta_v:.1f} m/s"
+        style = styles[one.name]._asdict() if one.name in styles else {"colour": "", "marker": ""}
+        branches.append({"name": one.name, "hit": hit, "words": words, **style})
+    start = item.fork.start
+    return {"t": float(seconds[start]), "row": start, "branches": branches}
 
 
 def _scores(metrics: Iterable[Mapping[str, Any]]) -> dict[str, float]:
