@@ -7,7 +7,7 @@ const FALL_HEIGHT = 36; // of a score of 100
 const FALL_WIDTH = 8; // of a loss
 
 function svgElement(name, attributes, ...children) {
-  const element = document.createElementNS("http://www.w3.org/2000/svg", name);
+  const element = document.createElementNS(byId("waterfall").namespaceURI, name);
   for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
   element.append(...children);
   return element;

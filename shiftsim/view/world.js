@@ -349,6 +349,12 @@ const MARKERS = {
   P: (c, r) => polygon(c, cross(r, 0)),
   X: (c, r) => polygon(c, cross(r, Math.PI / 4)),
   "*": (c, r) => polygon(c, star(r)),
+  "<": (c, r) => polygon(c, [[-r, 0], [r, -r], [r, r]]),
+  ">": (c, r) => polygon(c, [[r, 0], [-r, -r], [-r, r]]),
+  p: (c, r) => polygon(c, regular(r, 5)),
+  h: (c, r) => polygon(c, regular(r, 6)),
+  H: (c, r) => polygon(c, regular(r, 6, Math.PI / 6)),
+  d: (c, r) => polygon(c, [[0, -1.2 * r], [0.65 * r, 0], [0, 1.2 * r], [-0.65 * r, 0]]),
   burst: (c, r) => polygon(c, star(r, 8)), // where something went wrong; of no planner
 };
 
@@ -364,6 +370,11 @@ function cross(r, angle) {
     x * Math.cos(by) - y * Math.sin(by), x * Math.sin(by) + y * Math.cos(by),
   ];
   return [0, 1, 2, 3].flatMap((k) => quarter.map((p) => turn(p, angle + (k * Math.PI) / 2)));
+}
+
+function regular(r, corners, turn = 0) {
+  const angles = [...Array(corners).keys()].map((k) => turn + (2 * Math.PI * k) / corners);
+  return angles.map((angle) => [1.1 * r * Math.sin(angle), -1.1 * r * Math.cos(angle)]);
 }
 
 function star(r, points = 5) {
