@@ -88,10 +88,10 @@ def with_roles(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
     Those of interPlan differ from nuPlan's.
     """
-    rows = [dict(row) for row in rows]
-    names = {row["metric"] for row in rows}
+    listed = [dict(row) for row in rows]
+    names = {row["metric"] for row in listed}
     sorts = next((name.removeprefix(SORTS) for name in names if name.startswith(SORTS)), "")
-    for row in rows:
+    for row in listed:
         name = row["metric"]
         role = "multiplier" if name in MULTIPLIERS else "weighted" if name in WEIGHTS else ""
         weight = WEIGHTS.get(name)
@@ -100,7 +100,9 @@ def with_roles(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
         row |= {"role": role, "weight": weight}
     roles = ("multiplier", "weighted", "")
     order = {name: place for place, name in enumerate(SHORT_NAMES)}
-    return sorted(rows, key=lambda r: (roles.index(r["role"]), order.get(r["metric"], len(order))))
+    return sorted(
+        listed, key=lambda r: (roles.index(r["role"]), order.get(r["metric"], len(order)))
+    )
 
 
 def explain_tasks(

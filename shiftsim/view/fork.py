@@ -98,19 +98,22 @@ class _Search:
 
         Without such a moment within the last five seconds there are none.
         """
+        makers = {BRAKING: self._braking, **planners}
+        makers.setdefault(PDM, PdmClosed)
+
+        def branch(name: str, start: int) -> Branch:
+            return self._branch(name, start, makers[name]())
+
+        def can_avoid(start: int) -> bool:
+            return any(branch(name, start).hit is None for name in (BRAKING, PDM))
+
         least = max(self.iteration - _BACK, 0)
         for start in range(self.iteration - 1, least - 1, -_STRIDE):
-            if not self._can_avoid(start):
-                continue
-            later = range(min(start + _STRIDE, self.iteration) - 1, start, -1)
-            start = next((found for found in later if self._can_avoid(found)), start)
-            makers = {BRAKING: self._braking, **planners}
-            return Fork(start, tuple(self._branch(n, start, make()) for n, make in makers.items()))
+            if can_avoid(start):
+                later = range(min(start + _STRIDE, self.iteration) - 1, start, -1)
+                start = next(filter(can_avoid, later), start)
+                return Fork(start, tuple(branch(name, start) for name in makers))
         return Fork(least, ())
-
-    def _can_avoid(self, start: int) -> bool:
-        makers = {BRAKING: self._braking, PDM: PdmClosed}
-        return any(self._branch(n, start, make()).hit is None for n, make in makers.items())
 
     def _braking(self) -> Planner:
         return Braking(self.scenario, HARDEST, driven=(self.log.time_us, self.log.ego))

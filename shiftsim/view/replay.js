@@ -246,6 +246,7 @@ function draw() {
   [state.told, state.pins, state.dots] = [[], [], []];
   const ratio = window.devicePixelRatio || 1;
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  context.imageSmoothingEnabled = !(state.playing && state.up); // a turned map is drawn in time
   context.fillStyle = COLOURS.paper;
   context.fillRect(0, 0, canvas.clientWidth, canvas.clientHeight);
   for (const { panel, members } of panels) {
