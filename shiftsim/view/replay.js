@@ -182,6 +182,9 @@ function setFocus(index) {
   if (!state.shown[index]) show(index, true);
   highlighted = -1;
   changed();
+  const card = byId("rollouts").children[index];
+  const aside = card.closest("aside");
+  if (aside.scrollHeight > aside.clientHeight) card.scrollIntoView({ block: "nearest" });
 }
 
 function changed() {
@@ -287,7 +290,8 @@ function drawPanel(panel, members, leading, at) {
   const fork = state.fork && meta.rollouts[leading].fork;
   const order = fork ? [leading] : members.filter((i) => i !== leading).concat(leading);
   const drawn = tubesOf(members);
-  const inTube = new Set(order.filter((i) => i !== leading && drawn.some((tube) => holds(tube, meta.rollouts[i]))));
+  const isHeld = (index) => drawn.some((tube) => holds(tube, meta.rollouts[index]));
+  const inTube = new Set(order.filter((index) => index !== leading && isHeld(index)));
   for (const tube of drawn) drawTube(context, tube, panel, tube.colour);
   for (const index of order) {
     const rollout = meta.rollouts[index];
@@ -307,7 +311,8 @@ function drawPanel(panel, members, leading, at) {
       continue;
     }
     if (state.plans && !fork) drawPlan(context, rollouts[index], panel, at, rollout.colour, planned);
-    drawEgo(context, pose, meta.vehicle, panel, rollout.colour, index === leading, isNoisy(rollout) ? [4, 3] : []);
+    const dash = isNoisy(rollout) ? [4, 3] : [];
+    drawEgo(context, pose, meta.vehicle, panel, rollout.colour, index === leading, dash);
     drawDisc(context, ...place, 7.5); // so that the marker looks as in the list
     drawMarker(context, rollout.marker, ...place, 5, rollout.colour, isNoisy(rollout));
   }
@@ -473,8 +478,10 @@ function showCurves() {
     curves.push(...noiseCurves(order));
   }
   for (const name of SPREADS.slice(0, window.innerHeight < SMALL ? 1 : 2)) {
-    const lines = tubesOf(members).map((tube) => ({ ...tube, hollow: true, dash: [5, 3], values: tube[name] }));
-    if (lines.length) curves.push({ label: `seeds apart, ${name}`, unit: "m", least: 1, height: LOW, lines });
+    const noisy = { hollow: true, dash: [5, 3] };
+    const lines = tubesOf(members).map((tube) => ({ ...tube, ...noisy, values: tube[name] }));
+    const about = { label: `seeds apart, ${name}`, unit: "m", least: 1, height: LOW };
+    if (lines.length) curves.push({ ...about, lines });
   }
   const rows = members.filter((i) => meta.rollouts[i].violations.length);
   strips.show(curves, rows.flatMap(marksOf), times);
@@ -500,8 +507,7 @@ function noiseCurves(members) {
   }
   const inFocus = (one) => one.of.includes(state.focus);
   const { noise, seed } = meta.rollouts[state.focus];
-  const all = new Set(found.map((one) => labelOf({ ...meta.rollouts[one.of[0]], planner: "" })));
-  const which = found.some(inFocus) ? `${noise} #${seed}` : [...all].join(",");
+  const which = found.some(inFocus) ? `${noise} #${seed}` : `${found.length} realisations`;
   const curveOf = ([name, unit, least, digits], column) => ({
     label: `noise on ${name} (${which})`,
     unit,
@@ -524,13 +530,15 @@ function marksOf(index, row) {
   const hollow = isNoisy(meta.rollouts[index]);
   const moments = [...new Set(all.map((item) => item.t))];
   const { fork } = meta.rollouts[index];
-  const chance = fork?.branches.length && { t: fork.t, row, text: "last chance", words: forkWords(fork), colour: COLOURS.ink, marker: "o", hollow: true };
   const marks = moments.map((t) => {
     const here = all.filter((item) => item.t === t);
     const [text, words] = [here.map((item) => item.short).join(" "), here.map((item) => item.words).join("; ")];
     return { t, row, text, words, colour, marker, hollow };
   });
-  return chance ? [...marks, chance].sort((a, b) => a.t - b.t) : marks;
+  if (!fork?.branches.length) return marks;
+  const style = { colour: COLOURS.ink, marker: "o", hollow: true };
+  marks.push({ t: fork.t, row, text: "last chance", words: forkWords(fork), ...style });
+  return marks.sort((a, b) => a.t - b.t);
 }
 
 function forkWords({ t, branches }) {
@@ -579,25 +587,23 @@ function listRollouts() {
     cls.textContent = rollout.cls === null ? "–" : (100 * rollout.cls).toFixed(1);
     name.append(check, swatch(rollout), label, cls);
     const buttons = rollout.violations.map((item) => violationButton(item, index));
-    const rest = rollout.losses.filter((loss) => loss.t === null).map(lossLine);
-    box.append(name, noiseOf(rollout), scoresOf(rollout), ...buttons, ...rest, ...forkLines(rollout, index));
+    const undated = rollout.losses.filter((loss) => loss.t === null);
+    const lines = undated.map((loss) => smallLine(`${loss.words} ${loss.told}`));
+    const lists = [...buttons, ...lines, ...forkLines(rollout, index)];
+    box.append(name, noiseOf(rollout), scoresOf(rollout), ...lists);
     byId("rollouts").append(box);
   }
 }
 
-// what is lost without a moment of its own
-function lossLine(loss) {
+function smallLine(words) {
   const line = document.createElement("div");
-  line.className = "scores";
-  line.textContent = `${loss.words} ${loss.told}`;
-  return line;
+  return Object.assign(line, { className: "scores", textContent: words });
 }
 
 // from where on a collision could not be avoided, and what is driven from there
 function forkLines({ fork }, index) {
   if (!fork) return [];
-  const line = (words) => Object.assign(document.createElement("div"), { className: "scores", textContent: words });
-  if (!fork.branches.length) return [line(forkWords(fork))];
+  if (!fork.branches.length) return [smallLine(forkWords(fork))];
   const button = document.createElement("button");
   button.textContent = `${fork.t.toFixed(1)}\u00a0s  last chance to avoid the collision`;
   button.addEventListener("click", (event) => {
@@ -605,7 +611,7 @@ function forkLines({ fork }, index) {
     [state.focus, state.fork] = [index, false];
     showFork();
   });
-  return [button, ...fork.branches.map(({ name, words }) => line(`${name}: ${words}`))];
+  return [button, ...fork.branches.map(({ name, words }) => smallLine(`${name}: ${words}`))];
 }
 
 // a loss leads to its violation; one without a moment to the end

@@ -65,7 +65,9 @@ class Waterfall {
     const around = { x: at - reach, y: 0, width: 2 * reach, height: FALL_TOP + FALL_HEIGHT + 4 };
     one.element = svgElement(
       "g", { class: "loss", role: "button", tabindex: 0, "aria-label": words },
-      svgElement("title", {}, words), svgElement("rect", { ...around, class: "reach" }), svgElement("rect", box),
+      svgElement("title", {}, words),
+      svgElement("rect", { ...around, class: "reach" }),
+      svgElement("rect", box),
     );
     one.element.addEventListener("click", () => this.choose(loss));
     one.element.addEventListener("keydown", (event) => {

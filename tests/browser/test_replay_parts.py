@@ -317,3 +317,8 @@ def test_every_part_fits_the_window(page, folder, size):
     page.open((folder / "replay" / f"fork-{page_name(VIOLATED)}").as_uri() + "#tube=1&t=2", size)
     assert page.run("document.documentElement.scrollWidth") <= size[0]
     assert page.run("canvas.clientHeight") >= 0.35 * size[1]
+
+
+def test_a_page_with_everything_stays_small(folder):
+    for page in (folder / "replay").iterdir():
+        assert page.stat().st_size <= 150_000, page.name
