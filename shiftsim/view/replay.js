@@ -11,6 +11,7 @@ const CLEAN = [];
 const NOISY = [7, 5];
 const CLOSE = 14; // pixels per metre at least where a violation is looked at
 const AROUND = 15; // m around the path that the page opens with
+const NEAR = 6; // m around what is driven from a fork on
 const AHEAD = 0.2; // of the height of a view whose ego drives up: how far below its middle
 const LENGTH_CLEAR = 4.2; // m that no ego reaches from its rear axle
 const TOLD = 2; // s that the words of a violation stay
@@ -548,18 +549,20 @@ function forkWords({ t, branches }) {
 }
 
 // the moment at which the rollout in focus forks, else the first that does
-function showFork() {
+async function showFork() {
   const forks = (index) => meta.rollouts[index].fork?.branches.length;
   const index = [state.focus, ...rollouts.keys()].find(forks);
   if (index === undefined) return;
   if (index === state.focus && state.fork) return setOption("fork", false);
+  const { fork } = meta.rollouts[index];
   pause();
+  if (!state.shown[index]) await show(index, true);
   setFocus(index);
-  [state.fork, state.follow, state.centre] = [true, true, null];
-  state.scale = Math.max(state.scale, CLOSE);
-  syncOptions();
-  say(forkWords(meta.rollouts[index].fork));
-  seek(meta.rollouts[index].fork.t);
+  state.fork = true;
+  say(forkWords(fork));
+  const paths = fork.branches.map((_, number) => rollouts[index].get(`branch${number}.xy`).data);
+  showAround(paths.flatMap((xy) => [...xy]), NEAR);
+  seek(fork.t);
 }
 
 // ---- controls ----
@@ -765,12 +768,13 @@ function rounded(scale) {
   return Number(Math.min(Math.max(scale, MIN_SCALE), MAX_SCALE).toFixed(2));
 }
 
-// the view of the whole path in focus, and 15 m around it
-function fit() {
-  const xy = [...rollouts[state.focus].get("ego.xy").data];
+const fit = () => showAround([...rollouts[state.focus].get("ego.xy").data], AROUND);
+
+// the view of places x, y, x, y, … and some metres around them
+function showAround(xy, around) {
   const ends = [0, 1].map((axis) => {
     const values = xy.filter((value, i) => i % 2 === axis && Number.isFinite(value));
-    return [Math.min(...values) - AROUND, Math.max(...values) + AROUND];
+    return [Math.min(...values) - around, Math.max(...values) + around];
   });
   const { width, height } = panels[0].panel;
   const scale = Math.min(width / (ends[0][1] - ends[0][0]), height / (ends[1][1] - ends[1][0]));
