@@ -40,6 +40,9 @@ def view(
     store: Store = None,
     labels: Labels = None,
     limit: int = Option(200, help="Only the N with the lowest scores, 0 for all."),
+    fork: bool = Option(
+        False, "--fork", help="Also from where collisions could be avoided; needs TOKEN."
+    ),
     out: Path | None = Option(None, help="Folder to write to. [RUN/view]"),
     browser: Browser = True,
     quiet: Quiet = False,
@@ -47,13 +50,15 @@ def view(
     """Replay rollouts in the browser: pages that need no server and no network."""
     from shiftsim.view.build import page_name, write_site
 
+    if fork and token is None:
+        raise ConfigError("--fork needs a scenario", hint="shiftsim view RUN TOKEN --fork")
     found = _galleries([run, *(others or ())], labels, store, planner, noise, seed)
     folder = out or safe_join(run, "view")
     if token is not None:
         gallery, token = _holding(found, token)
         folder.mkdir(parents=True, exist_ok=True)
         page = folder / page_name(token)
-        for name, one in gallery.pages(token).items():
+        for name, one in gallery.pages(token, fork=fork).items():
             one.save(folder / name)
         _say_shown(gallery, token, "the others are linked")
     else:

@@ -34,6 +34,10 @@ _CHOICES: dict[str, Sequence[str]] = {
 }
 _FREE_SIGN = ("ahead_m", "left_m", "turn", "pose", "near", "goal", "also_at", "from_s")
 _MAX_NAME = 60  # characters
+# of keys, in words
+_SIDES = {"ahead_m": ("ahead", "behind"), "left_m": ("left", "right")}
+_UNITS = {"_mps2": "m/s²", "_mps": "m/s", "_m": "m", "_s": "s"}
+_UNNAMED = ("at", "kind", "kinds", "behavior")
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,16 +230,24 @@ def digest_of(content: Any) -> str:
 
 
 def _words(table: Any) -> str:
+    """What a table says that is not the default, as "30 m ahead, 1.2 m right, stopped"."""
     parts = []
     for item in fields(table):
         value = getattr(table, item.name)
-        plain = None if item.default is MISSING else item.default
-        if value != plain:
-            if is_dataclass(value):
-                parts.append(f"{item.name} ({_words(value)})")
-            else:
-                parts.append(f"{item.name} {_plain(value)}")
+        if value != (None if item.default is MISSING else item.default):
+            parts.append(_phrase(item.name, value))
     return ", ".join(parts) or "everything"
+
+
+def _phrase(name: str, value: Any) -> str:
+    if name in _SIDES:
+        return f"{abs(value):g} m {_SIDES[name][value < 0.0]}"
+    words = _words(value) if is_dataclass(value) else _plain(value)
+    if name in _UNNAMED:
+        return words.replace("_", " ")
+    ending = next(filter(name.endswith, _UNITS), "")
+    unit = f" {_UNITS[ending]}" if ending else ""
+    return f"{name.removesuffix(ending).replace('_', ' ')} {words}{unit}"
 
 
 def _plain(value: Any) -> str:

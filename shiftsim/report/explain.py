@@ -1,6 +1,6 @@
 """Why a rollout has its score: every metric, its value, threshold and first violation."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import pyarrow.compute as pc
@@ -8,6 +8,7 @@ import pyarrow.compute as pc
 from shiftsim.errors import ConfigError, beginning
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES, WEIGHTS
 from shiftsim.metrics.interplan import LANES, SORTS, role_of
+from shiftsim.metrics.score import closed_loop_score
 from shiftsim.report.words import COLLISIONS, REASONS, UNITS, in_words, rows_by_task, task_of
 from shiftsim.runs.edited import edit_words
 from shiftsim.runs.results import Run
@@ -54,19 +55,43 @@ def select_tasks(
     for row in rows:
         task = task_of(row)
         cls = scores[task][0]["cls"] if task in scores else None
-        listed = _with_roles(metrics.get(task, []))
+        listed = with_roles(metrics.get(task, []))
         out.append(row | {"cls": cls, "why": why(cls, listed), "edits": edits, "metrics": listed})
     return out
 
 
-def _with_roles(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def losses(rows: Iterable[Mapping[str, Any]]) -> list[tuple[dict[str, Any], float]]:
+    """What every metric below 1 takes from a score of 100 [points], in order of time.
+
+    All metrics begin at 1 and take their scores in turn: at their first violation, multipliers
+    first at equal times, and those without a moment last. The loss is the fall of the score at that
+    turn: 100 less all losses is the score, and nothing is left to lose once it is 0.
+    """
+    scored = [row for row in with_roles(rows) if row["role"] and row["score"] is not None]
+    weights = {row["metric"]: row["weight"] for row in scored}
+    scores = dict.fromkeys(weights, 1.0)
+    turns = sorted(
+        (row for row in scored if row["score"] < 1.0),
+        key=lambda row: (row["first_violation_s"] is None, row["first_violation_s"] or 0.0),
+    )
+    out, left = [], 100.0
+    for row in turns:
+        scores[row["metric"]] = row["score"]
+        after = 100.0 * closed_loop_score(scores, weights.__getitem__)
+        out.append((row, left - after))
+        left = after
+    return out
+
+
+def with_roles(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """The metrics of a task with role and weight, by role, then in the order of all tables.
 
     Those of interPlan differ from nuPlan's.
     """
-    names = {row["metric"] for row in rows}
+    listed = [dict(row) for row in rows]
+    names = {row["metric"] for row in listed}
     sorts = next((name.removeprefix(SORTS) for name in names if name.startswith(SORTS)), "")
-    for row in rows:
+    for row in listed:
         name = row["metric"]
         role = "multiplier" if name in MULTIPLIERS else "weighted" if name in WEIGHTS else ""
         weight = WEIGHTS.get(name)
@@ -75,7 +100,9 @@ def _with_roles(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         row |= {"role": role, "weight": weight}
     roles = ("multiplier", "weighted", "")
     order = {name: place for place, name in enumerate(SHORT_NAMES)}
-    return sorted(rows, key=lambda r: (roles.index(r["role"]), order.get(r["metric"], len(order))))
+    return sorted(
+        listed, key=lambda r: (roles.index(r["role"]), order.get(r["metric"], len(order)))
+    )
 
 
 def explain_tasks(

@@ -89,13 +89,14 @@ _KNOWN = {
     "idm": Style("#26576c", "X"),
     "constant-velocity": Style("#bf9647", "*"),
 }
+# of planners without a style: markers and hues of none of the known ones
 _OTHERS = (
-    Style("#c2569a", "o"),
-    Style("#1f3a70", "s"),
-    Style("#8a9a12", "^"),
-    Style("#d2691e", "D"),
-    Style("#0f8f96", "v"),
-    Style("#4d4d4d", "P"),
+    Style("#c2569a", ">"),
+    Style("#8a9310", "p"),
+    Style("#2218dc", "<"),
+    Style("#b84514", "h"),
+    Style("#0c6e5f", "d"),
+    Style("#254a1c", "H"),
 )
 
 

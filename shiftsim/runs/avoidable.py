@@ -10,6 +10,7 @@ import numpy as np
 from shiftsim.edits.sampling import GRADES, HARDEST
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.metrics.collision import classify, first_contacts, flat_ego, flat_tracks
+from shiftsim.metrics.result import Collision
 from shiftsim.planners.pdm.planner import PdmClosed
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import Rollout
@@ -17,7 +18,7 @@ from shiftsim.sim.planner import Observation, Planner, SceneInfo
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import NUM_STATE, PACIFICA, AgentKind, Trajectory, speeds
 
-_REACTION_US = 500_000  # before the ego brakes
+REACTION_US = 500_000  # before the ego brakes
 _LOOKS = 10  # iterations between looks for contacts
 _MOVES = 0.1  # m/s, from which a pedestrian has set off
 _BEYOND = 200.0  # m, how far the path goes on straight behind the recording
@@ -56,17 +57,17 @@ def hits(scenario: Scenario, planner: Planner) -> set[str]:
     while not rollout.done and not found:
         rollout.advance(planner.plan(rollout.observe()))
         if rollout.iteration % _LOOKS == 0 or rollout.done:
-            found = _at_fault(rollout.log(), rollout.iteration)
+            found = {hit.token for hit in at_fault(rollout.log(), rollout.iteration)}
     return found
 
 
-def _at_fault(log: SimulationLog, count: int) -> set[str]:
-    """Tokens of the tracks that are touched at fault in the first samples."""
+def at_fault(log: SimulationLog, count: int) -> list[Collision]:
+    """First contacts at fault with each track in the first samples, as `hits` counts them."""
     ego, tracks = log.ego[:count], log.tracks.rows(slice(0, count))
     contacts = first_contacts(flat_ego(ego, PACIFICA), flat_tracks(tracks))
     never_common = np.zeros(count, np.bool_)
     hits = classify(contacts, log.time_us[:count], tracks, never_common)
-    return {hit.token for hit in hits if hit.at_fault}
+    return [hit for hit in hits if hit.at_fault]
 
 
 class Braking:
@@ -77,14 +78,23 @@ class Braking:
 
     name = "braking"
 
-    def __init__(self, scenario: Scenario, deceleration: float) -> None:
-        """For one scenario; a deceleration of 0 [m/s^2] does not react."""
+    def __init__(
+        self,
+        scenario: Scenario,
+        deceleration: float,
+        *,
+        driven: tuple[IntArray, FloatArray] | None = None,
+    ) -> None:
+        """For one scenario; a deceleration of 0 [m/s^2] does not react.
+
+        `driven` are times (K,) [us] and states (K, 11) to drive in place of the recorded ones.
+        """
         rows = slice(int(scenario.iteration_rows[0]), None)
-        states = scenario.ego[rows]
-        distinct = np.flatnonzero(np.diff(scenario.time_us[rows], prepend=-1) > 0)
+        time_us, states = driven or (scenario.time_us[rows], scenario.ego[rows])
+        distinct = np.flatnonzero(np.diff(time_us, prepend=-1) > 0)
         end, heading = states[distinct[-1], :2], states[distinct[-1], 2]
         beyond = end + _BEYOND * np.array([np.cos(heading), np.sin(heading)])
-        self._time_us = scenario.time_us[rows][distinct]
+        self._time_us = time_us[distinct]
         self._xy = np.concatenate([states[distinct, :2], beyond[None]])
         headings = np.unwrap(states[distinct, 2])
         self._heading = np.append(headings, headings[-1])
@@ -105,7 +115,7 @@ class Braking:
         """The coming 2 s."""
         now = observation.time_us
         if self._brakes_us is None and self._deceleration > 0.0 and self._notices(observation):
-            self._brakes_us = now + _REACTION_US
+            self._brakes_us = now + REACTION_US
         brakes = self._brakes_us is not None and now >= self._brakes_us
         arc = self._braked(now + _AHEAD) if brakes else self._recorded(now + _AHEAD)
         states = np.zeros((len(_AHEAD), NUM_STATE))

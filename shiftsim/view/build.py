@@ -3,7 +3,8 @@
 import html
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -162,14 +163,21 @@ class Gallery:
             )
         return found[part]
 
-    def shown(self, token: str, scenario: Any, part: int = 0) -> list[ShownRollout]:
-        """The rollouts of a page with what is known of them."""
+    def shown(
+        self, token: str, scenario: Any, part: int = 0, *, fork: bool = False
+    ) -> list[ShownRollout]:
+        """The rollouts of a page with what is known of them, with `fork` also their forks."""
         out = []
         for task in self.tasks(token, part):
             one = self._rollouts[task]
             log = one.run.rollout(one.key, scenario)
             cls = one.score.get("cls")
-            out.append(ShownRollout(task.planner, task.noise, task.seed, log, cls, one.metrics))
+            item = ShownRollout(task.planner, task.noise, task.seed, log, cls, one.metrics)
+            if fork:
+                from shiftsim.view.fork import find_fork  # it drives, which other pages need not
+
+                item = replace(item, fork=find_fork(scenario, item, one.run.manifest))
+            out.append(item)
         return out
 
     def settings_words(self, token: str, part: int = 0) -> str:
@@ -182,14 +190,17 @@ class Gallery:
         )
         return "; ".join(dict.fromkeys(words))
 
-    def pages(self, token: str, *, back: str = "") -> dict[str, Page]:
+    def pages(self, token: str, *, back: str = "", fork: bool = False) -> dict[str, Page]:
         """The replays of one scenario as HTML by file name, all rollouts that can be drawn.
 
         Raises:
-            ConfigError: There are none.
+            ConfigError: There are none, or their forks cannot be driven.
         """
         self.tasks(token)
         scenario, links, first = self.store.read(token), [], 1
+        parts = range(len(self.parts(token)))
+        shown = [self.shown(token, scenario, part, fork=fork) for part in parts]
+        seeds = list(chain(*shown))
         for part, tasks in enumerate(self.parts(token)):
             links.append((f"{first}–{first + len(tasks) - 1}", page_name(token, part)))
             first += len(tasks)
@@ -200,17 +211,15 @@ class Gallery:
                 "shown": self.shown_words(token, part),
                 "settings": self.settings_words(token, part),
             }
-            out[name] = replay_page(
-                scenario, self.shown(token, scenario, part), back=back, more=more
-            )
+            out[name] = replay_page(scenario, shown[part], seeds=seeds, back=back, more=more)
         return out
 
     def page(self, token: str) -> Page:
         """The first replay of one scenario as HTML, alone."""
-        scenario = self.store.read(token)
-        shown = self.shown(token, scenario)
+        scenario, parts = self.store.read(token), range(len(self.parts(token)))
+        shown = [self.shown(token, scenario, part) for part in parts or [0]]
         more = {"shown": self.shown_words(token), "settings": self.settings_words(token)}
-        return replay_page(scenario, shown, more=more)
+        return replay_page(scenario, shown[0], seeds=list(chain(*shown)), more=more)
 
     def rows(self, token: str, *, with_pages: bool = True) -> list[dict[str, Any]]:
         """Rows of the scenario list: labels, scores and violated metrics of every rollout."""

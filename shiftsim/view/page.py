@@ -19,7 +19,7 @@ _HERE = Path(__file__).parent
 _FILES = {  # style and script of each page; its body is the file of its name
     "list": (["list.css"], ["list.js"]),
     "live": (["list.css", "live.css"], ["live.js"]),
-    "replay": (["replay.css"], ["codec.js", "world.js", "strips.js", "replay.js"]),
+    "replay": (["replay.css"], ["codec.js", "world.js", "strips.js", "waterfall.js", "replay.js"]),
     "review": (["replay.css", "review.css"], ["codec.js", "world.js", "review.js"]),
 }
 # of pages that are files; those of a server come with a header
@@ -78,13 +78,15 @@ def replay_page(
     scenario: Scenario,
     shown: Sequence[ShownRollout],
     *,
+    seeds: Sequence[ShownRollout] = (),
     back: str = "",
     more: Mapping[str, Any] | None = None,
 ) -> Page:
     """One self-contained HTML page of rollouts, the first six; `back` is the address of the list.
 
-    `more` are `shown`, what is shown of how much, and `parts`, words and names of all pages of the
-    scenario, of which `part` is this one.
+    `seeds` are all rollouts of the scenario, where other pages show more of them; `more` are
+    `shown`, what is shown of how much, and `parts`, words and names of all pages of the scenario,
+    of which `part` is this one.
 
     Raises:
         ValueError: There are no rollouts.
@@ -93,7 +95,7 @@ def replay_page(
         raise ValueError("a replay shows at least one rollout")
     drawn = shown[:MAX_ROLLOUTS]
     words = f"{len(drawn)} of {len(shown)} rollouts shown" if len(drawn) < len(shown) else ""
-    replay = Replay(scenario, drawn)
+    replay = Replay(scenario, drawn, seeds)
     data = {
         "meta": describe_scene(replay) | {"back": back, "shown": words} | dict(more or {}),
         "scene": pack(scene_fields(replay)),

@@ -4,11 +4,15 @@
 const MAX_SCALE = 60; // pixels per metre
 const MIN_SCALE = 0.5;
 const SMALL = 680; // pixels of window height below which only the speed is drawn as a curve
+const NOISES = [["acceleration", "m/s²", 0.5, 2], ["steering rate", "rad/s", 0.05, 3]];
+const SPREADS = ["across", "along"];
+const LOW = 44; // height of lesser curves
 const CLEAN = [];
 const NOISY = [7, 5];
-const EXPERT = "#1f1f1f";
 const CLOSE = 14; // pixels per metre at least where a violation is looked at
 const AROUND = 15; // m around the path that the page opens with
+const NEAR = 6; // m around what is driven from a fork on
+const AHEAD = 0.2; // of the height of a view whose ego drives up: how far below its middle
 const LENGTH_CLEAR = 4.2; // m that no ego reaches from its rear axle
 const TOLD = 2; // s that the words of a violation stay
 const FADE = 500; // ms in which whole plans appear once a moment is chosen
@@ -26,16 +30,21 @@ const state = {
   side: false,
   expert: true,
   plans: true,
+  up: false, // whether the ego's forward is up
+  fork: false, // whether what could have been driven in place of a collision is drawn
+  tube: false, // whether the seeds of a planner are drawn together
   scale: 6,
   centre: null,
   told: [], // the words of violations on the canvas
   pins: [], // [x, y, words] of every violation there
+  dots: [], // and of those on a tube
 };
 let chosen = null; // the violation that was jumped to
 let zoomed = false; // whether the link said how near
 let planned = 0; // how much of the plans beyond their first second is seen, 0 to 1
 const rollouts = meta.rollouts.map(() => null); // fields, once decoded
-let scene, map, times, strips, panels, highlighted = -1;
+let scene, map, times, strips, waterfall, panels, highlighted = -1;
+let tubes = []; // the seeds of each planner together: {planner, noise, colour, dots, area, across, along}
 
 const canvas = byId("scene");
 const context = canvas.getContext("2d", { alpha: false });
@@ -174,6 +183,9 @@ function setFocus(index) {
   if (!state.shown[index]) show(index, true);
   highlighted = -1;
   changed();
+  const card = byId("rollouts").children[index];
+  const aside = card.closest("aside");
+  if (aside.scrollHeight > aside.clientHeight) card.scrollIntoView({ block: "nearest" });
 }
 
 function changed() {
@@ -191,6 +203,17 @@ function visible() {
   return rollouts.map((fields, index) => index).filter((i) => state.shown[i] && rollouts[i]);
 }
 
+// the tubes of some rollouts' planners
+function tubesOf(members) {
+  const planners = new Set(members.map((index) => meta.rollouts[index].planner));
+  return state.tube ? tubes.filter((tube) => planners.has(tube.planner)) : [];
+}
+
+function readTube(tube, number) {
+  const [across, along] = ["across", "along"].map((name) => scene.get(`tube${number}.${name}`).data);
+  return { ...tube, across, along, area: layerPath(scene, `tube${number}`, true) };
+}
+
 // ---- drawing ----
 
 function layOut() {
@@ -199,8 +222,7 @@ function layOut() {
   canvas.width = Math.round(width * ratio);
   canvas.height = Math.round(height * ratio);
   const groups = state.side ? visible().map((i) => [i]) : [visible()];
-  const columns = Math.ceil(Math.sqrt((groups.length * width) / Math.max(height, 1) / 1.4)) || 1;
-  const across = Math.min(columns, groups.length);
+  const across = panelsAcross(groups.length, width > height);
   const down = Math.ceil(groups.length / across);
   panels = groups.map((members, i) => {
     const panel = (panels && panels[i] && panels[i].panel) || new Panel(map);
@@ -212,6 +234,12 @@ function layOut() {
   draw();
 }
 
+// 2 x 2 of four, 3 x 2 of six; two or three stand in one row, or below one another
+function panelsAcross(count, isWide) {
+  if (count === 4) return 2;
+  return isWide ? Math.min(count, 3) : Math.ceil(count / 3);
+}
+
 function egoPose(index, at) {
   return poseAt(rollouts[index], "ego", 1, 0, at);
 }
@@ -219,16 +247,18 @@ function egoPose(index, at) {
 function draw() {
   if (!panels) return;
   const at = sampleAt(state.t);
-  [state.told, state.pins] = [[], []];
+  [state.told, state.pins, state.dots] = [[], [], []];
   const ratio = window.devicePixelRatio || 1;
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
-  context.fillStyle = "#ffffff";
+  context.imageSmoothingEnabled = !(state.playing && state.up); // a turned map is drawn in time
+  context.fillStyle = COLOURS.paper;
   context.fillRect(0, 0, canvas.clientWidth, canvas.clientHeight);
   for (const { panel, members } of panels) {
     const leading = members.includes(state.focus) ? state.focus : members[0];
     const pose = egoPose(leading, at);
     panel.scale = state.scale;
-    panel.centre = state.follow || !state.centre ? pose.slice(0, 2) : state.centre;
+    panel.turn = state.up ? Math.PI / 2 - pose[2] : 0;
+    panel.centre = state.follow || !state.centre ? followed(panel, pose) : state.centre;
     context.save();
     context.beginPath();
     context.rect(panel.left, panel.top, panel.width, panel.height);
@@ -237,8 +267,15 @@ function draw() {
     context.restore();
   }
   strips.draw(state.t);
+  waterfall.point(strips.x(state.t));
   byId("clock").textContent = `${state.t.toFixed(2)} s of ${duration().toFixed(1)} s`;
   showScale();
+}
+
+// the middle of a view that goes with the ego: itself, or ahead of it where forward is up
+function followed(panel, [x, y, heading]) {
+  const ahead = state.up ? (AHEAD * panel.height) / panel.scale : 0;
+  return [x + ahead * Math.cos(heading), y + ahead * Math.sin(heading)];
 }
 
 function drawPanel(panel, members, leading, at) {
@@ -248,36 +285,102 @@ function drawPanel(panel, members, leading, at) {
   const edited = new Set(meta.edited.map((name) => names.indexOf(name)));
   drawAgents(context, fields, panel, at, highlighted, edited);
   if (state.expert) {
-    drawPath(context, scene.get("expert.xy").data, at, panel, EXPERT, [2, 3], 1.5);
-    drawEgo(context, poseAt(scene, "expert", 1, 0, at), meta.vehicle, panel, EXPERT, false);
+    drawPath(context, scene.get("expert.xy").data, at, panel, COLOURS.recorded, [2, 3], 1.5);
+    drawEgo(context, poseAt(scene, "expert", 1, 0, at), meta.vehicle, panel, COLOURS.recorded, false);
   }
-  const order = members.filter((i) => i !== leading).concat(leading);
+  const fork = state.fork && meta.rollouts[leading].fork;
+  const order = fork ? [leading] : members.filter((i) => i !== leading).concat(leading);
+  const drawn = tubesOf(members);
+  const isHeld = (index) => drawn.some((tube) => holds(tube, meta.rollouts[index]));
+  const inTube = new Set(order.filter((index) => index !== leading && isHeld(index)));
+  for (const tube of drawn) drawTube(context, tube, panel, tube.colour);
   for (const index of order) {
     const rollout = meta.rollouts[index];
     const xy = rollouts[index].get("ego.xy").data;
-    drawPath(context, xy, at, panel, rollout.colour, dashOf(rollout), index === leading ? 2.6 : 1.8);
+    const width = index === leading ? 2.6 : inTube.has(index) ? 1 : 1.8;
+    drawPath(context, xy, at, panel, rollout.colour, dashOf(rollout), width);
   }
+  for (const tube of drawn) drawDots(panel, tube);
   for (const index of order) {
     const rollout = meta.rollouts[index];
-    if (state.plans) drawPlan(context, rollouts[index], panel, at, rollout.colour, planned);
     const pose = egoPose(index, at);
-    drawEgo(context, pose, meta.vehicle, panel, rollout.colour, index === leading, isNoisy(rollout) ? [4, 3] : []);
     const reach = meta.vehicle[2];
     const where = [pose[0] + reach * Math.cos(pose[2]), pose[1] + reach * Math.sin(pose[2])];
     const place = panel.toScreen(...where);
+    if (inTube.has(index)) {
+      drawMarker(context, rollout.marker, ...place, 4, rollout.colour, true);
+      continue;
+    }
+    if (state.plans && !fork) drawPlan(context, rollouts[index], panel, at, rollout.colour, planned);
+    const dash = isNoisy(rollout) ? [4, 3] : [];
+    drawEgo(context, pose, meta.vehicle, panel, rollout.colour, index === leading, dash);
     drawDisc(context, ...place, 7.5); // so that the marker looks as in the list
     drawMarker(context, rollout.marker, ...place, 5, rollout.colour, isNoisy(rollout));
   }
+  const labels = fork ? drawFork(panel, leading, fork, at) : [];
   const violated = order.reverse().flatMap((index) => violatedNow(panel, index));
   // what words may not cover: [left, top, right, bottom]
-  const taken = violated.map(({ x, y }) => [x - 10, y - 10, x + 10, y + 10]);
+  const taken = [...labels, ...violated.map(({ x, y }) => [x - 10, y - 10, x + 10, y + 10])];
   const told = toldOf(violated.filter(({ index }) => index === leading));
   for (const one of violated.filter((item) => item !== told)) {
-    drawMarker(context, "burst", one.x, one.y, 6, ALARM);
+    drawMarker(context, "burst", one.x, one.y, 6, COLOURS.alarm);
   }
   if (told) tellViolation(panel, told, taken);
   state.pins.push(...violated.map(({ item, index, x, y }) => [x, y, `${labelOf(meta.rollouts[index])}: ${item.words}`]));
   if (state.side) captionPanel(panel, meta.rollouts[leading], rollouts[leading], at);
+}
+
+// what is driven from a fork on, up to a collision; returns the boxes of the words at the ends
+function drawFork(panel, index, { t, row, branches }, at) {
+  const fields = rollouts[index];
+  const boxes = [];
+  branches.forEach(({ name, colour, marker, hit }, number) => {
+    const xy = fields.get(`branch${number}.xy`).data;
+    const ink = colour || COLOURS.ink;
+    const last = xy.length / 2 - 1;
+    context.lineWidth = 3;
+    strokeLine(context, xy, 0, last + 1, panel, ink);
+    const rowNow = Math.min(Math.max(at.row - row, 0), last);
+    const now = { row: rowNow, next: Math.min(rowNow + 1, last), share: state.t > t ? at.share : 0 };
+    drawEgo(context, poseAt(fields, `branch${number}`, 1, 0, now), meta.vehicle, panel, ink, false);
+    const [x, y] = panel.toScreen(xy[2 * last], xy[2 * last + 1]);
+    if (hit === null) drawMarker(context, marker || "s", x, y, 5, ink);
+    else drawMarker(context, "burst", x, y, 7, COLOURS.alarm);
+    boxes.push(nameBranch(panel, hit === null ? `${name}: clear` : `${name}: hits`, x, y, ink, boxes));
+  });
+  const xy = fields.get("branch0.xy").data;
+  if (branches.length) drawMarker(context, "o", ...panel.toScreen(xy[0], xy[1]), 6, COLOURS.ink, true);
+  return boxes;
+}
+
+// the name of a branch beside its end, below those that are there
+function nameBranch(panel, words, x, y, colour, taken) {
+  context.font = "600 12px system-ui, sans-serif";
+  const width = context.measureText(words).width + 10;
+  const right = x + 12 + width < panel.left + panel.width;
+  const left = right ? x + 12 : x - 12 - width;
+  const boxAt = (k) => [left, y - 9 + 20 * k, left + width, y + 9 + 20 * k];
+  const meets = (a, b) => a[0] < b[2] && b[0] < a[2] && a[1] < b[3] && b[1] < a[3];
+  const box = [0, -1, 1, -2, 2, -3, 3].map(boxAt).find((one) => !taken.some((other) => meets(one, other)));
+  const [, top] = box || boxAt(4);
+  context.fillStyle = COLOURS.glass;
+  context.fillRect(left, top, width, 18);
+  context.fillStyle = colour;
+  context.fillRect(right ? left : left + width - 3, top, 3, 18);
+  context.fillStyle = COLOURS.ink;
+  context.fillText(words, left + 6, top + 13);
+  return [left, top, left + width, top + 18];
+}
+
+const holds = (tube, { planner, noise }) => tube.planner === planner && tube.noise === noise;
+
+// what the seeds of a tube ever violate
+function drawDots(panel, tube) {
+  for (const [x, y, words] of tube.dots) {
+    const place = panel.toScreen(x, y);
+    drawMarker(context, "o", ...place, 4.5, COLOURS.alarm);
+    state.dots.push([...place, words]);
+  }
 }
 
 // what a rollout has just violated, and where on the screen
@@ -309,12 +412,12 @@ function tellViolation(panel, { item, index, x, y }, taken) {
   context.moveTo(left > x ? left : left + width, top + 10);
   context.lineTo(x, y);
   context.stroke();
-  drawMarker(context, "burst", x, y, 9, ALARM);
+  drawMarker(context, "burst", x, y, 9, COLOURS.alarm);
   context.strokeStyle = meta.rollouts[index].colour;
-  context.fillStyle = "rgba(255, 255, 255, 0.92)";
+  context.fillStyle = COLOURS.glass;
   context.fillRect(left, top, width, 20);
   context.strokeRect(left, top, width, 20);
-  context.fillStyle = "#8c0018";
+  context.fillStyle = COLOURS["alarm-ink"];
   context.fillText(item.words, left + 8, top + 15);
   state.told.push(item.words);
 }
@@ -346,15 +449,15 @@ function placeWords(panel, x, y, width, side, taken) {
 
 function captionPanel(panel, rollout, fields, at) {
   const text = `${labelOf(rollout)}  ${fields.get("speed").data[at.row].toFixed(1)} m/s`;
-  context.strokeStyle = "#ffffff";
-  context.lineWidth = 2;
+  context.strokeStyle = COLOURS.edged;
+  context.lineWidth = 1;
   context.strokeRect(panel.left, panel.top, panel.width, panel.height);
   context.font = "600 12px system-ui, sans-serif";
   const width = context.measureText(text).width;
-  context.fillStyle = "rgba(255, 255, 255, 0.85)";
+  context.fillStyle = COLOURS.glass;
   context.fillRect(panel.left + 6, panel.top + 6, width + 26, 20);
   drawMarker(context, rollout.marker, panel.left + 16, panel.top + 16, 5, rollout.colour, isNoisy(rollout));
-  context.fillStyle = "#222222";
+  context.fillStyle = COLOURS.ink;
   context.fillText(text, panel.left + 26, panel.top + 20);
 }
 
@@ -365,31 +468,61 @@ function showScale() {
 }
 
 function showCurves() {
-  const lineOf = (index, name, column = 0, width = 1) => ({
-    times,
-    values: Array.from(rollouts[index].get(name).data).filter((_, i) => i % width === column),
-    colour: meta.rollouts[index].colour,
-    dash: dashOf(meta.rollouts[index]).length ? [5, 3] : [],
-  });
   const members = visible();
-  const expert = { times, values: [...scene.get("expert.speed").data.slice(0, times.length)] };
-  const curves = [
-    {
-      label: "speed",
-      unit: "m/s",
-      least: 2,
-      lines: [{ ...expert, colour: EXPERT, dash: [2, 2] }, ...members.map((i) => lineOf(i, "speed"))],
-    },
-    { label: "acceleration", unit: "m/s²", least: 1, lines: members.map((i) => lineOf(i, "accel")) },
-  ];
-  const noisy = members.filter((i) => meta.rollouts[i].noise !== "none");
-  if (window.innerHeight < SMALL) curves.pop();
-  else if (noisy.length) {
-    const lines = noisy.map((i) => lineOf(i, "noise", 0, 2));
-    curves.push({ label: "noise on acceleration", unit: "m/s²", least: 0.5, lines });
+  const order = [...members].sort((a, b) => (b === state.focus) - (a === state.focus));
+  const lines = (name) => order.map((index) => lineOf(index, rollouts[index].get(name).data));
+  const values = scene.get("expert.speed").data.slice(0, times.length);
+  const expert = { values, colour: COLOURS.recorded, dash: [2, 2] };
+  const curves = [{ label: "speed", unit: "m/s", least: 2, lines: [...lines("speed"), expert] }];
+  if (window.innerHeight >= SMALL) {
+    curves.push({ label: "acceleration", unit: "m/s²", least: 1, lines: lines("accel") });
+    curves.push(...noiseCurves(order));
+  }
+  for (const name of SPREADS.slice(0, window.innerHeight < SMALL ? 1 : 2)) {
+    const noisy = { hollow: true, dash: [5, 3] };
+    const lines = tubesOf(members).map((tube) => ({ ...tube, ...noisy, values: tube[name] }));
+    const about = { label: `seeds apart, ${name}`, unit: "m", least: 1, height: LOW };
+    if (lines.length) curves.push({ ...about, lines });
   }
   const rows = members.filter((i) => meta.rollouts[i].violations.length);
-  strips.show(curves, rows.flatMap(marksOf));
+  strips.show(curves, rows.flatMap(marksOf), times);
+  const rollout = meta.rollouts[state.focus];
+  const x = strips.x.bind(strips);
+  waterfall.show({ ...rollout, name: labelOf(rollout), duration: duration(), x });
+}
+
+function lineOf(index, values) {
+  const { colour, marker } = meta.rollouts[index];
+  const hollow = isNoisy(meta.rollouts[index]);
+  return { values, colour, marker, hollow, dash: hollow ? [5, 3] : [] };
+}
+
+// each noise once: with the same seed all planners have the same
+function noiseCurves(members) {
+  const found = []; // {data, of: rollouts}
+  for (const index of members.filter((i) => isNoisy(meta.rollouts[i]))) {
+    const { data } = rollouts[index].get("noise");
+    const same = found.find((one) => one.data.every((value, i) => value === data[i]));
+    if (same) same.of.push(index);
+    else found.push({ data, of: [index] });
+  }
+  const inFocus = (one) => one.of.includes(state.focus);
+  const { noise, seed } = meta.rollouts[state.focus];
+  const which = found.some(inFocus) ? `${noise} #${seed}` : `${found.length} realisations`;
+  const curveOf = ([name, unit, least, digits], column) => ({
+    label: `noise on ${name} (${which})`,
+    unit,
+    least,
+    digits,
+    height: LOW,
+    lines: found.sort((a, b) => inFocus(a) - inFocus(b)).map((one) => ({
+      values: one.data.filter((_, i) => i % 2 === column),
+      colour: inFocus(one) ? COLOURS.ink : COLOURS.edged,
+      dash: [],
+      marker: inFocus(one) ? "o" : "",
+    })),
+  });
+  return found.length ? NOISES.map(curveOf) : [];
 }
 
 // one mark per moment: what is first violated at the same time shares it
@@ -397,16 +530,46 @@ function marksOf(index, row) {
   const { colour, marker, violations: all } = meta.rollouts[index];
   const hollow = isNoisy(meta.rollouts[index]);
   const moments = [...new Set(all.map((item) => item.t))];
-  return moments.map((t) => {
+  const { fork } = meta.rollouts[index];
+  const marks = moments.map((t) => {
     const here = all.filter((item) => item.t === t);
     const [text, words] = [here.map((item) => item.short).join(" "), here.map((item) => item.words).join("; ")];
     return { t, row, text, words, colour, marker, hollow };
   });
+  if (!fork?.branches.length) return marks;
+  const style = { colour: COLOURS.ink, marker: "o", hollow: true };
+  marks.push({ t: fork.t, row, text: "last chance", words: forkWords(fork), ...style });
+  return marks.sort((a, b) => a.t - b.t);
+}
+
+function forkWords({ t, branches }) {
+  if (!branches.length) return `no braking and no PDM-Closed avoids the collision, from ${t.toFixed(1)} s on`;
+  const told = branches.map(({ name, words }) => `${name} ${words}`);
+  return `last chance to avoid the collision at ${t.toFixed(1)} s: ${told.join("; ")}`;
+}
+
+// the moment at which the rollout in focus forks, else the first that does
+async function showFork() {
+  const forks = (index) => meta.rollouts[index].fork?.branches.length;
+  const index = [state.focus, ...rollouts.keys()].find(forks);
+  if (index === undefined) return;
+  if (index === state.focus && state.fork) return setOption("fork", false);
+  const { fork } = meta.rollouts[index];
+  pause();
+  if (!state.shown[index]) await show(index, true);
+  setFocus(index);
+  state.fork = true;
+  say(forkWords(fork));
+  const paths = fork.branches.map((_, number) => rollouts[index].get(`branch${number}.xy`).data);
+  showAround(paths.flatMap((xy) => [...xy]), NEAR);
+  seek(fork.t);
 }
 
 // ---- controls ----
 
 function listRollouts() {
+  for (const { losses } of meta.rollouts) tellLosses(losses);
+  byId("rollouts").replaceChildren();
   for (const [index, rollout] of meta.rollouts.entries()) {
     const box = document.createElement("div");
     box.className = "rollout";
@@ -426,9 +589,42 @@ function listRollouts() {
     cls.className = "cls";
     cls.textContent = rollout.cls === null ? "–" : (100 * rollout.cls).toFixed(1);
     name.append(check, swatch(rollout), label, cls);
-    box.append(name, noiseOf(rollout), scoresOf(rollout), ...rollout.violations.map((v) => violationButton(v, index)));
+    const buttons = rollout.violations.map((item) => violationButton(item, index));
+    const undated = rollout.losses.filter((loss) => loss.t === null);
+    const lines = undated.map((loss) => smallLine(`${loss.words} ${loss.told}`));
+    const lists = [...buttons, ...lines, ...forkLines(rollout, index)];
+    box.append(name, noiseOf(rollout), scoresOf(rollout), ...lists);
     byId("rollouts").append(box);
   }
+}
+
+function smallLine(words) {
+  const line = document.createElement("div");
+  return Object.assign(line, { className: "scores", textContent: words });
+}
+
+// from where on a collision could not be avoided, and what is driven from there
+function forkLines({ fork }, index) {
+  if (!fork) return [];
+  if (!fork.branches.length) return [smallLine(forkWords(fork))];
+  const button = document.createElement("button");
+  button.textContent = `${fork.t.toFixed(1)}\u00a0s  last chance to avoid the collision`;
+  button.addEventListener("click", (event) => {
+    event.stopPropagation();
+    [state.focus, state.fork] = [index, false];
+    showFork();
+  });
+  return [button, ...fork.branches.map(({ name, words }) => smallLine(`${name}: ${words}`))];
+}
+
+// a loss leads to its violation; one without a moment to the end
+function showLoss(loss) {
+  const { violations: all } = meta.rollouts[state.focus];
+  const found = all.find((item) => item.metric === loss.metric);
+  if (found) return jumpTo({ ...found, index: state.focus });
+  pause();
+  say(loss.words);
+  seek(loss.t ?? duration());
 }
 
 function swatch(rollout) {
@@ -476,6 +672,8 @@ function violationButton(violation, index) {
   const button = document.createElement("button");
   const words = violation.words.replace(/(\d) (?=m|s|rad)/g, "$1\u00a0"); // a number keeps its unit
   button.textContent = `${violation.t.toFixed(1)}\u00a0s  ${words}`;
+  const loss = meta.rollouts[index].losses.find((one) => one.metric === violation.metric);
+  if (loss) button.append(" ", Object.assign(document.createElement("b"), { textContent: loss.told }));
   const limit = violation.threshold === null ? "" : `, bound ${violation.threshold}`;
   button.title = `${violation.metric} (${violation.short})${limit}`;
   button.addEventListener("click", (event) => {
@@ -486,12 +684,13 @@ function violationButton(violation, index) {
 }
 
 function listLegend() {
+  byId("legend").replaceChildren();
   const used = new Set();
   const fields = meta.ownTracks ? rollouts[state.focus] : scene;
   for (const kind of fields.get("tracks.kind").data) used.add(kind);
-  const entries = [...used].sort().map((kind) => [AGENT_COLOURS[kind], KIND_NAMES[kind]]);
-  if (meta.edited.length) entries.push([EDITED, "edited"]);
-  entries.push(["#98b8a2", "route"], [MAP_COLOURS.crosswalk, "crosswalk"]);
+  const entries = [...used].sort().map((kind) => [agentColour(kind), KIND_NAMES[kind]]);
+  if (meta.edited.length) entries.push([COLOURS.edited, "edited"]);
+  entries.push([COLOURS.route, "route"], [COLOURS.crosswalk, "crosswalk"]);
   for (const [colour, text] of entries) {
     const item = document.createElement("span");
     const sample = document.createElement("i");
@@ -501,7 +700,8 @@ function listLegend() {
   }
 }
 
-const OPTIONS = ["follow", "side", "expert", "plans"];
+const LINKED = ["side", "up", "tube", "fork"]; // of them, what the link says
+const OPTIONS = ["follow", "side", "expert", "plans", "up", "tube", "fork"];
 function syncOptions() {
   for (const name of OPTIONS) byId(name).checked = state[name];
   byId("route").checked = map.layers.route;
@@ -510,14 +710,57 @@ function syncOptions() {
 
 function setOption(name, on) {
   if (name === "follow") state.centre = on ? null : [...panels[0].panel.centre];
+  if (name === "up" && on) state.follow = true;
+  if (name === "follow" && !on) state.up = false;
   if (OPTIONS.includes(name)) state[name] = on;
   else {
     map.layers[name] = on;
     map.version++;
   }
   syncOptions();
+  if (name === "tube") showCurves();
   layOut();
   saveState();
+}
+
+// ---- light and dark ----
+
+const prefersDark = window.matchMedia("(prefers-color-scheme: dark)");
+const isDark = () => document.documentElement.dataset.theme === "dark";
+
+function setTheme(dark) {
+  document.documentElement.dataset.theme = dark ? "dark" : "light";
+  readColours();
+  const branches = meta.rollouts.flatMap(({ fork }) => fork?.branches || []);
+  for (const item of [...meta.rollouts, ...tubes, ...branches].filter(({ colour }) => colour)) {
+    item.given ??= item.colour;
+    item.colour = dark ? lightened(item.given) : item.given;
+  }
+  if (!map) return;
+  map.version++;
+  listRollouts();
+  listLegend();
+  changed();
+}
+
+function toggleTheme() {
+  setTheme(!isDark());
+  try {
+    localStorage.setItem("shiftsim-theme", isDark() ? "dark" : "light");
+  } catch {
+    // a page inside a notebook keeps nothing
+  }
+}
+
+function startTheme() {
+  let wanted = null;
+  try {
+    wanted = localStorage.getItem("shiftsim-theme");
+  } catch {
+    // nothing is kept here
+  }
+  setTheme(wanted ? wanted === "dark" : prefersDark.matches);
+  prefersDark.addEventListener("change", () => setTheme(prefersDark.matches));
 }
 
 // a scale within its bounds, as the link has it
@@ -525,18 +768,19 @@ function rounded(scale) {
   return Number(Math.min(Math.max(scale, MIN_SCALE), MAX_SCALE).toFixed(2));
 }
 
-// the view of the whole path in focus, and 15 m around it
-function fit() {
-  const xy = [...rollouts[state.focus].get("ego.xy").data];
+const fit = () => showAround([...rollouts[state.focus].get("ego.xy").data], AROUND);
+
+// the view of places x, y, x, y, … and some metres around them
+function showAround(xy, around) {
   const ends = [0, 1].map((axis) => {
     const values = xy.filter((value, i) => i % 2 === axis && Number.isFinite(value));
-    return [Math.min(...values) - AROUND, Math.max(...values) + AROUND];
+    return [Math.min(...values) - around, Math.max(...values) + around];
   });
   const { width, height } = panels[0].panel;
   const scale = Math.min(width / (ends[0][1] - ends[0][0]), height / (ends[1][1] - ends[1][0]));
   state.scale = rounded(scale);
   state.centre = ends.map(([low, high]) => Number(((low + high) / 2).toFixed(1)));
-  state.follow = false;
+  [state.follow, state.up] = [false, false];
   syncOptions();
   draw();
 }
@@ -593,7 +837,7 @@ function hover(event) {
 }
 
 function describeAt({ panel, members }, px, py) {
-  const pins = state.pins.filter(([x, y]) => Math.hypot(x - px, y - py) < 10);
+  const pins = [...state.pins, ...state.dots].filter(([x, y]) => Math.hypot(x - px, y - py) < 10);
   if (pins.length) return pins.map((pin) => pin[2]).join("; ");
   const leading = members.includes(state.focus) ? state.focus : members[0];
   const { fields, names } = tracksOf(leading);
@@ -633,6 +877,10 @@ const KEYS = {
   b: () => setOption("side", !state.side),
   e: () => setOption("expert", !state.expert),
   p: () => setOption("plans", !state.plans),
+  u: () => setOption("up", !state.up),
+  n: () => tubes.length && setOption("tube", !state.tube),
+  k: showFork,
+  d: toggleTheme,
   r: () => setOption("route", !map.layers.route),
   l: () => setOption("lanes", !map.layers.lanes),
   "?": () => (byId("keys").open ? byId("keys").close() : byId("keys").showModal()),
@@ -647,6 +895,7 @@ const KEYS = {
 
 function onKey(event) {
   if (event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;
+  if (event.key === " " && event.target.matches("button, input[type=checkbox]")) return;
   const digit = "123456".indexOf(event.key);
   const action = KEYS[event.key];
   if (action) action(event);
@@ -664,12 +913,20 @@ function connect() {
   byId("help").addEventListener("click", KEYS["?"]);
   byId("copy").addEventListener("click", copyLink);
   byId("save").addEventListener("click", savePicture);
+  byId("theme").addEventListener("click", toggleTheme);
+  document.addEventListener("click", (e) => {
+    const pressed = e.detail && e.target.closest("button, input[type=checkbox]");
+    if (pressed) pressed.blur(); // who uses the mouse plays with the space key
+  });
   byId("time").max = duration();
   byId("time").addEventListener("input", (e) => seek(Number(e.target.value)));
   byId("time").addEventListener("pointerdown", pause);
   byId("rate").addEventListener("change", (e) => (state.rate = Number(e.target.value)));
   for (const name of [...OPTIONS, "route", "lanes"]) {
-    byId(name).addEventListener("change", (e) => setOption(name, e.target.checked));
+    byId(name).addEventListener("change", (e) => {
+      if (name === "fork") showFork();
+      else setOption(name, e.target.checked);
+    });
   }
   canvas.addEventListener("pointerdown", drag);
   canvas.addEventListener("pointermove", hover);
@@ -739,7 +996,7 @@ function saveState() {
   const shown = state.shown.map((on, i) => (on ? i + 1 : 0)).filter(Boolean);
   const parts = [`t=${state.t.toFixed(2)}`, `on=${shown}`, `focus=${state.focus + 1}`];
   parts.push(`zoom=${state.scale.toFixed(2)}`);
-  if (state.side) parts.push("side=1");
+  for (const name of LINKED) if (state[name]) parts.push(`${name}=1`);
   if (!state.follow && state.centre) parts.push(`at=${state.centre.map((v) => v.toFixed(1))}`);
   written = parts.join("&");
   try {
@@ -751,7 +1008,7 @@ function saveState() {
 
 async function loadState() {
   const given = new URLSearchParams(location.hash.slice(1));
-  linked = ["t", "zoom", "at"].some((name) => given.has(name));
+  linked = ["t", "zoom", "at", "up"].some((name) => given.has(name));
   const number = (name, fallback) => {
     const value = Number.parseFloat(given.get(name));
     return Number.isFinite(value) ? value : fallback;
@@ -763,10 +1020,11 @@ async function loadState() {
   state.focus = state.shown[focus] ? focus : state.shown.indexOf(true);
   zoomed = given.has("zoom");
   state.scale = Math.min(Math.max(number("zoom", state.scale), MIN_SCALE), MAX_SCALE);
-  state.side = given.get("side") === "1";
+  for (const name of LINKED) state[name] = given.get(name) === "1";
+  state.tube &&= tubes.length > 0;
   const at = (given.get("at") || "").split(",").map(Number.parseFloat);
   state.follow = !(at.length === 2 && at.every(Number.isFinite));
-  if (!state.follow) state.centre = at;
+  if (!state.follow) [state.centre, state.up] = [at, false];
   for (const [index, shown] of state.shown.entries()) {
     if (shown && !rollouts[index]) rollouts[index] = await readSection(`rollout${index}`);
   }
@@ -796,8 +1054,13 @@ async function start() {
   }
   scene = await readSection("scene");
   times = scene.get("time").data;
-  map = new MapPicture(scene);
   strips = new Strips(byId("curves"), duration());
+  waterfall = new Waterfall(byId("waterfall"), showLoss);
+  tubes = meta.tubes.map(readTube);
+  startTheme();
+  map = new MapPicture(scene);
+  byId("tube").parentElement.hidden = !tubes.length;
+  byId("fork").parentElement.hidden = !meta.rollouts.some(({ fork }) => fork?.branches.length);
   listRollouts();
   await loadState();
   listLegend();

@@ -6,21 +6,25 @@ Positions are relative to a whole-metre origin near the scene, so that quantised
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeAlias
+from itertools import permutations
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import shapely
+from shapely.ops import substring
 
 from shiftsim.kernels import FloatArray
 from shiftsim.metrics import SHORT_NAMES
-from shiftsim.report.palette import planner_styles
+from shiftsim.metrics.result import Collision
+from shiftsim.report.explain import losses
+from shiftsim.report.palette import Style, planner_styles
 from shiftsim.report.words import REASONS, violation_words, violations
 from shiftsim.sim.log import SimulationLog
 from shiftsim.view.pack import Quantised
 from shiftsim.world.layers import Layer
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import AX, PACIFICA, Tracks, speeds
+from shiftsim.world.state import AX, PACIFICA, AgentKind, Tracks, speeds
 
 Fields: TypeAlias = dict[str, Quantised | np.ndarray]
 
@@ -30,6 +34,21 @@ _COARSE = 0.05  # m, of plans beyond their first second
 _FIRST_SECOND = 11  # poses of a plan up to 1 s ahead
 _MAP_STEP = 0.05  # m
 _TOLERANCE = 0.05  # m, of simplified map lines
+
+
+class Branch(NamedTuple):
+    """What is driven from the fork of a rollout on."""
+
+    name: str  # of the planner, or "braking"
+    poses: FloatArray  # (K, 3) rear axle from the fork on
+    hit: Collision | None  # the first collision at fault
+
+
+class Fork(NamedTuple):
+    """The last moment at which a collision could be avoided."""
+
+    start: int  # its iteration; without branches how far back there is none
+    branches: tuple[Branch, ...]
 
 
 @dataclass(frozen=True)
@@ -42,6 +61,7 @@ class ShownRollout:
     log: SimulationLog  # the rollout
     cls: float | None = None  # its score in [0, 1]; None where it was not scored
     metrics: Sequence[Mapping[str, Any]] = ()  # rows of `metrics.parquet`
+    fork: Fork | None = None  # where it was searched for
 
 
 @dataclass(frozen=True)
@@ -50,6 +70,7 @@ class Replay:
 
     scenario: Scenario
     shown: Sequence[ShownRollout]
+    seeds: Sequence[ShownRollout] = ()  # all of the scenario, also those of other pages
 
     @property
     def paths(self) -> list[FloatArray]:
@@ -65,6 +86,15 @@ class Replay:
     def origin(self) -> FloatArray:
         """(2,) whole metres that positions are relative to."""
         return np.rint((self.box[:2] + self.box[2:]) / 2.0)
+
+    @cached_property
+    def tubes(self) -> list[list[ShownRollout]]:
+        """Rollouts that differ in their seed alone, where there are several."""
+        groups: dict[tuple[str, str], list[ShownRollout]] = {}
+        for item in self.seeds or self.shown:
+            if item.noise != "none":
+                groups.setdefault((item.planner, item.noise), []).append(item)
+        return [members for members in groups.values() if len(members) > 1]
 
     @cached_property
     def own_tracks(self) -> bool:
@@ -95,7 +125,36 @@ def scene_fields(replay: Replay) -> Fields:
     fields["lights.status"] = (log.traffic_lights.status + 1).astype(np.uint8)
     if not replay.own_tracks:
         fields |= _track_fields(log.tracks, origin)
+    for number, members in enumerate(replay.tubes):
+        fields |= _tube_fields(f"tube{number}", [item.log.ego[:, :2] - origin for item in members])
     return fields
+
+
+def _tube_fields(name: str, paths: Sequence[FloatArray]) -> Fields:
+    """The area between paths (T, 2) of several seeds, and how far these are apart at each sample.
+
+    `across` is the largest distance of one seed from the path of another, as far as that reaches;
+    `along` is the difference of the distances driven [m].
+    """
+    count = min(map(len, paths))
+    lines = [shapely.LineString(path[:count]) for path in paths]
+    across, areas = np.zeros(count), []
+    for one, other in permutations(lines, 2):
+        points = shapely.points(shapely.get_coordinates(one))
+        where = shapely.line_locate_point(other, points)
+        far = shapely.distance(points, other)
+        across = np.maximum(across, np.where(where < other.length, far, 0.0))
+        common = substring(other, 0.0, where[-1]), substring(one, 0.0, one.length)
+        corners = [shapely.get_coordinates(line) for line in common]
+        if where[-1] < other.length:  # the other one goes on beyond its end
+            areas.append(shapely.Polygon(np.concatenate([corners[0], corners[1][::-1]])))
+    steps = [np.hypot(*np.diff(path[:count], axis=0, prepend=path[:1]).T) for path in paths]
+    along = np.ptp(np.cumsum(steps, axis=1), axis=0)
+    rings = _rings(areas, box_around(paths, 1.0))
+    apart = {"across": across, "along": along}
+    return line_fields(name, rings, np.zeros(2)) | {
+        f"{name}.{key}": Quantised(values, _METRES) for key, values in apart.items()
+    }
 
 
 def rollout_fields(replay: Replay, index: int) -> Fields:
@@ -110,6 +169,9 @@ def rollout_fields(replay: Replay, index: int) -> Fields:
     fields["rest"] = Quantised(plans[:, _FIRST_SECOND - 1 :], _COARSE)
     fields["noise"] = Quantised(log.noise, _RADIANS)
     fields["degraded"] = log.degraded
+    fork = replay.shown[index].fork
+    for number, branch in enumerate(fork.branches if fork else ()):
+        fields |= _poses(f"branch{number}", branch.poses[:, None], origin)
     if replay.own_tracks:
         fields |= _track_fields(log.tracks, origin)
     return fields
@@ -119,7 +181,8 @@ def describe_scene(replay: Replay) -> dict[str, Any]:
     """Everything that is text or a single number, as JSON values."""
     scenario, shown, own = replay.scenario, replay.shown, replay.own_tracks
     script = scenario.script
-    styles = planner_styles(item.planner for item in shown)
+    branched = [one.name for item in shown if item.fork for one in item.fork.branches[1:]]
+    styles = planner_styles([*(item.planner for item in (*shown, *replay.seeds)), *branched])
     return {
         "token": scenario.token,
         "type": scenario.scenario_type,
@@ -131,6 +194,7 @@ def describe_scene(replay: Replay) -> dict[str, Any]:
         "vehicle": [PACIFICA.length, PACIFICA.width, PACIFICA.rear_axle_to_center],
         "ownTracks": own,
         "tracks": None if own else _track_names(shown[0].log.tracks),
+        "tubes": [_describe_tube(replay, members, styles) for members in replay.tubes],
         "rollouts": [
             {
                 "planner": item.planner,
@@ -140,6 +204,8 @@ def describe_scene(replay: Replay) -> dict[str, Any]:
                 "colour": styles[item.planner].colour,
                 "marker": styles[item.planner].marker,
                 "violations": describe_violations(item),
+                "losses": _losses(item),
+                "fork": _describe_fork(item, styles),
                 "scores": _scores(item.metrics),
                 "degraded": int(item.log.degraded.sum()),
                 "tracks": _track_names(item.log.tracks) if own else None,
@@ -147,6 +213,22 @@ def describe_scene(replay: Replay) -> dict[str, Any]:
             for item in shown
         ],
     }
+
+
+def _describe_tube(
+    replay: Replay, members: Sequence[ShownRollout], styles: Mapping[str, Style]
+) -> dict[str, Any]:
+    """Several seeds of a planner as JSON values; `dots` are where each violated something."""
+    planner, noise = members[0].planner, members[0].noise
+    dots = []
+    for item in members:
+        seconds = (item.log.time_us - item.log.time_us[0]) * 1e-6
+        for one in describe_violations(item):
+            row = int(np.searchsorted(seconds, one["t"] - 1e-6))
+            x, y = (item.log.ego[min(row, len(seconds) - 1), :2] - replay.origin).tolist()
+            words = f"{planner} {noise} #{item.seed} at {one['t']:.1f} s: {one['words']}"
+            dots.append([round(x, 2), round(y, 2), words])
+    return {"planner": planner, "noise": noise, "dots": dots, **styles[planner]._asdict()}
 
 
 def line_fields(name: str, lines: Sequence[FloatArray], origin: FloatArray) -> Fields:
@@ -210,6 +292,38 @@ def describe_violations(item: ShownRollout) -> list[dict[str, Any]]:
         for one in violations(item.metrics)
         if one.time is not None
     ]
+
+
+def _losses(item: ShownRollout) -> list[dict[str, Any]]:
+    """What takes points from a score of 100, in order of time, as JSON values; see `losses`."""
+    if item.cls is None:
+        return []
+    out = []
+    for row, points in losses(item.metrics):
+        name, time = row["metric"], row["first_violation_s"]
+        reason = REASONS.get(name, name.replace("_", " "))
+        words = violation_words(row, item.log.tracks)
+        words += f", {100.0 * row['score']:.0f} of 100" if time is None else ""
+        out.append({"metric": name, "t": time, "points": points, "reason": reason, "words": words})
+    return out
+
+
+def _describe_fork(item: ShownRollout, styles: Mapping[str, Style]) -> dict[str, Any] | None:
+    """A fork as JSON values, times in s from the start."""
+    if item.fork is None:
+        return None
+    seconds = (item.log.time_us - item.log.time_us[0]) * 1e-6
+    branches = []
+    for one in item.fork.branches:
+        words, hit = "nothing hit", None
+        if one.hit is not None:
+            hit = float(seconds[one.hit.iteration])
+            kind = AgentKind(one.hit.kind).name.lower().replace("_", " ")
+            words = f"hits {kind} {one.hit.token} at {hit:.1f} s, Δv {one.hit.delta_v:.1f} m/s"
+        style = styles[one.name]._asdict() if one.name in styles else {"colour": "", "marker": ""}
+        branches.append({"name": one.name, "hit": hit, "words": words, **style})
+    start = item.fork.start
+    return {"t": float(seconds[start]), "row": start, "branches": branches}
 
 
 def _scores(metrics: Iterable[Mapping[str, Any]]) -> dict[str, float]:

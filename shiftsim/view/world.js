@@ -2,22 +2,39 @@
 // Draws the scene: a cached picture of the map, and everything that moves on top of it.
 // World coordinates are metres, x to the right, y up; the screen's y points down.
 
-const MAP_COLOURS = {
-  ground: "#f6f5f1",
-  walkway: "#e8e0cc",
-  drivable: "#c9cbca",
-  route: "rgba(64, 150, 90, 0.36)",
-  crosswalk: "#f7f4ea",
-  stop: "rgba(196, 80, 70, 0.25)",
-  boundary: "#8d908d",
-  centre: "#f4f4f1",
-};
-const AGENT_COLOURS = ["#566b80", "#a8791e", "#8a5f9e", "#8f8f8f", "#8f8f8f", "#8f8f8f", "#8f8f8f"];
-const EDITED = "#7b2fbf"; // what an edit made or moved
-const ALARM = "#b00020"; // violations
-const AGENT_EDGE = "#3d4650";
+// what is drawn has the colours of the page's style, which differ where it is dark
+const COLOURS = {};
+function readColours() {
+  const style = getComputedStyle(document.documentElement);
+  const names =
+    "ground walkway drivable route crosswalk stop boundary centre vehicle pedestrian bicycle " +
+    "object edge edged edited alarm alarm-ink partner paper glass ink soft line recorded";
+  for (const name of names.split(" ")) COLOURS[name] = style.getPropertyValue(`--${name}`).trim();
+}
+readColours();
+
+function luminance(colour) {
+  const part = (i) => {
+    const value = Number.parseInt(colour.slice(i, i + 2), 16) / 255;
+    return value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4;
+  };
+  return 0.2126 * part(1) + 0.7152 * part(3) + 0.0722 * part(5);
+}
+
+// a colour #rrggbb, mixed with white until it stands 3 : 1 from a dark road
+function lightened(colour) {
+  const parts = [1, 3, 5].map((i) => Number.parseInt(colour.slice(i, i + 2), 16));
+  for (let share = 0; ; share += 0.05) {
+    const mixed = parts.map((value) => Math.round(value + (255 - value) * share));
+    const out = `#${mixed.map((value) => value.toString(16).padStart(2, "0")).join("")}`;
+    if (luminance(out) >= LIGHT) return out;
+  }
+}
+
+const agentColour = (kind) => COLOURS[["vehicle", "pedestrian", "bicycle"][kind] || "object"];
 const KIND_NAMES = ["vehicle", "pedestrian", "bicycle", "cone", "barrier", "sign", "object"];
 const LIGHT_COLOURS = [null, "#1f9d4d", "#d9a400", "#d02a1e", null]; // absent, green, yellow, red, unknown
+const LIGHT = 0.31; // luminance of what stands 3 : 1 from the route on a dark page
 const CACHE_MARGIN = 0.35; // share of the view around it that the cached map also covers
 
 // Path2D of a layer in world coordinates; rings of one layer fill by the even-odd rule
@@ -52,15 +69,15 @@ class MapPicture {
   paint(context, scale) {
     for (const [name, path] of this.areas) {
       if (name === "route" && !this.layers.route) continue;
-      context.fillStyle = MAP_COLOURS[name];
+      context.fillStyle = COLOURS[name];
       context.fill(path, "evenodd");
     }
     if (!this.layers.lanes) return;
-    context.strokeStyle = MAP_COLOURS.boundary;
+    context.strokeStyle = COLOURS.boundary;
     context.lineWidth = 1 / scale;
     context.stroke(this.boundary);
     if (scale < 3) return;
-    context.strokeStyle = MAP_COLOURS.centre;
+    context.strokeStyle = COLOURS.centre;
     context.setLineDash([1.5, 2.5]);
     context.stroke(this.centre);
     context.setLineDash([]);
@@ -74,6 +91,7 @@ class Panel {
     this.cache = document.createElement("canvas");
     this.cached = null;
     this.centre = [0, 0];
+    this.turn = 0; // by which the world is turned on the screen, counter-clockwise [rad]
   }
 
   place(left, top, width, height, scale, ratio) {
@@ -81,56 +99,71 @@ class Panel {
   }
 
   toScreen(x, y) {
+    const [c, s] = [Math.cos(this.turn) * this.scale, Math.sin(this.turn) * this.scale];
+    const [dx, dy] = [x - this.centre[0], y - this.centre[1]];
     return [
-      this.left + this.width / 2 + (x - this.centre[0]) * this.scale,
-      this.top + this.height / 2 - (y - this.centre[1]) * this.scale,
+      this.left + this.width / 2 + dx * c - dy * s,
+      this.top + this.height / 2 - dx * s - dy * c,
     ];
   }
 
   toWorld(px, py) {
-    return [
-      this.centre[0] + (px - this.left - this.width / 2) / this.scale,
-      this.centre[1] - (py - this.top - this.height / 2) / this.scale,
-    ];
+    const [c, s] = [Math.cos(this.turn) / this.scale, Math.sin(this.turn) / this.scale];
+    const [dx, dy] = [px - this.left - this.width / 2, this.top + this.height / 2 - py];
+    return [this.centre[0] + dx * c + dy * s, this.centre[1] - dx * s + dy * c];
   }
 
   // the map is painted again only when the view leaves the cached picture
   drawMap(context) {
     const spare = CACHE_MARGIN * Math.max(this.width, this.height);
-    const key = [this.width, this.height, this.scale, this.ratio, this.map.version].join();
+    // half of what is seen across and down: all round where it is turned
+    const around = this.turn ? Math.hypot(this.width, this.height) / 2 : 0;
+    const half = [Math.max(this.width / 2, around) + spare, Math.max(this.height / 2, around) + spare];
+    const key = [...half, this.scale, this.ratio, this.map.version].join();
     const moved = this.cached && [0, 1].map((i) => Math.abs(this.centre[i] - this.cached.centre[i]));
     const stale = !this.cached || this.cached.key !== key || Math.max(...moved) * this.scale > spare;
-    if (stale) this.repaint(key, spare);
-    const dx = (this.cached.centre[0] - this.centre[0]) * this.scale - spare;
-    const dy = -(this.cached.centre[1] - this.centre[1]) * this.scale - spare;
-    const { cache } = this;
-    context.drawImage(
-      cache, this.left + dx, this.top + dy, cache.width / this.ratio, cache.height / this.ratio,
-    );
+    if (stale) this.repaint(key, half);
+    const [x, y] = this.toScreen(...this.cached.centre);
+    context.save();
+    context.translate(x, y);
+    context.rotate(-this.turn);
+    const { cache, ratio } = this;
+    context.drawImage(cache, -half[0], -half[1], cache.width / ratio, cache.height / ratio);
+    context.restore();
   }
 
-  repaint(key, spare) {
+  repaint(key, half) {
     const { cache, ratio, scale } = this;
-    cache.width = Math.ceil((this.width + 2 * spare) * ratio);
-    cache.height = Math.ceil((this.height + 2 * spare) * ratio);
+    cache.width = Math.ceil(2 * half[0] * ratio);
+    cache.height = Math.ceil(2 * half[1] * ratio);
     const context = cache.getContext("2d", { alpha: false });
-    context.fillStyle = MAP_COLOURS.ground;
+    context.fillStyle = COLOURS.ground;
     context.fillRect(0, 0, cache.width, cache.height);
     const zoom = scale * ratio;
     context.setTransform(
       zoom, 0, 0, -zoom,
-      (this.width / 2 + spare) * ratio - this.centre[0] * zoom,
-      (this.height / 2 + spare) * ratio + this.centre[1] * zoom,
+      half[0] * ratio - this.centre[0] * zoom, half[1] * ratio + this.centre[1] * zoom,
     );
     this.map.paint(context, scale);
     this.cached = { key, centre: [...this.centre] };
+  }
+
+  // runs a drawing in world coordinates [m]
+  inWorld(context, draw) {
+    const [x, y] = this.toScreen(0, 0);
+    context.save();
+    context.translate(x, y);
+    context.rotate(-this.turn);
+    context.scale(this.scale, -this.scale);
+    draw();
+    context.restore();
   }
 }
 
 // corners of a box as a closed sub-path
 function addBox(context, x, y, heading, front, rear, halfWidth, panel) {
-  const c = Math.cos(heading) * panel.scale;
-  const s = -Math.sin(heading) * panel.scale;
+  const c = Math.cos(heading + panel.turn) * panel.scale;
+  const s = -Math.sin(heading + panel.turn) * panel.scale;
   const [px, py] = panel.toScreen(x, y);
   context.moveTo(px + front * c - halfWidth * s, py + front * s + halfWidth * c);
   context.lineTo(px + front * c + halfWidth * s, py + front * s - halfWidth * c);
@@ -160,7 +193,7 @@ function drawAgents(context, fields, panel, at, highlighted, edited = new Set())
   const count = kinds.length;
   const marked = [];
   const made = [];
-  for (let kind = 0; kind < AGENT_COLOURS.length; kind++) {
+  for (let kind = 0; kind < KIND_NAMES.length; kind++) {
     context.beginPath();
     for (let i = 0; i < count; i++) {
       if (kinds[i] !== kind || !valid[at.row * count + i]) continue;
@@ -175,14 +208,14 @@ function drawAgents(context, fields, panel, at, highlighted, edited = new Set())
       if (edited.has(i)) made.push([x, y, heading, half, size[2 * i + 1] / 2]);
       if (i === highlighted) marked.push([x, y, heading, half, size[2 * i + 1] / 2]);
     }
-    context.fillStyle = AGENT_COLOURS[kind];
+    context.fillStyle = agentColour(kind);
     context.fill();
     context.lineWidth = 1;
-    context.strokeStyle = AGENT_EDGE;
+    context.strokeStyle = COLOURS.edge;
     context.stroke();
   }
-  outline(context, made, panel, 1.5, EDITED);
-  outline(context, marked, panel, 3, "#d02a1e");
+  outline(context, made, panel, 1.5, COLOURS.edited);
+  outline(context, marked, panel, 3, COLOURS.partner);
 }
 
 // boxes drawn around agents
@@ -231,6 +264,14 @@ function drawPath(context, xy, at, panel, colour, dash, width) {
   strokeLine(context, xy, at.row, xy.length / 2, panel, colour);
   context.globalAlpha = 1;
   context.setLineDash([]);
+}
+
+// the ground between the paths of a planner's seeds
+function drawTube(context, { area }, panel, colour) {
+  context.globalAlpha = 0.35;
+  context.fillStyle = colour;
+  panel.inWorld(context, () => context.fill(area, "evenodd"));
+  context.globalAlpha = 1;
 }
 
 // the plan from the rear axle on: its first second, and as far as `shown` (0 to 1) the rest of it,
@@ -295,7 +336,7 @@ function drawEgo(context, pose, vehicle, panel, colour, filled, dash = []) {
   context.beginPath();
   context.moveTo(...tail);
   context.lineTo(...tip);
-  context.strokeStyle = filled && !dash.length ? "#ffffff" : colour;
+  context.strokeStyle = filled && !dash.length ? COLOURS.paper : colour;
   context.stroke();
 }
 
@@ -308,6 +349,12 @@ const MARKERS = {
   P: (c, r) => polygon(c, cross(r, 0)),
   X: (c, r) => polygon(c, cross(r, Math.PI / 4)),
   "*": (c, r) => polygon(c, star(r)),
+  "<": (c, r) => polygon(c, [[-r, 0], [r, -r], [r, r]]),
+  ">": (c, r) => polygon(c, [[r, 0], [-r, -r], [-r, r]]),
+  p: (c, r) => polygon(c, regular(r, 5)),
+  h: (c, r) => polygon(c, regular(r, 6)),
+  H: (c, r) => polygon(c, regular(r, 6, Math.PI / 6)),
+  d: (c, r) => polygon(c, [[0, -1.2 * r], [0.65 * r, 0], [0, 1.2 * r], [-0.65 * r, 0]]),
   burst: (c, r) => polygon(c, star(r, 8)), // where something went wrong; of no planner
 };
 
@@ -325,6 +372,11 @@ function cross(r, angle) {
   return [0, 1, 2, 3].flatMap((k) => quarter.map((p) => turn(p, angle + (k * Math.PI) / 2)));
 }
 
+function regular(r, corners, turn = 0) {
+  const angles = [...Array(corners).keys()].map((k) => turn + (2 * Math.PI * k) / corners);
+  return angles.map((angle) => [1.1 * r * Math.sin(angle), -1.1 * r * Math.cos(angle)]);
+}
+
 function star(r, points = 5) {
   return [...Array(2 * points).keys()].map((k) => {
     const reach = k % 2 ? r * 0.45 : r;
@@ -335,7 +387,7 @@ function star(r, points = 5) {
 function drawDisc(context, x, y, radius) {
   context.beginPath();
   context.arc(x, y, radius, 0, 2 * Math.PI);
-  context.fillStyle = "#ffffff";
+  context.fillStyle = COLOURS.paper;
   context.fill();
 }
 
@@ -345,10 +397,10 @@ function drawMarker(context, marker, x, y, radius, colour, hollow = false) {
   context.translate(x, y);
   context.beginPath();
   (MARKERS[marker] || MARKERS.o)(context, radius);
-  context.fillStyle = hollow ? "#ffffff" : colour;
+  context.fillStyle = hollow ? COLOURS.paper : colour;
   context.fill();
   context.lineWidth = 1.2;
-  context.strokeStyle = hollow ? colour : "#ffffff";
+  context.strokeStyle = hollow ? colour : COLOURS.paper;
   context.stroke();
   context.restore();
 }

@@ -20,6 +20,13 @@ def test_view_writes_one_page_for_a_scenario(call, clean_run, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["0001cafe.html"]
 
 
+def test_a_fork_needs_a_scenario(call, clean_run, tmp_path):
+    done = call("view", clean_run.path, "--fork", "--out", tmp_path, "--no-open")
+
+    assert "--fork needs a scenario" in str(done.exception)
+    assert not list(tmp_path.iterdir())
+
+
 def test_view_writes_a_list_with_all_scenarios(call, clean_run, tmp_path):
     done = call("view", clean_run.path, "-p", "log-future", "--out", tmp_path, "--no-open", "-q")
 

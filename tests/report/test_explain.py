@@ -4,7 +4,7 @@ import pytest
 
 from shiftsim.metrics import SHORT_NAMES
 from shiftsim.metrics.score import closed_loop_score
-from shiftsim.report.explain import explain_lines, select_tasks, why
+from shiftsim.report.explain import explain_lines, losses, select_tasks, why
 from shiftsim.report.words import in_words
 
 
@@ -35,6 +35,52 @@ def test_a_score_is_taken_apart_into_its_terms():
     ]
     score = 0.5 * 5.0 * 0.8 / 7.0
     assert why(score, rows) == f"{100.0 * score:.2f} = 0.5 × (5·80 + 2·0) / 7"
+
+
+def at(second):
+    return {"first_violation_iteration": int(10 * second), "first_violation_s": second}
+
+
+def test_losses_are_the_falls_of_the_score_in_order_of_time():
+    rows = [
+        metric("driving_direction_compliance", 0.5, "multiplier", **at(4.0)),
+        metric("no_ego_at_fault_collisions", 1.0, "multiplier"),
+        metric("ego_progress_along_expert_route", 0.8, "weighted", 5.0),
+        metric("time_to_collision_within_bound", 0.0, "weighted", 5.0, **at(3.0)),
+        metric("speed_limit_compliance", None, "weighted", 4.0),
+        metric("ego_is_comfortable", 1.0, "weighted", 2.0),
+    ]
+    found = [(row["metric"], points) for row, points in losses(rows)]
+    assert [name for name, _ in found] == [
+        "time_to_collision_within_bound",
+        "driving_direction_compliance",
+        "ego_progress_along_expert_route",
+    ]
+    # weights 5 + 5 + 2: 100 -> 58.3 -> 29.2 -> half of (5 * 0.8 + 2) / 12
+    after = [700.0 / 12.0, 350.0 / 12.0, 300.0 / 12.0]
+    assert [points for _, points in found] == pytest.approx(
+        [100.0 - after[0], after[0] - after[1], after[1] - after[2]]
+    )
+
+
+def test_multipliers_fall_first_at_equal_times_and_nothing_is_lost_of_zero():
+    rows = [
+        metric("time_to_collision_within_bound", 0.0, "weighted", 5.0, **at(3.0)),
+        metric("ego_progress_along_expert_route", 1.0, "weighted", 5.0),
+        metric("drivable_area_compliance", 0.0, "multiplier", **at(3.0)),
+    ]
+    found = [(row["metric"], points) for row, points in losses(rows)]
+    assert found == [
+        ("drivable_area_compliance", 100.0),
+        ("time_to_collision_within_bound", 0.0),
+    ]
+
+
+def test_losses_of_a_run_sum_to_its_scores(clean_run):
+    for token in {*clean_run.scores["token"].to_pylist()}:
+        for task in select_tasks(clean_run, token):
+            lost = sum(points for _, points in losses(task["metrics"]))
+            assert 100.0 - lost == pytest.approx(100.0 * task["cls"], abs=1e-9)
 
 
 def test_a_score_that_is_zero_without_a_multiplier_says_so():

@@ -1,5 +1,6 @@
 """Planners can be told apart by anybody, also on a black and white print."""
 
+import colorsys
 from itertools import combinations
 
 import numpy as np
@@ -59,6 +60,21 @@ def test_markers_are_all_different():
 def test_own_planners_have_styles_of_their_own():
     found = planner_styles(["carl", "mine:A", "mine:B", "pluto"])
     assert len(set(found.values())) == 4
+
+
+def hue(colour):
+    red, green, blue = (int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5))
+    return 360.0 * colorsys.rgb_to_hls(red, green, blue)[0]
+
+
+def test_own_planners_share_no_marker_and_no_hue_with_a_known_one():
+    assert not {s.marker for s in _OTHERS} & {s.marker for s in _KNOWN.values()}
+    assert len({s.marker for s in _OTHERS}) == len(_OTHERS)
+    grey = _KNOWN["log-future"]
+    for other in _OTHERS:
+        for known in {*_KNOWN.values()} - {grey}:
+            apart = abs(hue(other.colour) - hue(known.colour))
+            assert min(apart, 360.0 - apart) >= 12.0, (other, known)
 
 
 @pytest.mark.parametrize("eyes", VISION)

@@ -101,7 +101,7 @@ def test_another_edit_is_another_run(edited, toy, tmp_path):
 
 def test_explain_replay_and_pictures_show_the_edit(edited):
     text = edited.explain("0001cafe-walk", planner="log-future")
-    assert "edit walk of 0001cafe: walk: start (at (ahead_m 30, left_m -4))" in text
+    assert "edit walk of 0001cafe: walk: start 30 m ahead, 4 m right" in text
     page = str(edited.view("0001cafe-walk"))
     meta = json.loads(page.partition('id="data-meta">')[2].partition("</script>")[0])
     assert meta["edited"] == ["walk.pedestrian0"]

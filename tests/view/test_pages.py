@@ -73,6 +73,32 @@ def test_rollouts_share_the_recorded_tracks_and_carry_their_own_when_traffic_rea
     assert "tracks.xy" not in unpack(reacting["scene"])
 
 
+def permutations_of(paths, lines):
+    """Each path with the line of every other one."""
+    return ((p, q) for i, p in enumerate(paths) for j, q in enumerate(lines) if i != j)
+
+
+def test_a_tube_lies_between_the_paths_of_seeds_also_of_other_pages(scenario):
+    seeds = [replace(shown(scenario, noise="ou-high", seed=n), seed=n) for n in range(3)]
+    page = sections(replay_page(scenario, seeds[:1], seeds=seeds))
+
+    (tube,) = json.loads(page["meta"])["tubes"]
+    fields = unpack(page["scene"])
+    assert (tube["planner"], tube["noise"]) == ("constant-velocity", "ou-high")
+    paths = np.array([item.log.ego[:, :2] for item in seeds])
+    dense = np.linspace(0, 39, 4000)
+    lines = [np.stack([np.interp(dense, range(40), p[:40, i]) for i in (0, 1)], 1) for p in paths]
+    from_path = [
+        np.hypot(*(line - path[20]).T).min() for path, line in permutations_of(paths, lines)
+    ]
+    assert fields["tube0.across"][20] == pytest.approx(max(from_path), abs=0.01)
+    steps = np.hypot(*np.moveaxis(np.diff(paths[:, :21], axis=1), 2, 0)).sum(axis=1)
+    assert fields["tube0.along"][20] == pytest.approx(np.ptp(steps), abs=0.02)
+    assert np.ptp(fields["tube0.xy"][:, 1]) == pytest.approx(np.ptp(paths[:, :, 1]), abs=0.3)
+    alone = sections(replay_page(scenario, seeds[:1]))
+    assert json.loads(alone["meta"])["tubes"] == []
+
+
 def test_making_a_page_leaves_rollout_and_scenario_as_they_are(scenario):
     item = shown(scenario)
     item.log.expert_ego[:, 2] += 7.0  # headings beyond a turn are unwrapped for the page only

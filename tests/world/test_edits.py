@@ -66,7 +66,7 @@ def test_a_parked_vehicle_stands_in_all_rows_where_it_was_put(scene):
     assert (parked.tracks.velocities[:, column] == 0.0).all()
     assert parked.script.behaviors[column] == STOPPED
     assert scene.tracks.num_tracks == 3  # the recorded one is as it was
-    assert parked.script.words == ("spawn: at (ahead_m 20, left_m -1.2), behavior stopped",)
+    assert parked.script.words == ("spawn: 20 m ahead, 1.2 m right, stopped",)
 
 
 def test_tracks_stay_ordered_by_kind(scene):
