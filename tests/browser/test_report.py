@@ -2,13 +2,11 @@
 
 import pytest
 from made_runs import random_scores, write_run
-from pages import sections
 from stores import write_toy_store
 
 import shiftsim
 from shiftsim.cli import main
 from shiftsim.report.build import citation
-from shiftsim.view.build import list_page
 
 pytest.importorskip("matplotlib")
 SIZES = [(1440, 900), (800, 600)]
@@ -97,40 +95,6 @@ def test_a_click_on_the_citation_selects_all_of_it(page, folder):
     page.browser.find_element("css selector", "pre").click()
     chosen = page.run("getSelection().toString()")
     assert chosen.strip() == citation([shiftsim.open_run(folder / "wide")])
-
-
-def test_the_list_begins_with_the_worst_and_leads_to_what_went_wrong(page, folder):
-    page.open((folder / "view" / "index.html").as_uri())
-    rows = "[...document.querySelectorAll('#worst tbody tr')].map((tr) => tr.innerText)"
-    found = page.run(rows)
-    scores = [float(row.split()[0]) for row in found]
-    assert scores == sorted(scores)
-    assert 1 <= len(found) <= 10
-    # of those that score 0 the farthest off the road: 0.38 m, before one of 0.36 m at 3.1 s
-    assert "drivable area 2.4\u00a0s" in found[0]
-    page.browser.find_element("css selector", "#worst a").click()
-    page.wait("document.documentElement.dataset.ready && location.hash.startsWith('#t=')")
-    first = sections((folder / "view" / "index.html").read_text("utf-8"))["rows"]
-    assert page.text("token").split()[0] in first
-
-
-def test_the_worst_are_in_words_and_without_markup_of_theirs(page, tmp_path):
-    row = {"token": "<b>x</b>", "type": "<i>", "city": "", "planner": "idm", "log": ""}
-    row |= {"noise": "ou-low", "seed": 3, "cls": 0.89, "failed": "", "at": 4.3}
-    row |= {"cause": "at-fault collision", "severity": (0.0, 0.0, -3.0)}
-    row |= {"violated": {"PER": None, "NCR": 4.3}, "page": "replay/x.html", "index": 1}
-    list_page("worst", [row, {**row, "token": "fine", "cls": 1.0}]).save(tmp_path / "index.html")
-
-    page.open((tmp_path / "index.html").as_uri())
-
-    cells = page.run("[...document.querySelectorAll('#worst td')].map((td) => td.textContent)")
-    wrong = "at-fault collision 4.3\u00a0s, little progress"
-    assert cells == ["89.00", "<b>x</b>", "<i>", "idm", "ou-low, seed 3", wrong, ""]
-    assert page.run("document.querySelector('#worst h2').textContent").startswith(
-        "The worst 1 of 2"
-    )
-    link = page.run("document.querySelector('#worst a').href")
-    assert link.endswith("replay/x.html#t=4.30&focus=2")
 
 
 def test_noise_is_dashed_and_hollow_in_a_replay_as_in_all_pictures(page, folder):
