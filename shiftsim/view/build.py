@@ -234,9 +234,9 @@ class Gallery:
             one = self._rollouts[task]
             rows, worst = one.run.rollout_rows(one.key), worst_moment(violations(one.metrics))
             path = np.stack([rows[name].to_numpy() for name in ("x_m", "y_m")], axis=1)
-            time_us = rows["time_us"].to_numpy()
-            at = None if worst is None or worst.time is None else time_us[0] + 1e6 * worst.time
-            driven[task] = (path, None if at is None else int(np.searchsorted(time_us, at - 1.0)))
+            seconds = 1e-6 * (rows["time_us"].to_numpy() - rows["time_us"][0].as_py())
+            at = None if worst is None else worst.time
+            driven[task] = (path, None if at is None else int(np.argmin(np.abs(seconds - at))))
         return thumbnails(self.store.read(token), driven)
 
     def _about(self, token: str) -> dict[str, str]:
@@ -287,23 +287,17 @@ def list_page(
     The worst are ranked as by `worst_of`. `above` is HTML between heading and list, whose caller
     escapes what comes from data; `shown` are words.
     """
-    scenes = {found: n for n, found in enumerate(dict.fromkeys(map(_scene, rows)))}
-    planners = sorted({row["planner"] for row in rows})
+    scenes = {one: n for n, one in enumerate(dict.fromkeys(row.get("scene") for row in rows))}
     looks = {
         "multipliers": [SHORT_NAMES[name] for name in MULTIPLIERS],
         "noises": noise_order(row["noise"] for row in rows),
-        "styles": planner_styles(planners),
+        "styles": planner_styles(sorted({row["planner"] for row in rows})),
         "scenes": list(scenes),
     }
-    numbered = [{**row, "scene": scenes[_scene(row)]} for row in rows]
+    numbered = [{**row, "scene": scenes[row.get("scene")]} for row in rows]
     data = {"rows": numbered, "metrics": _WRONG, "looks": looks}
     images, shown = "'self' data:", html.escape(shown)
     return framed("list", title=title, images=images, data=data, above=above, shown=shown)
-
-
-def _scene(row: Mapping[str, Any]) -> Any:
-    """What the thumbnails of a scenario share; None where nothing is drawn."""
-    return row.get("scene")
 
 
 def write_site(

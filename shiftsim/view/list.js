@@ -6,7 +6,7 @@ const read = (name) => JSON.parse(byId(`data-${name}`).textContent);
 const rows = read("rows");
 const metrics = read("metrics"); // words by abbreviation, in their order
 const { multipliers, noises, styles, scenes } = read("looks");
-const PAGE = 200;
+const PAGE = 100;
 const WORST = 10;
 const chosen = { planner: "", noise: "" }; // by the matrix
 let sorting = { key: "cls", up: true };

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from shiftsim.report.palette import planner_styles
-from shiftsim.report.words import violations
+from shiftsim.report.statistics import bootstrap_interval
+from shiftsim.report.words import noise_order, violations
 from shiftsim.runs.execute import Progress
 from shiftsim.runs.rollouts.columns import complete_rollout, decode_rows
 from shiftsim.runs.tables import OK, TaskResult
@@ -24,7 +25,7 @@ from shiftsim.view.serving import LocalServer
 from shiftsim.world.scenario import Scenario
 
 _WORST, _FAILURES = 20, 50  # that the page lists
-_Z95 = 1.96  # of the normal distribution
+_DRAWS = 1_000  # of an interval, which is drawn anew as results come; a report makes more
 _PATIENCE = 2.0  # s that the end of a run waits for the page to see it
 
 
@@ -49,6 +50,7 @@ class LiveRun:
         self._first: int | None = None  # tasks that were done before
         # scores by planner, noise and traffic, and by recording
         self._scores: dict[tuple[str, str, str], dict[str, list[float]]] = {}
+        self._summaries: dict[tuple[str, str, str], dict[str, Any]] = {}
         # the lowest scores by scenario: the score, the number of the result, the result
         self._worst: dict[str, tuple[float, int, TaskResult]] = {}
         self._failures: list[TaskResult] = []
@@ -101,12 +103,12 @@ class LiveRun:
                 "groups": [
                     {
                         **dict(zip(("planner", "noise", "traffic"), group, strict=True)),
-                        **_statistics(scores),
+                        **self._known(group),
                         "failed": self._num_failures[group[:2]],
-                        "colour": self._styles[group[0]].colour,
                     }
-                    for group, scores in sorted(self._scores.items())
+                    for group in sorted(self._scores, key=self._place)
                 ],
+                "styles": self._styles,
                 "worst": [
                     _describe(result) | {"replay": number if result.rollout else None}
                     for _, number, result in sorted(self._worst.values(), key=lambda one: one[:2])
@@ -117,6 +119,18 @@ class LiveRun:
                 ],
                 "num_failures": self._num_failures.total(),
             }
+
+    def _place(self, group: tuple[str, str, str]) -> tuple[int, int, str]:
+        """Where a group stands: planners as they were named, the noise from none to high."""
+        noises = noise_order(noise for _, noise, _ in self._scores)
+        return list(self._styles).index(group[0]), noises.index(group[1]), group[2]
+
+    def _known(self, group: tuple[str, str, str]) -> dict[str, Any]:
+        """The statistics of a group, made anew when it has grown."""
+        scores, last = self._scores[group], self._summaries.get(group)
+        if last is None or last["done"] < sum(map(len, scores.values())):
+            self._summaries[group] = _statistics(scores)
+        return self._summaries[group]
 
     def replay(self, number: int | str) -> str | None:
         """The replay of one of the worst rollouts; None where it is none of them any more.
@@ -138,17 +152,13 @@ class LiveRun:
 
 
 def _statistics(scores: Mapping[str, list[float]]) -> dict[str, Any]:
-    """Mean and 95 % interval x 100 of scores by recording, whose scenarios are not independent.
-
-    There is no interval of fewer than two recordings.
-    """
-    totals = np.array([sum(values) for values in scores.values()])
-    counts = np.array([len(values) for values in scores.values()])
-    mean, clusters, half = totals.sum() / counts.sum(), len(scores), None
-    if clusters > 1:
-        squares = float(np.square(totals - counts * mean).sum())
-        half = 100.0 * _Z95 * (squares * clusters / (clusters - 1)) ** 0.5 / float(counts.sum())
-    return {"done": int(counts.sum()), "mean": 100.0 * float(mean), "half": half}
+    """Mean and bootstrap interval x 100 of scores by recording, as a report has them."""
+    recordings = sorted(scores)
+    values = np.array([100.0 * score for name in recordings for score in scores[name]])
+    codes = np.repeat(np.arange(len(recordings)), [len(scores[name]) for name in recordings])
+    interval = bootstrap_interval(values, codes, draws=_DRAWS)
+    ends = [] if interval is None else [interval.low, interval.high]
+    return {"done": len(values), "mean": float(values.mean()), "interval": ends}
 
 
 def _describe(result: TaskResult) -> dict[str, Any]:

@@ -36,54 +36,47 @@ def thumbnails(
         for all; `path` of the rollout; `view`, its window, as left, top, width, height; `mark`, the
         place of the marked row.
     """
-    place = _Placement(scenario.expert)
-    expert = place(scenario.expert[:, :2])
+    expert, start = scenario.expert, scenario.expert[0, :2]
+    dx, dy = expert[-1, :2] - start
+    angle = np.arctan2(dy, dx) if np.hypot(dx, dy) > _STANDING else expert[0, 2]
+    cos, sin = np.cos(angle) / _UNIT, np.sin(angle) / _UNIT
+    turn = np.array([[cos, sin], [sin, -cos]])  # metres to units, its own inverse but for scale
+
+    def place(points: FloatArray) -> FloatArray:
+        return (points - start) @ turn
+
+    recorded = place(expert[:, :2])
     paths = {key: place(positions) for key, (positions, _) in driven.items()}
-    views = {key: _window(box_around([expert, path], _MARGIN)) for key, path in paths.items()}
-    corners = [np.array([view[:2], view[:2] + view[2:]]) for view in views.values()]
-    scene = (_roads(scenario, place, box_around(corners)), _line(expert))
-    out = {}
-    for key, path in paths.items():
-        row = driven[key][1]
-        mark = None if row is None else _whole(path[min(row, len(path) - 1)])
-        view = _whole(views[key])
-        out[key] = {"scene": scene, "path": _line(path), "view": view, "mark": mark}
-    return out
-
-
-class _Placement:
-    """From map positions (N, 2) [m] to units of the pictures, and back."""
-
-    def __init__(self, expert: FloatArray) -> None:
-        self._start = expert[0, :2]
-        (dx, dy), heading = expert[-1, :2] - self._start, expert[0, 2]
-        angle = np.arctan2(dy, dx) if np.hypot(dx, dy) > _STANDING else heading
-        cos, sin = np.cos(angle) / _UNIT, np.sin(angle) / _UNIT
-        self._turn = np.array([[cos, sin], [sin, -cos]])  # y down
-
-    def __call__(self, points: FloatArray) -> FloatArray:
-        return (points - self._start) @ self._turn
-
-    def back(self, points: FloatArray) -> FloatArray:
-        return points @ np.linalg.inv(self._turn) + self._start
+    views = {key: _window(box_around([recorded, path], _MARGIN)) for key, path in paths.items()}
+    shown = box_around([np.array([view[:2], view[:2] + view[2:]]) for view in views.values()])
+    corners = np.array([(x, y) for x in shown[::2] for y in shown[1::2]])
+    layer = scenario.map.drivable_areas
+    near = indices_near(layer, box_around([corners @ turn * _UNIT**2 + start]))
+    shapes = shapely.transform(np.array([layer.shape(index) for index in near], object), place)
+    scene = (_areas(shapes, shown), _line(recorded))
+    return {
+        key: {
+            "scene": scene,
+            "path": _line(path),
+            "view": _whole(views[key]),
+            "mark": None if (row := driven[key][1]) is None else _whole(path[row]),
+        }
+        for key, path in paths.items()
+    }
 
 
 def _window(box: FloatArray) -> FloatArray:
     """(4,) left, top, width, height of a picture that shows a box."""
     centre, (width, height) = (box[:2] + box[2:]) / 2.0, box[2:] - box[:2]
-    width = max(width, height * ASPECT, _LEAST)
-    size = np.array([width, width / ASPECT])
+    size = np.array([1.0, 1.0 / ASPECT]) * max(width, height * ASPECT, _LEAST)
     return np.concatenate([centre - size / 2.0, size])
 
 
-def _roads(scenario: Scenario, place: _Placement, box: FloatArray) -> str:
-    layer, (x0, y0, x1, y1) = scenario.map.drivable_areas, box
-    corners = place.back(np.array([(x0, y0), (x0, y1), (x1, y0), (x1, y1)]))
-    shapes = [layer.shape(index) for index in indices_near(layer, box_around([corners]))]
-    placed = shapely.make_valid(shapely.transform(np.array(shapes, object), place))
-    union = shapely.union_all(shapely.clip_by_rect(placed, *box), grid_size=1.0)
-    parts = shapely.get_parts(shapely.simplify(union, _TOLERANCE))
-    areas = [part for part in parts if part.geom_type == "Polygon"]
+def _areas(shapes: Any, box: FloatArray) -> str:
+    """Polygons within a box as one SVG path, for even-odd filling."""
+    clipped = shapely.clip_by_rect(shapely.make_valid(shapes), *box)
+    union = shapely.simplify(shapely.union_all(clipped, grid_size=1.0), _TOLERANCE)
+    areas = [part for part in shapely.get_parts(union) if part.geom_type == "Polygon"]
     rings = [ring for area in areas for ring in (area.exterior, *area.interiors)]
     return "".join(f"{_steps(shapely.get_coordinates(ring)[:-1])}z" for ring in rings)
 
