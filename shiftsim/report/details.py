@@ -41,14 +41,14 @@ def ranking(groups: Sequence[Group]) -> Table | None:
     means = {name: np.mean([*map(_score, _under(known, name))]) for name in noises}
     first, hardest = next(iter(noises), ""), min(noises[1:], key=means.__getitem__, default="")
     heads = ["without noise" if name == "none" else f"under {name}" for name in (first, hardest)]
-    noisy = {(_place(group), group.planner): group for group in _under(known, hardest)}
+    noisy = {(*_place(group), group.planner): group for group in _under(known, hardest)}
     records = list[Record]()
     for group in _under(known, first):
         record: Record = {"set": group.data.label, "traffic": group.traffic}
         record |= {"planner": group.planner, heads[0]: group.estimate()}
         record["95 % CI"] = score_interval(group)
         if hardest:
-            other = noisy.get((_place(group), group.planner))
+            other = noisy.get((*_place(group), group.planner))
             record[heads[1]] = other.estimate() if other else None
             record["95 % CI with it"] = score_interval(other) if other else None
         records.append(record)
@@ -98,12 +98,11 @@ def _findings(clean: Sequence[Group], noisy: Sequence[Group], heads: Sequence[st
         if second and second.seeds == first.seeds:  # these two are the first pair
             alike = [group for group in clean if group.seeds == first.seeds]
             p = holm([one.p_value for one in _compared(alike)[1]])[0]
-            lead += (
-                f", which is {'' if p < _SIGNIFICANT else 'not '}significant (p = {p:.2g}, Holm)"
-            )
+            sign = "significant" if p < _SIGNIFICANT else "not significant"
+            lead += f", which is {sign} (p = {p:.2g}, Holm)"
         said.append(f"{lead}.")
     if not noisy:
-        return [*said, "No rollouts were made under noise."]
+        return [*said, "There are no complete scores under noise."]
     changes = [(_score(g) - before[g.planner], g.planner) for g in noisy if g.planner in before]
     ends = dict.fromkeys((min(changes), max(changes)) if changes else ())
     each = (f"{f'{change:.2f}'.replace('-', '−')} ({name})" for change, name in ends)

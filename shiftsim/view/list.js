@@ -19,7 +19,6 @@ function options(id, values, words = {}) {
 }
 
 const sorted = (values) => [...new Set(values)].sort();
-const percent = (row) => (100 * row.cls).toFixed(2);
 
 // ---- what is shown ----
 
@@ -80,18 +79,11 @@ function linked(row, content) {
 
 function picture(row) {
   if (!row.path) return span("thumbnail");
-  const [roads, expert] = scenes[row.scene];
   const dashed = row.noise === "none" ? "" : " dashed";
-  const width = row.view[2];
-  const parts = [
-    svgOf("path", { d: roads, class: "road" }),
-    svgOf("path", { d: expert, class: "expert" }),
-    svgOf("path", { d: row.path, class: `driven${dashed}` }),
-  ];
+  const more = [svgOf("path", { d: row.path, class: `driven${dashed}` })];
   const [cx, cy] = row.mark || [];
-  if (row.mark) parts.push(svgOf("circle", { cx, cy, r: width / 45, class: "moment" }));
-  const hidden = { viewBox: row.view.join(" "), class: "thumbnail", "aria-hidden": "true" };
-  const svg = svgOf("svg", hidden, ...parts);
+  if (row.mark) more.push(svgOf("circle", { cx, cy, r: row.view[2] / 45, class: "moment" }));
+  const svg = thumbnail(scenes[row.scene], row.view, ...more);
   svg.style.setProperty("--own", styles[row.planner][0]);
   return svg;
 }
@@ -108,7 +100,7 @@ function scoreOf(row) {
   if (row.cls === null) return span("score", row.failed ? "failed" : "–");
   const bar = span("bar");
   bar.style.setProperty("--score", `${100 * row.cls}%`);
-  return span(row.cls > 0 ? "score" : "score zero", span("number", percent(row)), bar);
+  return span(row.cls > 0 ? "score" : "score zero", span("number", (100 * row.cls).toFixed(2)), bar);
 }
 
 // what went wrong, by time; what has none in the order of the metrics, as it stands there
@@ -173,9 +165,7 @@ function button(content, wanted, label) {
   return made;
 }
 
-function groupOf(planner, noise) {
-  return rows.filter((row) => row.planner === planner && row.noise === noise);
-}
+const groupOf = (name, noise) => rows.filter((row) => row.planner === name && row.noise === noise);
 
 function meanOf(group) {
   if (!group.length || group.some((row) => row.cls === null)) return null;
@@ -187,34 +177,35 @@ function cellOf(name, noise, best) {
   if (!group.length) return "";
   const mean = meanOf(group);
   const done = group.filter((row) => row.cls !== null).length;
-  const words = mean === null ? `${done} of ${group.length} scored` : `mean ${mean.toFixed(2)} of ${group.length} rollouts`;
-  const made = button(mean === null ? "–" : mean.toFixed(2), { planner: name, noise }, `${name}, noise ${noise}: ${words}`);
-  if (mean !== null) made.style.setProperty("--loss", `${0.4 * (100 - mean)}%`);
+  const text = mean === null ? "–" : mean.toFixed(2);
+  const where = `${name}, noise ${noise}: ${text}, ${done} of ${group.length} rollouts scored`;
+  const made = button(text, { planner: name, noise }, where);
   if (mean === null) made.append(" ", span("soft", `${done}/${group.length}`));
-  made.classList.toggle("best", mean !== null && mean.toFixed(2) === best);
+  else made.style.setProperty("--loss", `${0.4 * (100 - mean)}%`);
+  made.classList.toggle("best", text === best);
   return made;
 }
 
+function headingOf(scope, ...parts) {
+  const th = document.createElement("th");
+  th.scope = scope;
+  th.append(button(...parts));
+  return th;
+}
+
 function makeMatrix() {
-  const planners = Object.keys(styles);
-  const heading = (tag, scope, content) => {
-    const th = document.createElement("th");
-    th.scope = scope;
-    th.append(content);
-    tag.append(th);
-  };
-  const head = byId("matrix").tHead.insertRow();
-  heading(head, "col", button("all", { planner: "", noise: "" }, "all rollouts"));
-  const best = new Map();
-  for (const noise of noises) {
-    heading(head, "col", button(noise, { planner: "", noise }, `all planners, noise ${noise}`));
-    const means = planners.map((name) => meanOf(groupOf(name, noise))).filter((mean) => mean !== null);
-    best.set(noise, means.length > 1 ? Math.max(...means).toFixed(2) : null);
-  }
-  for (const name of planners) {
-    const tr = byId("matrix").tBodies[0].insertRow();
-    heading(tr, "row", button(planner(name, styles[name]), { planner: name, noise: "" }, `${name}, all noise`));
-    for (const noise of noises) tr.insertCell().append(cellOf(name, noise, best.get(noise)));
+  const [head, body] = [byId("matrix").tHead.insertRow(), byId("matrix").tBodies[0]];
+  const names = Object.keys(styles);
+  const heads = noises.map((noise) => headingOf("col", noise, { planner: "", noise }, `noise ${noise}`));
+  head.append(headingOf("col", "all", { planner: "", noise: "" }, "all rollouts"), ...heads);
+  const best = noises.map((noise) => {
+    const means = names.map((name) => meanOf(groupOf(name, noise))).filter((mean) => mean !== null);
+    return means.length > 1 ? Math.max(...means).toFixed(2) : "";
+  });
+  for (const name of names) {
+    const tr = body.insertRow();
+    tr.append(headingOf("row", planner(name, styles[name]), { planner: name, noise: "" }, name));
+    noises.forEach((noise, i) => tr.insertCell().append(cellOf(name, noise, best[i])));
   }
 }
 

@@ -77,6 +77,7 @@ class LiveRun:
         group = (planner, noise, result.scores["traffic"])
         by_recording = self._scores.setdefault(group, defaultdict(list))
         by_recording[result.scores["log_name"]].append(score)
+        self._summaries.pop(group, None)  # made anew when somebody looks
         if score < (self._worst[token][0] if token in self._worst else 1.0):
             self._worst[token] = (score, self._number, result)
             if len(self._worst) > _WORST:
@@ -93,6 +94,11 @@ class LiveRun:
             progress, done = self._progress, self._progress.done - (self._first or 0)
             elapsed = (self._ended or monotonic()) - self._began
             left = elapsed / done * (progress.total - progress.done) if done > 0 else None
+            for group in self._scores.keys() - self._summaries.keys():
+                self._summaries[group] = _statistics(self._scores[group])
+            noises = noise_order(noise for _, noise, _ in self._scores)
+            ranks = {name: rank for rank, name in enumerate((*self._styles, *noises))}
+            groups = sorted(self._scores, key=lambda one: (ranks[one[0]], ranks[one[1]], one[2]))
             return {
                 "title": self.title,
                 "state": self._state,
@@ -103,10 +109,10 @@ class LiveRun:
                 "groups": [
                     {
                         **dict(zip(("planner", "noise", "traffic"), group, strict=True)),
-                        **self._known(group),
+                        **self._summaries[group],
                         "failed": self._num_failures[group[:2]],
                     }
-                    for group in sorted(self._scores, key=self._place)
+                    for group in groups
                 ],
                 "styles": self._styles,
                 "worst": [
@@ -119,18 +125,6 @@ class LiveRun:
                 ],
                 "num_failures": self._num_failures.total(),
             }
-
-    def _place(self, group: tuple[str, str, str]) -> tuple[int, int, str]:
-        """Where a group stands: planners as they were named, the noise from none to high."""
-        noises = noise_order(noise for _, noise, _ in self._scores)
-        return list(self._styles).index(group[0]), noises.index(group[1]), group[2]
-
-    def _known(self, group: tuple[str, str, str]) -> dict[str, Any]:
-        """The statistics of a group, made anew when it has grown."""
-        scores, last = self._scores[group], self._summaries.get(group)
-        if last is None or last["done"] < sum(map(len, scores.values())):
-            self._summaries[group] = _statistics(scores)
-        return self._summaries[group]
 
     def replay(self, number: int | str) -> str | None:
         """The replay of one of the worst rollouts; None where it is none of them any more.

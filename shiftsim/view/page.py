@@ -20,7 +20,7 @@ _FILES = {  # style and script of each page; its body is the file of its name
     "list": (["list.css"], ["marks.js", "list.js"]),
     "live": (["list.css", "live.css"], ["marks.js", "live.js"]),
     "replay": (["replay.css"], ["codec.js", "world.js", "strips.js", "replay.js"]),
-    "review": (["replay.css", "review.css"], ["codec.js", "world.js", "review.js"]),
+    "review": (["replay.css", "review.css"], ["codec.js", "world.js", "marks.js", "review.js"]),
 }
 # of pages that are files; those of a server come with a header
 _POLICY = (

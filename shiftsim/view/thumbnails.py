@@ -88,9 +88,11 @@ def _line(points: FloatArray) -> str:
 
 def _steps(points: FloatArray) -> str:
     """(N, 2) points in whole units, each relative to the one before."""
-    first, whole = _whole(points[0]), np.rint(points).astype(int)
-    joined = " ".join(f"{x} {y}" for x, y in np.diff(whole, axis=0).tolist())
-    return f"M{first[0]} {first[1]}l{joined}".replace(" -", "-")
+    whole = np.rint(points).astype(int)
+    steps = np.diff(whole, axis=0)
+    moves = steps[steps.any(axis=1)].tolist() or [(0, 0)]
+    joined = " ".join(f"{x} {y}" for x, y in moves)
+    return f"M{whole[0, 0]} {whole[0, 1]}l{joined}".replace(" -", "-")
 
 
 def _whole(values: FloatArray) -> list[int]:
