@@ -78,7 +78,7 @@ function linked(row, content) {
 }
 
 function picture(row) {
-  if (!row.path) return span("thumbnail");
+  if (!row.path) return "";
   const dashed = row.noise === "none" ? "" : " dashed";
   const more = [svgOf("path", { d: row.path, class: `driven${dashed}` })];
   const [cx, cy] = row.mark || [];
@@ -120,7 +120,7 @@ function line(row) {
   const cells = {
     scene: [sceneOf(row)],
     token: [linked(row, row.token), about],
-    planner: [planner(row.planner, styles[row.planner], row.noise)],
+    who: [planner(row.planner, styles[row.planner], row.noise)],
     noise: [noiseOf(row)],
     cls: [scoreOf(row)],
     causes: causesOf(row),
