@@ -314,7 +314,7 @@ def _float(table: Table, tabular: Sequence[str], sizes: Sequence[int]) -> str:
         width, font, gap = 3.9 * sum(sizes) + 4.0 * len(sizes), "scriptsize", 2
     if width > _PAGE:
         needs, tabular = ",graphicx", [r"\resizebox{\textwidth}{!}{%", *tabular, "}"]
-    notes = " ".join(f"{latex_escape(note)}." for note in table.remarks)
+    notes = " ".join(f"{latex_escape(note.removesuffix('.'))}." for note in table.remarks)
     below = ["", r"\smallskip", r"\begin{minipage}{\linewidth}\scriptsize\raggedright", notes]
     lines = [
         f"\\begin{{{kind}}}  % needs \\usepackage{{booktabs{needs}}}",

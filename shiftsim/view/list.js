@@ -20,8 +20,6 @@ function options(id, values, words = {}) {
 
 const sorted = (values) => [...new Set(values)].sort();
 
-// ---- what is shown ----
-
 function matches(row) {
   for (const name of ["planner", "noise"]) {
     if (chosen[name] && row[name] !== chosen[name]) return false;
@@ -65,8 +63,6 @@ function worstOf(found) {
   }
   return [...alike.values()].slice(0, WORST);
 }
-
-// ---- parts of a row ----
 
 function linked(row, content) {
   const link = document.createElement(row.page ? "a" : "span");
@@ -147,8 +143,6 @@ function card([row, alike]) {
   return item;
 }
 
-// ---- the matrix ----
-
 function choose(wanted) {
   const same = chosen.planner === wanted.planner && chosen.noise === wanted.noise;
   Object.assign(chosen, same ? { planner: "", noise: "" } : wanted);
@@ -208,8 +202,6 @@ function makeMatrix() {
     noises.forEach((noise, i) => tr.insertCell().append(cellOf(name, noise, best[i])));
   }
 }
-
-// ---- the page ----
 
 function showWorst(found) {
   const section = byId("worst");
