@@ -246,8 +246,8 @@ def report_html(
 ) -> str:
     """Tables, pictures (titles by address) and citation as sections that any page can hold.
 
-    The ranking and the first picture, that of robustness, stand above the contents, which also
-    link `more` ids of the page.
+    The ranking and the first picture stand above the contents, which also link `more` ids of the
+    page. The first picture is that of robustness where there is noise.
     """
     sections = {table.name: (table.title, render(table, "html")) for table in tables}
     for number, (address, title) in enumerate(images.items()):

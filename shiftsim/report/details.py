@@ -62,7 +62,7 @@ def ranking(groups: Sequence[Group]) -> Table | None:
         *(data.rules for data in distinct_sets(known)),
         "95 % CI: cluster bootstrap over recordings; it leaves out what the seeds change",
         *([f"few recordings ({few}): intervals are too narrow"] if few < FEW_CLUSTERS else []),
-        *([f"not ranked, as rollouts are missing: {left_out}"] if left_out else []),
+        *([f"not ranked, as scores are missing: {left_out}"] if left_out else []),
     ]
     best = {name: max for name in heads if name in records[0]}
     findings = _findings(_under(field, first), _under(field, hardest), heads)

@@ -217,8 +217,8 @@ function showWorst(found) {
 function show() {
   const found = rows.filter(matches).sort(compare);
   byId("list").tBodies[0].replaceChildren(...found.slice(0, room).map(line));
-  const drawn = found.length > room ? `${room} shown of ` : "";
-  byId("count").textContent = `${drawn}${found.length} of ${rows.length} rollouts`;
+  const drawn = found.length > room ? `, the first ${room} shown` : "";
+  byId("count").textContent = `${found.length} of ${rows.length} rollouts${drawn}`;
   byId("more").hidden = found.length <= room;
   for (const th of byId("list").tHead.rows[0].cells) {
     if (th.dataset.key === sorting.key) th.ariaSort = sorting.up ? "ascending" : "descending";

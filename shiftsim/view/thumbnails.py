@@ -82,8 +82,9 @@ def _areas(shapes: Any, box: FloatArray) -> str:
 
 
 def _line(points: FloatArray) -> str:
-    """(N, 2) a path as the commands of an SVG path."""
-    return _steps(shapely.get_coordinates(shapely.LineString(points).simplify(_TOLERANCE)))
+    """(N, 2) a path of one point or more as the commands of an SVG path."""
+    line = shapely.LineString(np.vstack([points[:1], points]))
+    return _steps(shapely.get_coordinates(line.simplify(_TOLERANCE)))
 
 
 def _steps(points: FloatArray) -> str:

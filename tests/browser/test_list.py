@@ -162,6 +162,15 @@ class TestRows:
 
         assert self.scores(listing) == sorted(self.scores(listing), reverse=True)
 
+    def test_of_a_thousand_a_hundred_are_drawn_until_more_are_asked_for(self, page, tmp_path):
+        open_rows(page, tmp_path, [made_row(number % 100, seed=number) for number in range(1000)])
+        assert page.text("count") == "1000 of 1000 rollouts, the first 100 shown"
+        assert len(page.run(SHOWN)) == 100
+
+        page.click("more")
+
+        assert len(page.run(SHOWN)) == 200
+
     def test_they_say_in_words_what_went_wrong(self, listing):
         said = " ".join(listing.run(SHOWN))
 

@@ -85,9 +85,7 @@ def test_what_is_not_complete_is_not_ranked_and_named(tmp_path, allow_partial):
 
     assert [shown(row[2]) for row in table.rows] == ["alpha"]
     assert table.rows[0][-2:] == (None, None)
-    left_out = (
-        "not ranked, as rollouts are missing: alpha ou-low NR, alpha ou-high NR, beta none NR"
-    )
+    left_out = "not ranked, as scores are missing: alpha ou-low NR, alpha ou-high NR, beta none NR"
     assert left_out in table.notes
     assert table.findings[1] == "Under ou-high beta is first with 0.00."
     assert ranking([group for group in read_groups([run]) if not group.is_complete]) is None

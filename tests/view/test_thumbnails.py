@@ -1,12 +1,14 @@
 """Thumbnails: turned to the direction of travel, in whole units, a few hundred bytes."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from worlds import cruise_scenario
 
 from shiftsim.view.thumbnails import ASPECT, thumbnails
+from shiftsim.world.layers import make_layer
 
 
 @pytest.fixture(scope="module")
@@ -61,3 +63,12 @@ def test_a_standing_ego_has_a_picture_of_the_road_around_it():
     assert found["view"][2] == 160
     assert found["mark"] == [0, 0]
     assert re.fullmatch(r"M0 0l0 0", found["path"])
+
+
+def test_a_rollout_of_one_sample_on_a_map_without_areas_has_a_picture(scenario):
+    bare = replace(scenario, map=replace(scenario.map, drivable_areas=make_layer([], [])))
+
+    found = thumbnails(bare, {"short": (scenario.expert[:1, :2], 0)})["short"]
+
+    assert found["scene"][0] == ""
+    assert found["path"] == "M0 0l0 0"
