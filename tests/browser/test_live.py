@@ -3,6 +3,7 @@
 from threading import Event, Thread
 
 import pytest
+from contrast import FAINT
 from stores import write_toy_store
 
 from shiftsim.data.store.reading import open_store
@@ -64,6 +65,11 @@ def test_progress_grows_and_the_last_state_stays(page, watched, size, tmp_path):
     page.wait("document.getElementById('count').textContent.startsWith('8 of 8')")
     watched.thread.join()
 
+    for mode in ("light", "dark"):
+        scheme = [{"name": "prefers-color-scheme", "value": mode}]
+        page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
+        assert page.run(FAINT) == []
+    page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
     page.shoot(tmp_path / "finished.png")
     assert "finished" in page.text("state")
     assert page.run("document.querySelectorAll('#scores tbody tr').length") == 2
