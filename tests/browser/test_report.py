@@ -124,6 +124,15 @@ def test_pairs_are_a_forest_plot_with_one_zero_line(page, folder):
     for zero, low, mean, high, difference in lines:
         assert low <= mean <= high
         assert (mean > zero) == (difference > 0.0)
+    page.open((folder / "one" / "report.html").as_uri(), (390, 844), LOADED)
+    room = page.run(
+        """[...document.querySelectorAll("#planner-comparison td svg")].map((svg) => {
+          const text = document.createRange();
+          text.selectNodeContents(svg.parentElement.lastChild);
+          return text.getBoundingClientRect().left - svg.getBoundingClientRect().right;
+        })"""
+    )
+    assert min(room) > 0  # between the plot and the number, also on a phone
     heads = page.run("document.querySelector('#planner-comparison thead svg').textContent")
     assert "0" in heads
 
