@@ -307,7 +307,7 @@ class OpenedRuns(NamedTuple):
         folder.mkdir(parents=True, exist_ok=True)
         images = {figure.save(folder).name: figure.title for figure in drawn}
         shown = galleries(self.runs, [_store_of(run) for run in self.runs], Choice())
-        above = build.report_html(self.runs, tables, images)
+        above = build.report_html(self.runs, tables, images, "scenarios")
         write_site(folder, shown, title=title, above=above, on_progress=on_progress)
         return [folder / "index.html"]
 

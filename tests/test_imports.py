@@ -30,7 +30,7 @@ NEIGHBOURS = {
         "sim.planner",
     ),
     "metrics": ("sim.log",),
-    "view": ("report.explain", "report.palette", "report.words"),
+    "view": ("report.explain", "report.palette", "report.statistics", "report.words"),
     "train": ("env", "report.palette"),
 }
 LAZY = {"torch", "dask", "distributed", "matplotlib", "gymnasium"}

@@ -27,6 +27,7 @@ _HERE = Path(__file__).parent
 
 # the kinds of tables, names up to the first "_", and what they show
 TABLES = {
+    "ranking": "planners by score, without noise and under the hardest, and what that says",
     "semantic-shift": "clean scores by site, beside the published ones",
     "noise-robustness": "scores under every noise",
     "edits": "scores of edited scenarios by kind and difficulty",
@@ -108,6 +109,7 @@ def _makers(
     statistics = cache(lambda: dataset.own_statistics(groups))
     edited = {group.data.label for group in groups if group.data.edits}
     return {
+        "ranking": lambda: [details.ranking(groups)],
         "semantic-shift": lambda: paper.semantic_shift(
             groups, published, with_published=options.with_published
         ),
@@ -239,17 +241,33 @@ def write_report(
     return out
 
 
-def report_html(runs: Sequence[Run], tables: Sequence[Table], images: Mapping[str, str]) -> str:
-    """Tables, pictures (titles by address) and citation as sections that any page can hold."""
-    parts = [f"<style>\n{_filled('tables.css')}\n</style>", f"<p>{html.escape(made_of(runs))}</p>"]
-    parts += [render(table, "html") for table in tables]
-    for address, title in images.items():
-        words = html.escape(title)
-        parts.append(f'<section><h2>{words}</h2>\n<img alt="{words}" src="{address}"></section>')
-    cite = html.escape(citation(runs))
-    heading = "Cite (a click selects all)"
-    parts.append(f"<section><h2>{heading}</h2>\n<pre>{cite}</pre></section>")
-    return "\n".join(parts)
+def report_html(
+    runs: Sequence[Run], tables: Sequence[Table], images: Mapping[str, str], *more: str
+) -> str:
+    """Tables, pictures (titles by address) and citation as sections that any page can hold.
+
+    The ranking and the first picture stand above the contents, which also link `more` ids of the
+    page. The first picture is that of robustness where there is noise.
+    """
+    sections = {table.name: (table.title, render(table, "html")) for table in tables}
+    for number, (address, title) in enumerate(images.items()):
+        words, name = html.escape(title), f"figure-{number + 1}"
+        part = f'<h2>{words}</h2>\n<img alt="{words}" src="{address}">'
+        sections[name] = (title, f'<section id="{name}">{part}</section>')
+    cite = f"<h2>Cite (a click selects all)</h2>\n<pre>{html.escape(citation(runs))}</pre>"
+    sections["cite"] = ("Cite", f'<section id="cite">{cite}</section>')
+    named = [(name, title.partition(":")[0]) for name, (title, _) in sections.items()]
+    named += [(name, name.capitalize()) for name in more]
+    links = (f'<li><a href="#{html.escape(n)}">{html.escape(words)}</a></li>' for n, words in named)
+    above = [sections.pop(name)[1] for name in ("ranking", "figure-1") if name in sections]
+    parts = [
+        f"<style>\n{_filled('tables.css')}\n</style>",
+        f'<div class="report"><p>{html.escape(made_of(runs))}</p>',
+        *([f'<div class="overview">{"".join(above)}</div>'] if above else []),
+        f'<nav aria-label="Contents"><h2>Contents</h2><ul>{"".join(links)}</ul></nav>',
+        *(part for _, part in sections.values()),
+    ]
+    return "\n".join([*parts, "</div>"])
 
 
 def _filled(name: str, **parts: str) -> str:

@@ -1,4 +1,4 @@
-"""Tables beyond the paper's: planners compared, scenario types, edits, planning times."""
+"""Tables beyond the paper's: a ranking, planners compared, scenario types, edits, times."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -8,19 +8,119 @@ import pyarrow.compute as pc
 
 from shiftsim.edits.sampling import GRADES, graded
 from shiftsim.kernels import FloatArray
-from shiftsim.metrics import open_loop
-from shiftsim.report.groups import Group, by_set, distinct_sets
+from shiftsim.metrics import MULTIPLIERS, open_loop
+from shiftsim.report.groups import COLUMNS, Group, by_set, distinct_sets
 from shiftsim.report.statistics import (
     FEW_CLUSTERS,
+    Comparison,
     bootstrap_interval,
     cluster_codes,
     compare,
+    forest,
     holm,
+    score_interval,
 )
 from shiftsim.report.tables import Cell, Interval, Number, Record, Row, Table
+from shiftsim.report.words import REASONS, noise_order
 from shiftsim.runs.results import Run
 
 ALL_KINDS = "all"
+_SIGNIFICANT = 0.05  # p-value below which a difference is called so
+
+
+def ranking(groups: Sequence[Group]) -> Table | None:
+    """Planners by their score without noise, beside that under the noise of the lowest mean.
+
+    The first noise takes the place of none where that was not run. Only complete groups are ranked;
+    None where there are none. The findings are those of the largest set of scenarios.
+    """
+    places = list(dict.fromkeys(map(_place, groups)))
+    known = [group for group in groups if group.is_complete]
+    known.sort(key=lambda group: (places.index(_place(group)), -_score(group)))
+    noises = noise_order(group.noise for group in known)
+    means = {name: np.mean([*map(_score, _under(known, name))]) for name in noises}
+    first, hardest = next(iter(noises), ""), min(noises[1:], key=means.__getitem__, default="")
+    heads = ["without noise" if name == "none" else f"under {name}" for name in (first, hardest)]
+    noisy = {(*_place(group), group.planner): group for group in _under(known, hardest)}
+    records = list[Record]()
+    for group in _under(known, first):
+        record: Record = {"set": group.data.label, "traffic": group.traffic}
+        record |= {"planner": group.planner, heads[0]: group.estimate()}
+        record["95 % CI"] = score_interval(group)
+        if hardest:
+            other = noisy.get((*_place(group), group.planner))
+            record[heads[1]] = other.estimate() if other else None
+            record["95 % CI with it"] = score_interval(other) if other else None
+        records.append(record)
+    if not records:
+        return None
+    largest = max(known, key=lambda group: len(group.data.tokens))
+    field = [group for group in known if _place(group) == _place(largest)]
+    few = min(group.data.num_recordings for group in known)
+    left_out = ", ".join(f"{g.planner} {g.noise} {g.traffic}" for g in groups if g not in known)
+    notes = [
+        *(data.rules for data in distinct_sets(known)),
+        "95 % CI: cluster bootstrap over recordings; it leaves out what the seeds change",
+        *([f"few recordings ({few}): intervals are too narrow"] if few < FEW_CLUSTERS else []),
+        *([f"not ranked, as scores are missing: {left_out}"] if left_out else []),
+    ]
+    best = {name: max for name in heads if name in records[0]}
+    findings = _findings(_under(field, first), _under(field, hardest), heads)
+    findings.append(_zeros(field))
+    title = "Ranking: closed-loop score × 100"
+    return Table.of("ranking", title, records, 3, notes=notes, best=best, findings=findings)
+
+
+def _place(group: Group) -> tuple[object, ...]:
+    return group.data.key, group.traffic
+
+
+def _score(group: Group) -> float:
+    return 100.0 * float(group.seed_means().mean())
+
+
+def _under(groups: Sequence[Group], noise: str) -> list[Group]:
+    return [group for group in groups if group.noise == noise]
+
+
+def _findings(clean: Sequence[Group], noisy: Sequence[Group], heads: Sequence[str]) -> list[str]:
+    """Who is first, how sure that is, and what the noise changes; the best planners come first."""
+    said, before = list[str](), {group.planner: _score(group) for group in clean}
+    if clean:
+        first, traffic = clean[0], clean[0].run.manifest["determining"]["traffic"]
+        interval, second = score_interval(first), clean[1] if len(clean) > 1 else None
+        sure = f" (95 % interval {interval.low:.2f} to {interval.high:.2f})" if interval else ""
+        scenarios = f"{len(first.data.tokens)} scenarios in {traffic} traffic"
+        verb = "is first with" if second else "scores"
+        lead = f"{first.planner} {verb} {_score(first):.2f}{sure} {heads[0]}, on {scenarios}"
+        if second:
+            lead += f"; {second.planner} follows, {_score(first) - _score(second):.2f} behind"
+        if second and second.seeds == first.seeds:  # these two are the first pair
+            alike = [group for group in clean if group.seeds == first.seeds]
+            p = holm([one.p_value for one in _compared(alike)[1]])[0]
+            sign = "significant" if p < _SIGNIFICANT else "not significant"
+            lead += f", which is {sign} (p = {p:.2g}, Holm)"
+        said.append(f"{lead}.")
+    if not noisy:
+        return [*said, "There are no complete scores under noise."]
+    changes = [(_score(g) - before[g.planner], g.planner) for g in noisy if g.planner in before]
+    ends = dict.fromkeys((min(changes), max(changes)) if changes else ())
+    each = (f"{f'{change:.2f}'.replace('-', '−')} ({name})" for change, name in ends)
+    change = f"scores change by {' to '.join(each)}; " if ends else ""
+    stays = "stays" if clean and clean[0].planner == noisy[0].planner else "is"
+    leads = f"{noisy[0].planner} {stays} first with {_score(noisy[0]):.2f}"
+    return [*said, f"{heads[1].capitalize()} {change}{leads}."]
+
+
+def _zeros(field: Sequence[Group]) -> str:
+    """How many rollouts score 0, and because of what."""
+    values = np.concatenate([group.values.reshape(-1, len(COLUMNS)) for group in field])
+    rollouts = dict(zip(COLUMNS, values.T, strict=True))
+    zero = rollouts["cls"] == 0.0
+    counts = {REASONS[name]: int(np.sum(zero & (rollouts[name] == 0.0))) for name in MULTIPLIERS}
+    causes = sorted(filter(counts.get, counts), key=counts.__getitem__, reverse=True)
+    because = ", ".join(f"{name} in {counts[name]}" for name in causes)
+    return f"{zero.sum()} of {len(zero)} rollouts score 0{': ' * bool(because)}{because}."
 
 
 def planner_comparison(groups: Sequence[Group], *, noisy: bool = False) -> Table | None:
@@ -39,16 +139,16 @@ def planner_comparison(groups: Sequence[Group], *, noisy: bool = False) -> Table
         "95 % CI: cluster bootstrap over recordings; p: the sign of each recording's difference "
         "flipped at random; Holm: corrected for all pairs of the same set, traffic and noise",
     ]
-    records, smallest = list[Record](), 0.0
+    records, results = list[Record](), list[Comparison]()
     for block in pairs:
-        found, least = _compared(block)
-        records += found
-        smallest = max(smallest, least)
+        found = _compared(block)
+        records += found[0]
+        results += found[1]
     few = min(block[0].data.num_recordings for block in pairs)
     if few < FEW_CLUSTERS:
         notes.append(
             f"few recordings ({few}): intervals are too narrow, and no p can be below "
-            f"{smallest:.4f}"
+            f"{max(result.smallest_p for result in results):.4f}"
         )
     if alone:
         words = "not compared, as rollouts are missing or no other planner has the same seeds"
@@ -61,11 +161,12 @@ def planner_comparison(groups: Sequence[Group], *, noisy: bool = False) -> Table
         records,
         5,
         notes=notes,
+        drawn=("difference", forest(results)),
     )
 
 
-def _compared(block: Sequence[Group]) -> tuple[list[Record], float]:
-    """A record per pair of groups, and the smallest p-value that their recordings allow."""
+def _compared(block: Sequence[Group]) -> tuple[list[Record], list[Comparison]]:
+    """A record per pair of groups, and what it was made of."""
     clusters = cluster_codes(block[0].data.recordings)
     pairs = [*combinations(block, 2)]
     results = [
@@ -84,7 +185,7 @@ def _compared(block: Sequence[Group]) -> tuple[list[Record], float]:
         }
         for (first, second), result, p_value in zip(pairs, results, corrected, strict=True)
     ]
-    return records, max(result.smallest_p for result in results)
+    return records, results
 
 
 def scenario_types(groups: Sequence[Group]) -> list[Table]:

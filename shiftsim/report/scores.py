@@ -19,7 +19,7 @@ from shiftsim.report.groups import (
     read_groups,
     seed_deviation,
 )
-from shiftsim.report.tables import Number, Row, Table, text
+from shiftsim.report.tables import Cell, Number, Row, Table, text
 from shiftsim.report.words import (
     Violation,
     rows_by_task,
@@ -67,7 +67,8 @@ def scores(groups: Sequence[Group], *, by: str | None = None) -> Table:
     title = f"Scores × 100 of all planners and noises: {'; '.join(sets)}"
     best = dict.fromkeys(COLUMNS.values(), max)
     in_paper = Table("scores", title, header, paper, len(heading), notes, best=best)
-    return Table("scores", title, header, rows, len(heading), notes, machine, paper=in_paper)
+    more: dict[str, Any] = {"full": machine, "paper": in_paper, "best": best}
+    return Table("scores", title, header, rows, len(heading), notes, **more)
 
 
 def planner_notes(runs: Iterable[Run]) -> list[str]:
@@ -111,7 +112,9 @@ def _lines(labels: tuple[str, ...], part: Group, caption: str) -> tuple[list[Row
     known = next((one for one in found if one.expected), found[0])
     count, label = f"{known.done}/{known.expected}", known.label
     about = (*count.split("/"), f"{label}; {caption}" if label else caption)
-    first = f"– ({count} done)" if means[0] is None else f"{means[0]} {label}".rstrip()
+    first: Cell = means[0] if not label else f"{means[0]} {label}"
+    if means[0] is None:
+        first = f"– ({count} done)"
     if known is not found[0]:
         first = "undefined"
     shown: list[Row] = [(*labels, first, *(number or "–" for number in means[1:]))]

@@ -86,6 +86,27 @@ def compare(first: FloatArray, second: FloatArray, clusters: IntArray) -> Compar
     return Comparison(float(delta.mean()), interval, *tested, *counts)
 
 
+def forest(found: Sequence[Comparison]) -> list[str]:
+    """A forest plot, line by line: the axis, then mean and interval of each, beside a zero line."""
+    bars = [one.interval or Interval(one.difference, one.difference) for one in found]
+    reach = 10.0 * max(1.0, np.ceil(max(max(-bar.low, bar.high) for bar in bars) / 10.0))
+
+    def x(value: float) -> str:
+        return f"{100.0 + 95.0 * value / reach:.1f}"
+
+    ticks = ((-reach, "start"), (0.0, "middle"), (reach, "end"))
+    words = (f'<text x="{x(at)}" y="11" text-anchor="{side}">{at:g}</text>' for at, side in ticks)
+    lines = ["".join(words).replace(">-", ">−")]
+    for one, bar in zip(found, bars, strict=True):
+        low, mean, high = map(x, (bar.low, one.difference, bar.high))
+        lines.append(
+            f'<path d="M100-2V18"/><path d="M{low} 8H{high}"/><circle cx="{mean}" cy="8" r="4"/>'
+        )
+    return [
+        f'<svg class="forest" viewBox="0 0 200 16" aria-hidden="true">{one}</svg>' for one in lines
+    ]
+
+
 def sign_flip_test(
     delta: FloatArray, clusters: IntArray, *, draws: int = DRAWS
 ) -> tuple[float, float]:

@@ -84,6 +84,9 @@ class Table:
     rows: Sequence[Row]  # cells; None where there is nothing to say
     num_labels: int  # leading columns that hold text
     notes: Sequence[str] = ()  # what a reader must know to use the numbers
+    findings: Sequence[str] = ()  # what the numbers say, in sentences
+    # drawn in HTML pages, as SVG: a column's name, above it and per row
+    drawn: tuple[str, Sequence[str]] = ("", ())
     full: "Table | None" = None  # the same for machines, where it is another table
     words: Mapping[str, str] = field(default_factory=lambda: LONG)  # what headings are short for
     # measured columns, and what chooses the best number of each, `max` or `min`
@@ -110,9 +113,9 @@ class Table:
 
     @property
     def remarks(self) -> Sequence[str]:
-        """What the short headings mean, as "no at-fault collision (NCR), …", and the notes."""
+        """Findings, what short headings mean, as "no at-fault collision (NCR), …", and notes."""
         known = legend(self.header, self.words)
-        return (f"columns: {known}", *self.notes) if known else self.notes
+        return (*self.findings, *([f"columns: {known}"] if known else []), *self.notes)
 
 
 def shown(cell: Cell) -> str:
@@ -249,14 +252,9 @@ def _for_paper(table: Table) -> Table:
     planner, stand together.
     """
     table = table.paper or table
-    labels = {name: [row[i] for row in table.rows] for i, name in enumerate(table.header)}
-    shared = [
-        (name, shown(cells[0]))
-        for name, cells in [*labels.items()][: table.num_labels]
-        if name in _SETTINGS and len(set(cells)) == 1
-    ]
+    shared = _shared(table)
     names = list(enumerate(table.header))
-    kept = [i for i, name in names[: table.num_labels] if name not in dict(shared)]
+    kept = [i for i, name in names[: table.num_labels] if name not in shared]
     if table.best:
         kept.sort(key=lambda i: table.header[i] == "planner")
     measured = [i for i, name in names[table.num_labels :] if not table.best or name in table.best]
@@ -265,16 +263,27 @@ def _for_paper(table: Table) -> Table:
         places = list(dict.fromkeys(row[: len(kept) - 1] for row in rows))
         rows.sort(key=lambda row: places.index(row[: len(kept) - 1]))
     left_out = {name for i, name in names if i not in (*kept, *measured)}
-    said = ", ".join(f"{name} {value}" for name, value in shared if value not in table.title)
     return replace(
         table,
-        title="; ".join(filter(None, (table.title, said))),
+        title="; ".join(filter(None, (table.title, _said(table, shared)))),
         header=[table.header[i] for i in (*kept, *measured)],
         rows=rows,
         num_labels=len(kept),
         notes=[note for note in table.notes if note.partition(":")[0] not in left_out],
         paper=None,
     )
+
+
+def _shared(table: Table) -> dict[str, str]:
+    """Settings among the labels that are the same in all rows, with their value."""
+    columns = {name: {row[i] for row in table.rows} for i, name in enumerate(table.header)}
+    labels = [name for name in table.header[: table.num_labels] if name in _SETTINGS]
+    return {name: shown(*columns[name]) for name in labels if len(columns[name]) == 1}
+
+
+def _said(table: Table, shared: Mapping[str, str]) -> str:
+    """Shared settings in words, those that the title does not say."""
+    return ", ".join(f"{name} {of}" for name, of in shared.items() if of not in table.title)
 
 
 def _best(table: Table, settings: Sequence[Row]) -> set[tuple[int, int]]:
@@ -305,7 +314,7 @@ def _float(table: Table, tabular: Sequence[str], sizes: Sequence[int]) -> str:
         width, font, gap = 3.9 * sum(sizes) + 4.0 * len(sizes), "scriptsize", 2
     if width > _PAGE:
         needs, tabular = ",graphicx", [r"\resizebox{\textwidth}{!}{%", *tabular, "}"]
-    notes = " ".join(f"{latex_escape(note)}." for note in table.remarks)
+    notes = " ".join(f"{latex_escape(note.removesuffix('.'))}." for note in table.remarks)
     below = ["", r"\smallskip", r"\begin{minipage}{\linewidth}\scriptsize\raggedright", notes]
     lines = [
         f"\\begin{{{kind}}}  % needs \\usepackage{{booktabs{needs}}}",
@@ -366,11 +375,30 @@ def latex_picture(name: str, title: str, *, is_wide: bool = False) -> str:
 
 
 def _html(table: Table) -> str:
-    """A section; its table lies in a box that scrolls where the page is too narrow."""
+    """A section; its table lies in a box that scrolls where the page is too narrow.
 
-    def row(cells: Sequence[str], tag: str) -> str:
-        kinds = ["" if i < table.num_labels else " class=n" for i in range(len(cells))]
-        parts = (f"<{tag}{kind}>{cell}</{tag}>" for kind, cell in zip(kinds, cells, strict=True))
+    The planner comes first, the best numbers of each setting are bold, and settings that all rows
+    share stand above the table.
+    """
+    shared, names = _shared(table), table.header
+    places = [i for i, name in enumerate(names) if i >= table.num_labels or name not in shared]
+    places.sort(key=lambda i: names[i] != "planner")
+    others = [i for i in places if i < table.num_labels and names[i] != "planner"]
+    bold = _best(
+        table,
+        [  # lines below a planner's are compared with nothing
+            tuple(row[i] for i in others) if shown(row[places[0]]) else (f"line {number}",)
+            for number, row in enumerate(table.rows)
+        ],
+    )
+
+    def line(number: int, cells: Sequence[str], tag: str) -> str:
+        parts = []
+        for i in places:
+            picture = table.drawn[1][number + 1] if names[i] == table.drawn[0] else ""
+            kinds = ["n"] * (i >= table.num_labels) + ["best"] * ((number, i) in bold)
+            kind = f' class="{" ".join(kinds)}"' if kinds else ""
+            parts.append(f"<{tag}{kind}>{picture}{cells[i]}</{tag}>")
         return f"<tr>{''.join(parts)}</tr>"
 
     def heading(name: str) -> str:
@@ -378,13 +406,17 @@ def _html(table: Table) -> str:
         return f"<small>{html.escape(words)}</small> {name}" if words else html.escape(name)
 
     head, *rows = table.lines
-    title = html.escape(table.title or table.name)
+    title, above = (
+        html.escape(words) for words in (table.title or table.name, _said(table, shared))
+    )
     lines = [
         f'<section id="{html.escape(table.name)}">',
         f"<h2>{title}</h2>",
+        *(f"<p class=finding>{html.escape(words)}</p>" for words in table.findings),
+        *([f"<p>{above}</p>"] if above else []),
         f'<div class="wide" tabindex="0" role="region" aria-label="{title}"><table>',
-        f"<thead>{row([*map(heading, head)], 'th')}</thead>\n<tbody>",
-        *(row([*map(html.escape, cells)], "td") for cells in rows),
+        f"<thead>{line(-1, [*map(heading, head)], 'th')}</thead>\n<tbody>",
+        *(line(number, [*map(html.escape, cells)], "td") for number, cells in enumerate(rows)),
         "</tbody></table></div>",
         *(f"<p>{html.escape(note)}</p>" for note in table.notes),
     ]

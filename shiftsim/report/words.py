@@ -8,6 +8,7 @@ import pyarrow as pa
 
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES
 from shiftsim.runs.rollouts import Task
+from shiftsim.sim.noise import NOISE_NAMES
 from shiftsim.world.state import AgentKind, Tracks
 
 COLLISIONS = "no_ego_at_fault_collisions"
@@ -55,6 +56,12 @@ def in_words(metric: str, names: Mapping[str, str] = NAMES) -> str:
 def legend(shorts: Iterable[str], words: Mapping[str, str] = LONG) -> str:
     """What those of some headings mean that are short: "no at-fault collision (NCR), …"."""
     return ", ".join(f"{words[name]} ({name})" for name in shorts if name in words)
+
+
+def noise_order(names: Iterable[str]) -> list[str]:
+    """Noises, each once: none, then by kind from low to high, then custom ones by name."""
+    found = set(names)
+    return [name for name in NOISE_NAMES if name in found] + sorted(found - {*NOISE_NAMES})
 
 
 def task_of(row: Mapping[str, Any]) -> Task:

@@ -1,33 +1,36 @@
 """Replays of runs: which rollouts belong on one page, and a folder of pages with a list of them."""
 
 import html
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from shiftsim.errors import ConfigError, DataError, ShiftsimError, beginning
 from shiftsim.files import safe_join, write_text
-from shiftsim.metrics import SHORT_NAMES
+from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES
+from shiftsim.report.palette import planner_styles
 from shiftsim.report.words import (
     REASONS,
+    noise_order,
     rows_by_task,
     severity,
     violations,
     worst_moment,
-    worst_of,
     worst_violation,
 )
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
 from shiftsim.view.page import MAX_ROLLOUTS, Page, framed, replay_page
 from shiftsim.view.scene import ShownRollout
+from shiftsim.view.thumbnails import thumbnails
 
 _ENDS = [*Task._fields, "status", "error", "scenario_type"]
 _NO_PAGE = {"page": None, "index": 0}
-_WORST = 10  # scenarios before the list
 _WRONG = {SHORT_NAMES[name]: reason for name, reason in REASONS.items()}  # in words, in their order
 
 
@@ -229,9 +232,21 @@ class Gallery:
             for part, tasks in enumerate(parts)
             for index, task in enumerate(tasks)
         }
-        about = self._about(token)
-        tasks = self._chosen[token]
-        return [about | self._row(task) | where.get(task, _NO_PAGE) for task in tasks]
+        drawn = self._thumbnails(token, where) if where else {}
+        about, tasks = self._about(token), self._chosen[token]
+        return [about | self._row(t) | where.get(t, _NO_PAGE) | drawn.get(t, {}) for t in tasks]
+
+    def _thumbnails(self, token: str, tasks: Iterable[Task]) -> dict[Task, dict[str, Any]]:
+        """What the list draws of stored rollouts, which mark what cost most."""
+        driven = {}
+        for task in tasks:
+            one = self._rollouts[task]
+            rows, worst = one.run.rollout_rows(one.key), worst_moment(violations(one.metrics))
+            path = np.stack([rows[name].to_numpy() for name in ("x_m", "y_m")], axis=1)
+            seconds = 1e-6 * (rows["time_us"].to_numpy() - rows["time_us"][0].as_py())
+            at = None if worst is None else worst.time
+            driven[task] = (path, None if at is None else int(np.argmin(np.abs(seconds - at))))
+        return thumbnails(self.store.read(token), driven)
 
     def _about(self, token: str) -> dict[str, str]:
         """Type and city of a scenario; of one that never finished as its store has them."""
@@ -278,13 +293,18 @@ def list_page(
 ) -> Page:
     """The page that lists rows of `Gallery.rows`, sortable and filterable, the worst of them first.
 
-    The worst are those of the rollouts that finished, as `worst_of` ranks them. `above` is HTML
-    between heading and list, whose caller escapes what comes from data; `shown` are words.
+    The worst are ranked as by `worst_of`. `above` is HTML between heading and list, whose caller
+    escapes what comes from data; `shown` are words.
     """
-    finished = (dict(row, number=n) for n, row in enumerate(rows) if row["cls"] is not None)
-    worst = worst_of((row for row in finished if row["cls"] < 1.0), _WORST)
-    numbers = [(row["number"], others) for row, others in worst]
-    data = {"rows": list(rows), "metrics": _WRONG, "worst": numbers}
+    scenes = {one: n for n, one in enumerate(dict.fromkeys(row.get("scene") for row in rows))}
+    looks = {
+        "multipliers": [SHORT_NAMES[name] for name in MULTIPLIERS],
+        "noises": noise_order(row["noise"] for row in rows),
+        "styles": planner_styles(sorted({row["planner"] for row in rows})),
+        "scenes": list(scenes),
+    }
+    numbered = [{**row, "scene": scenes[row.get("scene")]} for row in rows]
+    data = {"rows": numbered, "metrics": _WRONG, "looks": looks}
     images, shown = "'self' data:", html.escape(shown)
     return framed("list", title=title, images=images, data=data, above=above, shown=shown)
 

@@ -1,29 +1,30 @@
 "use strict";
-// The list of scenarios: sorted, filtered, each row a link into its replay at the violation that counts most.
+// The list of rollouts: filtered by a matrix of scores, sorted, each row a link to what went wrong.
 
 const byId = (id) => document.getElementById(id);
-const rows = JSON.parse(byId("data-rows").textContent);
-const metrics = JSON.parse(byId("data-metrics").textContent); // words by abbreviation, in their order
-const worst = JSON.parse(byId("data-worst").textContent); // [number of a row, how many are like it]
-const PAGE = 200;
+const read = (name) => JSON.parse(byId(`data-${name}`).textContent);
+const rows = read("rows");
+const metrics = read("metrics"); // words by abbreviation, in their order
+const { multipliers, noises, styles, scenes } = read("looks");
+const PAGE = 100;
+const WORST = 10;
+const chosen = { planner: "", noise: "" }; // by the matrix
 let sorting = { key: "cls", up: true };
 let room = PAGE;
 
 for (const row of rows) row.first = row.at ?? Infinity;
 
 function options(id, values, words = {}) {
-  for (const value of values) {
-    const option = document.createElement("option");
-    option.value = value;
-    option.textContent = words[value] ? `${words[value]} (${value})` : value;
-    byId(id).append(option);
-  }
+  for (const value of values) byId(id).append(new Option(words[value] || value, value));
 }
 
 const sorted = (values) => [...new Set(values)].sort();
 
 function matches(row) {
-  for (const name of ["city", "planner", "noise"]) {
+  for (const name of ["planner", "noise"]) {
+    if (chosen[name] && row[name] !== chosen[name]) return false;
+  }
+  for (const name of ["city", "type"]) {
     if (byId(name).value && row[name] !== byId(name).value) return false;
   }
   const violated = byId("violated").value;
@@ -34,94 +35,213 @@ function matches(row) {
   return !wanted || row.token.toLowerCase().includes(wanted) || row.type.toLowerCase().includes(wanted);
 }
 
+// order of two values; of lists that of their first different values
+function order(x, y) {
+  if (!Array.isArray(x)) return x === y ? 0 : x === null || x < y ? -1 : 1;
+  const at = x.findIndex((value, i) => order(value, y[i]) !== 0);
+  return at < 0 ? x.length - y.length : at < y.length ? order(x[at], y[at]) : 1;
+}
+
 function compare(a, b) {
-  const [x, y] = [a[sorting.key], b[sorting.key]];
-  const order = x === y ? 0 : x === null || x < y ? -1 : 1;
-  return sorting.up ? order : -order;
+  const key = (row) => (sorting.key === "noise" ? noises.indexOf(row.noise) : row[sorting.key]);
+  return sorting.up ? order(key(a), key(b)) : order(key(b), key(a));
 }
 
-// violations in words, each with its first time
-function words(violated) {
-  return violated.map(([name, t]) => {
-    const said = metrics[name] || name;
-    return t === null ? said : `${said} ${t.toFixed(1)}\u00a0s`;
-  });
+// each scenario by its worst rollout, one per recording and cause, with how many others are like it
+function worstOf(found) {
+  const place = (r) => [r.cls, r.severity, r.noise !== "none", r.planner, r.noise, r.seed, r.token];
+  const worst = new Map();
+  const alike = new Map();
+  const scored = found.filter((row) => row.cls !== null && row.cls < 1);
+  for (const row of scored.sort((a, b) => order(place(a), place(b)))) {
+    if (!worst.has(row.token)) worst.set(row.token, row);
+  }
+  for (const row of worst.values()) {
+    const key = JSON.stringify(row.log && row.cause ? [row.log, row.cause] : [row.token]);
+    if (alike.has(key)) alike.get(key)[1]++;
+    else alike.set(key, [row, 0]);
+  }
+  return [...alike.values()].slice(0, WORST);
 }
 
-function violatedText(row) {
-  if (row.failed) return row.failed;
-  // by time; what has none in the order of the metrics, as it stands there
-  const parts = Object.entries(row.violated).sort((a, b) => (a[1] ?? 1e9) - (b[1] ?? 1e9));
-  return words(parts).join(" · ");
-}
-
-function scenarioOf(row) {
+function linked(row, content) {
   const link = document.createElement(row.page ? "a" : "span");
   const at = Number.isFinite(row.first) ? `t=${row.first.toFixed(2)}&` : "";
   if (row.page) link.href = `${row.page}#${at}focus=${row.index + 1}`;
   else link.title = "no replay";
-  link.textContent = row.token;
+  link.append(content);
   return link;
 }
 
-function lineOf(score, cells, place) {
-  const tr = document.createElement("tr");
-  for (const content of cells) tr.insertCell().append(content);
-  const td = tr.insertCell(place);
-  td.className = "number";
-  td.append(score);
-  return tr;
+function picture(row) {
+  if (!row.path) return "";
+  const dashed = row.noise === "none" ? "" : " dashed";
+  const more = [svgOf("path", { d: row.path, class: `driven${dashed}` })];
+  const [cx, cy] = row.mark || [];
+  if (row.mark) more.push(svgOf("circle", { cx, cy, r: row.view[2] / 45, class: "moment" }));
+  const svg = thumbnail(scenes[row.scene], row.view, ...more);
+  svg.style.setProperty("--own", styles[row.planner][0]);
+  return svg;
+}
+
+function sceneOf(row) {
+  const link = linked(row, picture(row));
+  link.tabIndex = -1; // the token is the same link
+  return link;
+}
+
+const noiseOf = (row) => span("chip", row.noise === "none" ? "none" : `${row.noise}, seed ${row.seed}`);
+
+function scoreOf(row) {
+  if (row.cls === null) return span("score", row.failed ? "failed" : "–");
+  const bar = span("bar");
+  bar.style.setProperty("--score", `${100 * row.cls}%`);
+  return span(row.cls > 0 ? "score" : "score zero", span("number", (100 * row.cls).toFixed(2)), bar);
+}
+
+// what went wrong, by time; what has none in the order of the metrics, as it stands there
+function causesOf(row) {
+  if (row.failed) return [row.failed];
+  const parts = Object.entries(row.violated).sort((a, b) => (a[1] ?? 1e9) - (b[1] ?? 1e9));
+  return parts.map(([name, t]) => {
+    const words = metrics[name] || name;
+    const kind = multipliers.includes(name) ? "chip bad" : "chip";
+    return span(kind, t === null ? words : `${words} ${t.toFixed(1)}\u00a0s`);
+  });
 }
 
 function line(row) {
-  const score = row.failed ? "failed" : row.cls === null ? "–" : (100 * row.cls).toFixed(2);
-  const seed = row.noise === "none" ? "" : row.seed;
-  const cells = [scenarioOf(row), row.type, row.city, row.planner, row.noise, seed, violatedText(row)];
-  return lineOf(score, cells, 6);
+  const tr = document.createElement("tr");
+  const about = span("soft", [row.type, row.city].filter(Boolean).join(" · "));
+  const cells = {
+    scene: [sceneOf(row)],
+    token: [linked(row, row.token), about],
+    who: [planner(row.planner, styles[row.planner], row.noise)],
+    noise: [noiseOf(row)],
+    cls: [scoreOf(row)],
+    causes: causesOf(row),
+  };
+  for (const [kind, content] of Object.entries(cells)) {
+    const td = tr.insertCell();
+    td.className = kind;
+    td.append(...content);
+  }
+  return tr;
 }
 
-function worstLine([number, alike]) {
-  const row = rows[number];
-  const noise = row.noise === "none" ? row.noise : `${row.noise}, seed ${row.seed}`;
-  const violated = Object.keys(metrics).filter((name) => name in row.violated);
-  const wrong = words(violated.map((name) => [name, row.violated[name]])).join(", ");
-  const cells = [scenarioOf(row), row.type, row.planner, noise, wrong, alike || ""];
-  return lineOf((100 * row.cls).toFixed(2), cells, 0);
+function card([row, alike]) {
+  const item = document.createElement("li");
+  const more = alike ? span("soft", `${alike} alike`) : "";
+  item.append(
+    sceneOf(row),
+    span("top", scoreOf(row), more),
+    linked(row, row.token),
+    span("soft", [row.type, row.city].filter(Boolean).join(" · ")),
+    span("who", planner(row.planner, styles[row.planner], row.noise), noiseOf(row)),
+    span("causes", ...causesOf(row)),
+  );
+  return item;
 }
 
-function showWorst() {
+function choose(wanted) {
+  const same = chosen.planner === wanted.planner && chosen.noise === wanted.noise;
+  Object.assign(chosen, same ? { planner: "", noise: "" } : wanted);
+  refresh();
+}
+
+function button(content, wanted, label) {
+  const made = document.createElement("button");
+  made.type = "button";
+  made.append(content);
+  made.title = made.ariaLabel = label;
+  Object.assign(made.dataset, wanted);
+  made.addEventListener("click", () => choose(wanted));
+  return made;
+}
+
+const groupOf = (name, noise) => rows.filter((row) => row.planner === name && row.noise === noise);
+
+function meanOf(group) {
+  if (!group.length || group.some((row) => row.cls === null)) return null;
+  return group.reduce((sum, row) => sum + 100 * row.cls, 0) / group.length;
+}
+
+function cellOf(name, noise, best) {
+  const group = groupOf(name, noise);
+  if (!group.length) return "";
+  const mean = meanOf(group);
+  const done = group.filter((row) => row.cls !== null).length;
+  const text = mean === null ? "–" : mean.toFixed(2);
+  const where = `${name}, noise ${noise}: ${text}, ${done} of ${group.length} rollouts scored`;
+  const made = button(text, { planner: name, noise }, where);
+  if (mean === null) made.append(" ", span("soft", `${done}/${group.length}`));
+  else made.style.setProperty("--loss", `${0.4 * (100 - mean)}%`);
+  made.classList.toggle("best", text === best);
+  return made;
+}
+
+function headingOf(scope, ...parts) {
+  const th = document.createElement("th");
+  th.scope = scope;
+  th.append(button(...parts));
+  return th;
+}
+
+function makeMatrix() {
+  const [head, body] = [byId("matrix").tHead.insertRow(), byId("matrix").tBodies[0]];
+  const names = Object.keys(styles);
+  const heads = noises.map((noise) => headingOf("col", noise, { planner: "", noise }, `noise ${noise}`));
+  head.append(headingOf("col", "all", { planner: "", noise: "" }, "all rollouts"), ...heads);
+  const best = noises.map((noise) => {
+    const means = names.map((name) => meanOf(groupOf(name, noise))).filter((mean) => mean !== null);
+    return means.length > 1 ? Math.max(...means).toFixed(2) : "";
+  });
+  for (const name of names) {
+    const tr = body.insertRow();
+    tr.append(headingOf("row", planner(name, styles[name]), { planner: name, noise: "" }, name));
+    noises.forEach((noise, i) => tr.insertCell().append(cellOf(name, noise, best[i])));
+  }
+}
+
+function showWorst(found) {
   const section = byId("worst");
-  const count = new Set(rows.map((row) => row.token)).size;
-  const title = `The worst ${worst.length} of ${count} scenarios`;
-  section.querySelector("h2").textContent = section.querySelector("div").ariaLabel = title;
-  section.querySelector("tbody").replaceChildren(...worst.map(worstLine));
+  const worst = worstOf([...found]);
+  const count = new Set(found.map((row) => row.token)).size;
+  const only = [chosen.planner, chosen.noise && `noise ${chosen.noise}`].filter(Boolean).join(", ");
+  const title = `The worst ${worst.length} of ${count} scenarios${only && `: ${only}`}`;
+  section.querySelector("h2").textContent = section.querySelector("ol").ariaLabel = title;
+  section.querySelector("ol").replaceChildren(...worst.map(card));
   section.hidden = !worst.length;
 }
 
 function show() {
   const found = rows.filter(matches).sort(compare);
   byId("list").tBodies[0].replaceChildren(...found.slice(0, room).map(line));
-  const drawn = found.length > room ? `${room} shown of ` : "";
-  byId("count").textContent = `${drawn}${found.length} of ${rows.length} rollouts`;
+  const drawn = found.length > room ? `, the first ${room} shown` : "";
+  byId("count").textContent = `${found.length} of ${rows.length} rollouts${drawn}`;
   byId("more").hidden = found.length <= room;
   for (const th of byId("list").tHead.rows[0].cells) {
     if (th.dataset.key === sorting.key) th.ariaSort = sorting.up ? "ascending" : "descending";
     else th.ariaSort = null;
   }
+  for (const one of byId("matrix").querySelectorAll("button")) {
+    const { planner: name, noise } = one.dataset;
+    one.ariaPressed = name === chosen.planner && noise === chosen.noise;
+  }
+  return found;
 }
 
-options("city", sorted(rows.map((row) => row.city)));
-options("planner", sorted(rows.map((row) => row.planner)));
-options("noise", sorted(rows.map((row) => row.noise)));
-const violated = new Set(rows.flatMap((row) => Object.keys(row.violated)));
-options("violated", Object.keys(metrics).filter((name) => violated.has(name)), metrics);
-for (const id of ["city", "planner", "noise", "violated", "low", "high", "find"]) {
-  byId(id).addEventListener("input", () => {
-    room = PAGE;
-    show();
-  });
+function refresh() {
+  room = PAGE;
+  showWorst(show());
 }
-for (const th of byId("list").tHead.rows[0].cells) {
+
+for (const name of ["city", "type"]) options(name, sorted(rows.map((row) => row[name])).filter(Boolean));
+const violated = new Set(rows.flatMap((row) => Object.keys(row.violated)));
+const named = Object.fromEntries(Object.entries(metrics).map(([short, words]) => [short, `${words} (${short})`]));
+options("violated", Object.keys(metrics).filter((name) => violated.has(name)), named);
+for (const id of ["city", "type", "violated", "low", "high", "find"]) byId(id).addEventListener("input", refresh);
+for (const th of byId("list").tHead.querySelectorAll("[data-key]")) {
   th.tabIndex = 0;
   const sort = () => {
     sorting = { key: th.dataset.key, up: th.dataset.key === sorting.key ? !sorting.up : true };
@@ -134,6 +254,6 @@ byId("more").addEventListener("click", () => {
   room += PAGE;
   show();
 });
-showWorst();
-show();
+makeMatrix();
+refresh();
 document.documentElement.dataset.ready = "1";

@@ -43,15 +43,14 @@ function fillRows(id, rows, empty) {
 }
 
 // mean and interval on a scale from 0 to 100
-function range({ mean, half, colour }) {
+function range({ mean, interval: [low = mean, high = mean] }, colour) {
   const box = document.createElement("div");
   box.className = "range";
   const [line, dot] = [document.createElement("i"), document.createElement("b")];
-  const [low, high] = [Math.max(mean - (half || 0), 0), Math.min(mean + (half || 0), 100)];
   line.style.left = `${low}%`;
   line.style.width = `${high - low}%`;
   dot.style.left = `${mean}%`;
-  line.style.background = dot.style.background = colour;
+  box.style.setProperty("--own", colour);
   box.append(line, dot);
   return box;
 }
@@ -82,20 +81,21 @@ function show(state) {
   const next = ended ? `; replays of all: shiftsim view ${state.title}` : "";
   byId("time").textContent = so + next;
   document.body.className = state.state === "finished" ? "ended" : ended ? "stopped" : "";
-  const half = (row) => (row.half === null ? "–" : `± ${row.half.toFixed(2)}`);
+  const ends = (row) => row.interval.map((end) => end.toFixed(2)).join(" – ") || "–";
+  const who = (row) => cell(planner(row.planner, state.styles[row.planner], row.noise));
   fillRows(
     "scores",
     state.groups.map((row) => [
-      cell(row.planner), cell(row.noise), cell(row.traffic),
-      cell(`${row.done}${row.failed ? `, ${row.failed} failed` : ""}`, "n"),
-      cell(row.mean.toFixed(2), "n"), cell(half(row), "n"), cell(range(row), "scale"),
+      who(row), cell(row.noise), cell(row.mean.toFixed(2), "n"), cell(ends(row), "n"),
+      cell(range(row, state.styles[row.planner][0]), "scale"),
+      cell(`${row.done}${row.failed ? `, ${row.failed} failed` : ""}`, "n"), cell(row.traffic),
     ]),
     "nothing has finished yet",
   );
   fillRows(
     "worst",
     state.worst.map((row) => [
-      cell(row.score.toFixed(2), "n"), cell(scenario(row, ended)), cell(row.planner),
+      cell(row.score.toFixed(2), "n"), cell(scenario(row, ended)), who(row),
       cell(row.noise), cell(seedOf(row), "n"), cell(row.why, "why"),
     ]),
     "no rollout below 100 yet",
@@ -105,7 +105,7 @@ function show(state) {
   fillRows(
     "failures",
     state.failures.map((row) => [
-      cell(row.token), cell(row.planner), cell(row.noise), cell(seedOf(row), "n"),
+      cell(row.token), who(row), cell(row.noise), cell(seedOf(row), "n"),
       cell(`${row.status}: ${[row.error, row.hint].filter(Boolean).join(" – ")}`, "why"),
     ]),
     "nothing",

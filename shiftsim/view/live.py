@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from shiftsim.report.palette import planner_styles
-from shiftsim.report.words import violations
+from shiftsim.report.statistics import bootstrap_interval
+from shiftsim.report.words import noise_order, violations
 from shiftsim.runs.execute import Progress
 from shiftsim.runs.rollouts.columns import complete_rollout, decode_rows
 from shiftsim.runs.tables import OK, TaskResult
@@ -24,7 +25,7 @@ from shiftsim.view.serving import LocalServer
 from shiftsim.world.scenario import Scenario
 
 _WORST, _FAILURES = 20, 50  # that the page lists
-_Z95 = 1.96  # of the normal distribution
+_DRAWS = 1_000  # of an interval, which is drawn anew as results come; a report makes more
 _PATIENCE = 2.0  # s that the end of a run waits for the page to see it
 
 
@@ -49,6 +50,7 @@ class LiveRun:
         self._first: int | None = None  # tasks that were done before
         # scores by planner, noise and traffic, and by recording
         self._scores: dict[tuple[str, str, str], dict[str, list[float]]] = {}
+        self._summaries: dict[tuple[str, str, str], dict[str, Any]] = {}
         # the lowest scores by scenario: the score, the number of the result, the result
         self._worst: dict[str, tuple[float, int, TaskResult]] = {}
         self._failures: list[TaskResult] = []
@@ -75,6 +77,7 @@ class LiveRun:
         group = (planner, noise, result.scores["traffic"])
         by_recording = self._scores.setdefault(group, defaultdict(list))
         by_recording[result.scores["log_name"]].append(score)
+        self._summaries.pop(group, None)  # made anew when somebody looks
         if score < (self._worst[token][0] if token in self._worst else 1.0):
             self._worst[token] = (score, self._number, result)
             if len(self._worst) > _WORST:
@@ -91,6 +94,11 @@ class LiveRun:
             progress, done = self._progress, self._progress.done - (self._first or 0)
             elapsed = (self._ended or monotonic()) - self._began
             left = elapsed / done * (progress.total - progress.done) if done > 0 else None
+            for group in self._scores.keys() - self._summaries.keys():
+                self._summaries[group] = _statistics(self._scores[group])
+            noises = noise_order(noise for _, noise, _ in self._scores)
+            ranks = {name: rank for rank, name in enumerate((*self._styles, *noises))}
+            groups = sorted(self._scores, key=lambda one: (ranks[one[0]], ranks[one[1]], one[2]))
             return {
                 "title": self.title,
                 "state": self._state,
@@ -101,12 +109,12 @@ class LiveRun:
                 "groups": [
                     {
                         **dict(zip(("planner", "noise", "traffic"), group, strict=True)),
-                        **_statistics(scores),
+                        **self._summaries[group],
                         "failed": self._num_failures[group[:2]],
-                        "colour": self._styles[group[0]].colour,
                     }
-                    for group, scores in sorted(self._scores.items())
+                    for group in groups
                 ],
+                "styles": self._styles,
                 "worst": [
                     _describe(result) | {"replay": number if result.rollout else None}
                     for _, number, result in sorted(self._worst.values(), key=lambda one: one[:2])
@@ -138,17 +146,13 @@ class LiveRun:
 
 
 def _statistics(scores: Mapping[str, list[float]]) -> dict[str, Any]:
-    """Mean and 95 % interval x 100 of scores by recording, whose scenarios are not independent.
-
-    There is no interval of fewer than two recordings.
-    """
-    totals = np.array([sum(values) for values in scores.values()])
-    counts = np.array([len(values) for values in scores.values()])
-    mean, clusters, half = totals.sum() / counts.sum(), len(scores), None
-    if clusters > 1:
-        squares = float(np.square(totals - counts * mean).sum())
-        half = 100.0 * _Z95 * (squares * clusters / (clusters - 1)) ** 0.5 / float(counts.sum())
-    return {"done": int(counts.sum()), "mean": 100.0 * float(mean), "half": half}
+    """Mean and bootstrap interval x 100 of scores by recording, as a report has them."""
+    recordings = sorted(scores)
+    values = np.array([100.0 * score for name in recordings for score in scores[name]])
+    codes = np.repeat(np.arange(len(recordings)), [len(scores[name]) for name in recordings])
+    interval = bootstrap_interval(values, codes, draws=_DRAWS)
+    ends = [] if interval is None else [interval.low, interval.high]
+    return {"done": len(values), "mean": float(values.mean()), "interval": ends}
 
 
 def _describe(result: TaskResult) -> dict[str, Any]:

@@ -6,6 +6,13 @@ const secret = new URLSearchParams(location.search).get("token") || "";
 const ROUTE = "rgba(40, 140, 90, 0.38)";
 const CHANGED = "rgba(224, 138, 0, 0.45)";
 const EGO = "#0b62c4";
+const NUMBERS = { // results of the filter, in words
+  max_outside_m: (value) => `${value.toFixed(2)} m off the road`,
+  path_m: (value) => `${value.toFixed(1)} m path`,
+  progress_m: (value) => `${value.toFixed(1)} m along the route`,
+  first_violation_s: (value) => `first violation ${value.toFixed(1)} s`,
+  partner_token: (value) => `with ${value}`,
+};
 const CLICK = 4; // pixels a pointer may move between down and up to count as a click
 
 let listing, current, fields, scene, map, panel, blocks;
@@ -53,6 +60,24 @@ function chosen() {
   return listing.scenarios.filter((row) => WHICH[byId("which").value](row) || row.token === current);
 }
 
+// thumbnails are asked for when their line comes into view
+const pictures = new Map(); // answers by token
+const seen = new IntersectionObserver((entries) => {
+  for (const { target, isIntersecting } of entries) if (isIntersecting) fillBox(target);
+});
+
+async function fillBox(box) {
+  const { token } = box.dataset;
+  seen.unobserve(box);
+  if (!pictures.has(token)) pictures.set(token, ask(`/api/thumbnail?id=${encodeURIComponent(token)}`));
+  try {
+    const { scene: shared, view: window } = await pictures.get(token);
+    box.replaceChildren(thumbnail(shared, window));
+  } catch (error) {
+    box.title = `no picture: ${error.message}`;
+  }
+}
+
 function showList() {
   const count = (decision) => listing.scenarios.filter((row) => row.decision === decision).length;
   byId("counts").textContent =
@@ -61,9 +86,13 @@ function showList() {
   const lines = chosen().map((row) => {
     const line = document.createElement("li");
     line.classList.toggle("current", row.token === current);
-    const sign = document.createElement("span");
-    sign.textContent = { accept: "✓", reject: "✗", "": "" }[row.decision] + (row.route ? " ⤳" : "");
-    line.append(row.token, sign);
+    const sign = { accept: "✓", reject: "✗", "": "" }[row.decision] + (row.route ? " ⤳" : "");
+    const result = row.reason && `${row.verdict}: ${row.reason}`;
+    const about = [row.city, result].filter(Boolean).join(" · ");
+    const box = span("box");
+    box.dataset.token = row.token;
+    seen.observe(box);
+    line.append(box, span("token", row.token), span("sign", sign), span("about", about));
     line.title = `${row.city} · ${row.type} · filter: ${row.verdict} ${row.reason}`;
     line.addEventListener("click", () => open(row.token));
     return line;
@@ -95,9 +124,9 @@ async function open(token) {
   highlighted = -1;
   byId("token").textContent = token;
   byId("about").textContent = [found.meta.type, found.meta.city, found.meta.log].join(" · ");
-  const numbers = Object.entries(found.numbers).map(([name, value]) =>
-    `${name.replaceAll("_", " ")} ${typeof value === "number" ? value.toFixed(2) : value}`);
-  byId("verdict").textContent = `filter: ${found.verdict} ${found.reason} ${numbers.join(" · ")}`;
+  const numbers = Object.entries(found.numbers).map(([name, value]) => NUMBERS[name](value));
+  const result = [`filter: ${found.verdict}`, found.reason].filter(Boolean).join(", ");
+  byId("verdict").textContent = [result, ...numbers].join(" · ");
   Object.assign(open, { found });
   history.replaceState(null, "", `${location.pathname}${location.search}#${encodeURIComponent(token)}`);
   byId("time").max = duration();

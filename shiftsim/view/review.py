@@ -28,6 +28,7 @@ from shiftsim.view import scene
 from shiftsim.view.pack import Quantised, pack
 from shiftsim.view.page import framed
 from shiftsim.view.serving import LocalServer
+from shiftsim.view.thumbnails import thumbnails
 from shiftsim.world.scenario import Scenario
 
 MAX_COMMENT = 4000  # characters
@@ -97,6 +98,15 @@ class ReviewService:
             **self._state(token),
             **self._checked_route(recorded),
         }
+
+    def thumbnail(self, token: str) -> dict[str, Any]:
+        """The small picture of one scenario.
+
+        Raises:
+            DataError: The store has no such scenario.
+        """
+        recorded = self.store.read_recorded(token)
+        return thumbnails(recorded, {token: (recorded.expert[:, :2], None)})[token]
 
     def check_route(self, token: str, route: Any) -> dict[str, Any]:
         """A route with what is wrong with it.
@@ -187,6 +197,7 @@ def review_server(service: ReviewService, port: int = 0) -> LocalServer:
             "GET /": lambda values: page,
             "GET /api/scenarios": lambda values: service.listing(),
             "GET /api/scenario": lambda values: service.scenario(values.get("id", "")),
+            "GET /api/thumbnail": lambda values: service.thumbnail(values.get("id", "")),
             "POST /api/review": lambda body: service.keep(_token(body), body.get("values")),
             "POST /api/route": lambda body: service.check_route(_token(body), body.get("values")),
         },

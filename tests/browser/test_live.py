@@ -3,6 +3,7 @@
 from threading import Event, Thread
 
 import pytest
+from contrast import FAINT
 from stores import write_toy_store
 
 from shiftsim.data.store.reading import open_store
@@ -11,7 +12,7 @@ from shiftsim.runs.execute import execute
 from shiftsim.runs.prepare import prepare
 from shiftsim.view.live import LiveRun, LiveServer
 
-SIZES = [(1440, 900), (800, 600)]
+SIZES = [(1440, 900), (800, 600), (390, 844)]
 
 
 class Watched:
@@ -64,9 +65,23 @@ def test_progress_grows_and_the_last_state_stays(page, watched, size, tmp_path):
     page.wait("document.getElementById('count').textContent.startsWith('8 of 8')")
     watched.thread.join()
 
+    for mode in ("light", "dark"):
+        scheme = [{"name": "prefers-color-scheme", "value": mode}]
+        page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
+        assert page.run(FAINT) == []
+    page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
     page.shoot(tmp_path / "finished.png")
     assert "finished" in page.text("state")
     assert page.run("document.querySelectorAll('#scores tbody tr').length") == 2
+    assert page.run("document.querySelectorAll('#scores .planner svg').length") == 2
+    low, mean, high = page.run(
+        """(() => {
+          const row = document.querySelector("#scores tbody tr");
+          const [low, high] = row.cells[3].textContent.split(" – ").map(Number);
+          return [low, Number(row.cells[2].textContent), high];
+        })()"""
+    )
+    assert 0.0 <= low <= mean <= high <= 100.0
     assert page.run("document.documentElement.scrollWidth") <= size[0]
 
 

@@ -1,5 +1,4 @@
 import json
-import re
 from dataclasses import replace
 from itertools import pairwise
 
@@ -415,45 +414,3 @@ def test_a_notebook_frame_plays(page, folder, tmp_path):
 
     assert page.text("clock").startswith("1.00 s")
     page.browser.switch_to.default_content()
-
-
-class TestList:
-    @pytest.fixture
-    def listing(self, page, folder):
-        page.open((folder / "index.html").as_uri())
-        return page
-
-    @staticmethod
-    def column(page, number):
-        cells = f"#list tbody td:nth-child({number})"
-        return page.run(f"[...document.querySelectorAll({cells!r})].map((c) => c.textContent)")
-
-    def test_rows_are_sorted_by_a_click_on_the_heading(self, listing):
-        scores = [float(text) for text in self.column(listing, 7)]
-        assert scores == sorted(scores)
-
-        listing.browser.find_element("css selector", "th[data-key=cls]").click()
-
-        scores = [float(text) for text in self.column(listing, 7)]
-        assert scores == sorted(scores, reverse=True)
-
-    def test_rows_are_filtered(self, listing):
-        listing.browser.execute_script(
-            "const s = document.getElementById('planner'); s.value = 'log-future';"
-            "s.dispatchEvent(new Event('input'))"
-        )
-
-        assert set(self.column(listing, 4)) == {"log-future"}
-        said = " ".join(self.column(listing, 8))
-        assert "drivable area" in said or "collision" in said
-        assert not re.search(r"\b(NCR|DAC|EMP|DDC|PER|TTC|SLC|EIC)\b", said)
-        assert listing.text("count") == "4 of 8 rollouts"
-
-    def test_a_row_links_into_its_replay_at_the_violation(self, listing):
-        link = listing.browser.find_element("css selector", "#list tbody a")
-        assert "#t=" in link.get_attribute("href")
-
-        link.click()
-        listing.wait("document.documentElement.dataset.ready && window.replay")
-
-        assert now(listing) > 0

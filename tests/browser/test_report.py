@@ -1,14 +1,13 @@
 """Pages of a report: no table is cut off, the worst rollouts come first, and one can cite it."""
 
 import pytest
+from contrast import FAINT
 from made_runs import random_scores, write_run
-from pages import sections
 from stores import write_toy_store
 
 import shiftsim
 from shiftsim.cli import main
 from shiftsim.report.build import citation
-from shiftsim.view.build import list_page
 
 pytest.importorskip("matplotlib")
 SIZES = [(1440, 900), (800, 600)]
@@ -92,45 +91,104 @@ def test_headings_say_the_words_before_the_abbreviation(page, folder):
     assert " ".join(heads[3].split()) == "no at-fault collision NCR"
 
 
+def test_a_report_begins_with_ranking_sentences_and_robustness_and_has_contents(page, folder):
+    page.open((folder / "one" / "report.html").as_uri(), ready=LOADED)
+    above = page.run(
+        """[...document.querySelectorAll(".overview section")].map((section) => [
+          section.querySelector("h2").textContent,
+          section.querySelector("img, table").getBoundingClientRect().bottom])"""
+    )
+    assert [title.split()[0] for title, _ in above] == ["Ranking:", "Noise"]
+    assert max(bottom for _, bottom in above) <= SIZES[0][1]  # on the first screen
+    said = page.run("[...document.querySelectorAll('.finding')].map((p) => p.textContent)")
+    assert len(said) == 3
+    assert all(sentence.endswith(".") for sentence in said)
+    links = page.run("[...document.querySelectorAll('nav a')].map((link) => link.hash.slice(1))")
+    ids = page.run("[...document.querySelectorAll('.report section')].map((one) => one.id)")
+    assert sorted(links) == sorted(ids)
+
+
+def test_pairs_are_a_forest_plot_with_one_zero_line(page, folder):
+    page.open((folder / "one" / "report.html").as_uri(), ready=LOADED)
+    lines = page.run(
+        """[...document.querySelectorAll("#planner-comparison-noise tbody tr")].map((row) => {
+          const [zero, interval, mean] = row.querySelector("svg").children;
+          const at = (element) => element.getBoundingClientRect();
+          const [low, high] = [at(interval).left, at(interval).right];
+          const text = row.querySelector("svg").parentElement.textContent;
+          return [at(zero).left, low, at(mean).left + at(mean).width / 2, high, Number(text)];
+        })"""
+    )
+    assert len(lines) == 6
+    assert len({round(zero) for zero, *_ in lines}) == 1
+    for zero, low, mean, high, difference in lines:
+        assert low <= mean <= high
+        assert (mean > zero) == (difference > 0.0)
+    page.open((folder / "one" / "report.html").as_uri(), (390, 844), LOADED)
+    room = page.run(
+        """[...document.querySelectorAll("#planner-comparison td svg")].map((svg) => {
+          const text = document.createRange();
+          text.selectNodeContents(svg.parentElement.lastChild);
+          return text.getBoundingClientRect().left - svg.getBoundingClientRect().right;
+        })"""
+    )
+    assert min(room) > 0  # between the plot and the number, also on a phone
+    heads = page.run("document.querySelector('#planner-comparison thead svg').textContent")
+    assert "0" in heads
+
+
+def test_the_planner_stays_in_sight_while_a_wide_table_scrolls(page, folder):
+    page.open((folder / "one" / "report.html").as_uri(), (390, 844), LOADED)
+    left = page.run(
+        """(() => {
+          const box = document.querySelector("#scores .wide");
+          box.scrollLeft = 300;
+          const cell = box.querySelector("tbody td");
+          const place = (element) => element.getBoundingClientRect().left;
+          const ground = getComputedStyle(cell).backgroundColor;
+          return [cell.textContent, place(cell) - place(box), box.scrollLeft, ground];
+        })()"""
+    )
+    assert left[:3] == ["alpha", 0, 300]
+    assert left[3] != "rgba(0, 0, 0, 0)"  # what scrolls is hidden behind it
+    assert page.run("document.documentElement.scrollWidth") <= 390
+
+
+def test_the_best_of_each_setting_is_bold(page, folder):
+    page.open((folder / "one" / "report.html").as_uri(), ready=LOADED)
+    rows = page.run(
+        """[...document.querySelectorAll("#noise-robustness tbody tr")].map((row) =>
+          [...row.querySelectorAll(".n")].map((cell) =>
+            [parseFloat(cell.textContent), getComputedStyle(cell).fontWeight === "700"]))"""
+    )
+    for column in zip(*rows[:2], strict=True):  # the run's own, before the published ones
+        best = max(value for value, _ in column)
+        assert [is_bold for _, is_bold in column] == [value == best for value, _ in column]
+
+
+@pytest.mark.parametrize("name", ["one/report.html", "site/index.html"])
+@pytest.mark.parametrize("mode", ["light", "dark"])
+def test_a_report_can_be_read(page, folder, name, mode):
+    scheme = [{"name": "prefers-color-scheme", "value": mode}]
+    page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
+    page.open((folder / name).as_uri(), ready=LOADED)
+    assert page.run(FAINT) == []
+    page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+
+
+def test_printed_no_table_of_a_report_is_cut_off(page, folder):
+    page.open((folder / "site" / "index.html").as_uri(), ready=LOADED)
+    page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    boxes = "[...document.querySelectorAll('.report .wide')]"
+    assert set(page.run(f"{boxes}.map((box) => getComputedStyle(box).overflowX)")) == {"visible"}
+    page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
+
+
 def test_a_click_on_the_citation_selects_all_of_it(page, folder):
     page.open((folder / "one" / "report.html").as_uri(), ready=LOADED)
     page.browser.find_element("css selector", "pre").click()
     chosen = page.run("getSelection().toString()")
     assert chosen.strip() == citation([shiftsim.open_run(folder / "wide")])
-
-
-def test_the_list_begins_with_the_worst_and_leads_to_what_went_wrong(page, folder):
-    page.open((folder / "view" / "index.html").as_uri())
-    rows = "[...document.querySelectorAll('#worst tbody tr')].map((tr) => tr.innerText)"
-    found = page.run(rows)
-    scores = [float(row.split()[0]) for row in found]
-    assert scores == sorted(scores)
-    assert 1 <= len(found) <= 10
-    # of those that score 0 the farthest off the road: 0.38 m, before one of 0.36 m at 3.1 s
-    assert "drivable area 2.4\u00a0s" in found[0]
-    page.browser.find_element("css selector", "#worst a").click()
-    page.wait("document.documentElement.dataset.ready && location.hash.startsWith('#t=')")
-    first = sections((folder / "view" / "index.html").read_text("utf-8"))["rows"]
-    assert page.text("token").split()[0] in first
-
-
-def test_the_worst_are_in_words_and_without_markup_of_theirs(page, tmp_path):
-    row = {"token": "<b>x</b>", "type": "<i>", "city": "", "planner": "idm", "log": ""}
-    row |= {"noise": "ou-low", "seed": 3, "cls": 0.89, "failed": "", "at": 4.3}
-    row |= {"cause": "at-fault collision", "severity": (0.0, 0.0, -3.0)}
-    row |= {"violated": {"PER": None, "NCR": 4.3}, "page": "replay/x.html", "index": 1}
-    list_page("worst", [row, {**row, "token": "fine", "cls": 1.0}]).save(tmp_path / "index.html")
-
-    page.open((tmp_path / "index.html").as_uri())
-
-    cells = page.run("[...document.querySelectorAll('#worst td')].map((td) => td.textContent)")
-    wrong = "at-fault collision 4.3\u00a0s, little progress"
-    assert cells == ["89.00", "<b>x</b>", "<i>", "idm", "ou-low, seed 3", wrong, ""]
-    assert page.run("document.querySelector('#worst h2').textContent").startswith(
-        "The worst 1 of 2"
-    )
-    link = page.run("document.querySelector('#worst a').href")
-    assert link.endswith("replay/x.html#t=4.30&focus=2")
 
 
 def test_noise_is_dashed_and_hollow_in_a_replay_as_in_all_pictures(page, folder):

@@ -1,11 +1,13 @@
 import json
 
 import pytest
+from contrast import FAINT
 from review_servers import reviewing
 from stores import write_toy_store
 
 import shiftsim
 from shiftsim.data.store.tables import REVIEW
+from shiftsim.runs.filter import FilterConfig, filter_store
 
 SIZES = [(1440, 900), (800, 600)]
 FIRST, SECOND = "0000cafe", "0001cafe"
@@ -55,6 +57,35 @@ def test_the_page_loads_without_complaints_and_fits_the_window(page, server, siz
     assert page.run("document.documentElement.scrollWidth") <= size[0]
     assert page.run("document.documentElement.scrollHeight") <= size[1]
     page.shoot(tmp_path / "review.png")
+
+
+def test_the_list_has_thumbnail_city_and_why_the_filter_dropped_a_scenario(page, store):
+    filter_store(store, FilterConfig(min_path_m=16.0), workers=1)
+    with reviewing(store) as server:
+        page.open(server.address)
+        page.wait("document.querySelectorAll('nav svg.thumbnail').length === 2")
+
+        lines = page.run("[...document.querySelectorAll('nav li')].map((line) => line.innerText)")
+        faint = page.run(f"{FAINT}.filter((text) => !/ (recorded route|undo|[uo])$/.test(text))")
+        drawn = page.run("document.querySelector('nav .expert').getBoundingClientRect().width")
+
+    assert [line.split("\n")[0] for line in lines] == [FIRST, SECOND]
+    assert "straight" in lines[0]
+    assert "dropped: path too short" in lines[0]
+    assert drawn > 10
+    assert faint == []  # but for buttons that cannot be used now
+
+
+def test_on_a_phone_the_list_is_a_strip_above_the_scene(page, server):
+    page.open(server.address, (390, 844))
+
+    strip, stage = page.run(
+        "['list', 'stage'].map((id) => document.getElementById(id).getBoundingClientRect())"
+        ".map(({ top, bottom, width }) => ({ top, bottom, width }))"
+    )
+    assert page.run("document.documentElement.scrollWidth") <= 390
+    assert strip["bottom"] <= stage["top"] + 1
+    assert stage["width"] == page.run("document.documentElement.clientWidth")
 
 
 def test_a_decision_is_kept_at_once_and_leads_on(desk, store):

@@ -9,6 +9,7 @@ from stores import write_toy_store
 
 from shiftsim.cli import main
 from shiftsim.data.store.reading import open_store
+from shiftsim.report.statistics import bootstrap_interval
 from shiftsim.runs.config import make_config
 from shiftsim.runs.execute import Progress, execute
 from shiftsim.runs.prepare import prepare
@@ -43,23 +44,42 @@ def ask(server, path, method="GET", **headers):
     return answer.status, answer.read().decode()
 
 
-def test_the_interval_is_that_of_a_mean_of_recordings():
-    scores = [("a", 1.0), ("a", 0.8), ("b", 0.0), ("c", 0.5), ("c", 0.5), ("c", 0.9)]
+def test_the_interval_is_that_of_a_report_within_the_scale():
+    scores = [("b", 1.0), ("b", 1.0), ("a", 0.2), ("c", 1.0), ("c", 1.0), ("c", 0.9)]
     run = run_of(*[ended(i, score, name) for i, (name, score) in enumerate(scores)])
 
     (group,) = run.values()["groups"]
 
-    mean = np.mean([score for _, score in scores])
-    by_recording = [sum(s - mean for n, s in scores if n == name) for name in "abc"]
-    error = np.sqrt(3 * np.var(by_recording, ddof=1)) / 6
+    values = np.array([20.0, 100.0, 100.0, 100.0, 100.0, 90.0])  # recordings in order
+    found = bootstrap_interval(values, np.array([0, 1, 1, 2, 2, 2]), draws=1000)
     assert group["done"] == 6
-    assert group["mean"] == pytest.approx(100 * mean)
-    assert group["half"] == pytest.approx(100 * 1.96 * error)
+    assert group["mean"] == pytest.approx(values.mean())
+    assert group["interval"] == pytest.approx([found.low, found.high])
+    assert found.high <= 100.0
+    assert group["mean"] - found.low > 2.0 * (found.high - group["mean"])  # as it is skewed
 
 
 def test_one_recording_says_nothing_of_the_spread():
-    (group,) = run_of(ended(0, 0.5), ended(1, 0.7)).values()["groups"]
-    assert group["half"] is None
+    run = run_of(ended(0, 0.5), ended(1, 0.7))
+    assert run.values()["groups"][0]["interval"] == []
+
+    run.add(Progress(3, 10, 0, news=[ended(2, 0.9, "r1")]))
+
+    assert len(run.values()["groups"][0]["interval"]) == 2
+
+
+def test_planners_come_as_they_were_named_and_noise_from_none_to_high():
+    run = LiveRun("runs/x", 6, ["simple", "idm"], read=None)
+    names = ["ou-high", "mine:Noise", "ou-low", "none"]
+    tasks = [Task(planner, noise, 0, "t") for planner in ("idm", "simple") for noise in names]
+    scores = {"cls": 0.5, "traffic": "nonreactive", "log_name": "r0"}
+    news = [TaskResult(task, OK, scores=scores) for task in tasks]
+    run.add(Progress(len(news), 10, 0, news=news))
+
+    found = [(group["planner"], group["noise"]) for group in run.values()["groups"]]
+
+    order = ["none", "ou-low", "ou-high", "mine:Noise"]
+    assert found == [(planner, noise) for planner in ("simple", "idm") for noise in order]
 
 
 def test_the_worst_are_kept_in_order_with_the_reason():

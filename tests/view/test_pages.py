@@ -129,26 +129,13 @@ def test_texts_of_the_data_cannot_become_script(scenario):
 
 def test_the_list_escapes_what_it_shows():
     row = {"token": HOSTILE, "type": HOSTILE, "violated": {}, "page": page_name(HOSTILE)}
+    row |= {"planner": HOSTILE, "noise": HOSTILE, "cls": None}
 
-    page = list_page(HOSTILE, [row | {"cls": None}], shown=HOSTILE)
+    page = list_page(HOSTILE, [row], shown=HOSTILE)
 
     assert "<script>alert" not in page
-    assert page.count("<script") == 4  # rows, words of the metrics, the worst, the program
+    assert page.count("<script") == 4  # rows, words of the metrics, looks, the program
     assert json.loads(sections(page)["rows"])[0]["token"] == HOSTILE
-
-
-def test_the_worst_are_ten_scenarios_each_by_its_worst_rollout():
-    row = {"type": "", "planner": "idm", "noise": "ou-low", "seed": 3, "log": ""}
-    row |= {"cause": "at-fault collision", "severity": (0.0, 0.0, -3.0)}
-    rows = [{**row, "token": f"t{number}", "cls": 1.0 - number / 100.0} for number in range(12)]
-    rows += [{**rows[3], "cls": 0.975, "noise": "none"}]  # the better one of the same scenario
-    rows += [{**row, "token": "failed", "cls": None}]
-
-    def worst(rows):
-        return json.loads(sections(list_page("", rows))["worst"])
-
-    assert worst(rows) == [[number, 0] for number in range(11, 1, -1)]
-    assert worst(rows[:1]) == []
 
 
 def test_a_page_needs_nothing_from_elsewhere(scenario):
@@ -317,8 +304,8 @@ class TestGallery:
         assert "16 of 24 rollouts listed: only seed 1" in page
         assert "replays of 1 of 4 scenarios, the others with --limit 0" in page
         rows = json.loads(sections(page)["rows"])
-        worst = {rows[number]["token"] for number, _ in json.loads(sections(page)["worst"])}
-        assert worst == {row["token"] for row in rows if row["cls"] < 1.0}  # also without a page
+        assert len({row["token"] for row in rows}) == 4  # also without a page
+        assert {row["token"] for row in rows if "path" in row} == {gallery.tokens[0]}
 
     def test_a_folder_of_pages_links_every_rollout(self, gallery, tmp_path):
         count = write_site(tmp_path, [gallery], title="toy")

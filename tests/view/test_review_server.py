@@ -262,3 +262,15 @@ def test_a_malformed_address_is_answered(server, path):
 def test_a_request_without_a_length_is_answered(server):
     assert ask(server, "POST", "/api/review")[0] == 400
     assert ask(server, "POST", "/api/review", **{"Content-Length": "9" * 5000})[0] == 413
+
+
+def test_a_thumbnail_is_small_and_of_a_known_scenario(server):
+    status, text = ask(server, "GET", f"/api/thumbnail?id={FIRST}")
+    (road, expert), view = (json.loads(text)[name] for name in ("scene", "view"))
+
+    assert status == 200
+    assert len(text) < 500
+    assert road.endswith("z")
+    assert expert.startswith("M0 0l")  # from where the ego starts
+    assert view[2] > view[3] > 0
+    assert ask(server, "GET", "/api/thumbnail?id=unknown")[0] == 400
