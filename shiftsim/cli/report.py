@@ -33,6 +33,12 @@ Labels = Annotated[
         help="NAME=LABEL, or RUN/NAME=LABEL: what a planner is called; repeatable.",
     ),
 ]
+Width = Annotated[
+    str | None,
+    Option("--width", help="Of figures: 3.5in, 7in (columns of a paper), 89mm … [as they need]"),
+]
+Serif = Annotated[bool, Option("--serif", help="Figures with letters as in the text of a paper.")]
+Plain = Annotated[bool, Option("--plain", help="Figures without title and notes.")]
 RunFolder = Annotated[Path, Argument(metavar="RUN", help="A run folder, or that of a benchmark.")]
 
 
@@ -50,6 +56,9 @@ def report(
     by: str | None = Option(None, help="Scores per scenario_type, city or seed as well."),
     published: bool = Option(False, "--published", help="The paper's figures beside the own ones."),
     figures: bool = Option(False, "--figures", help="Pictures as well, into --out (RUN/report)."),
+    width: Width = None,
+    serif: Serif = False,
+    plain: Plain = False,
     worst: int = Option(5, help="Name the N worst scenarios."),
     labels: Labels = None,
     out: Path | None = Option(None, help="Write everything into this folder."),
@@ -65,9 +74,11 @@ def report(
     """Tables and pictures of one or several runs, or of a benchmark's folder."""
     from shiftsim.benchmarks.bench import open_runs
     from shiftsim.report.build import BRIEF, TABLES, Options
+    from shiftsim.report.palette import FigureFormat
     from shiftsim.report.scores import summary
     from shiftsim.report.tables import render
 
+    form = FigureFormat.of(width, serif=serif, plain=plain)
     opened = open_runs(folders, labels or ())
     if as_json:
         print_json([summary(run) for run in opened.runs])
@@ -76,7 +87,7 @@ def report(
         out = safe_join(folders[0], "report")
     title = f"Report on {', '.join(folder.resolve().name for folder in folders)}"
     options = Options(tuple(table or TABLES), by, published)
-    shared: dict[str, Any] = {"allow_partial": allow_partial, "title": title}
+    shared: dict[str, Any] = {"allow_partial": allow_partial, "title": title, "form": form}
     if out is not None:
         files = opened.report(out, options, style, pictures=figures, **shared)
         echo(f"{plural(len(files), 'file')} in {out}: {', '.join(path.name for path in files)}")

@@ -7,14 +7,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pictures import cut_off, overlaps, written
+from pictures import cut_off, overlaps, sizes_in_pdf, smallest, written
 from worlds import cruise_scenario, standing_tracks, straight_road
 
+from shiftsim.errors import ConfigError
 from shiftsim.planners.registry import load_planner
-from shiftsim.report.palette import ALARM, RECORDED, planner_styles
+from shiftsim.report.palette import ALARM, RECORDED, FigureFormat, planner_styles
 from shiftsim.sim.loop import simulate
 from shiftsim.view.scene import ShownRollout
-from shiftsim.view.still import grid, overview, save_figure, still
+from shiftsim.view.still import grid, overview, picture, save_figure, still
 from shiftsim.view.tracks import save_tracks_picture
 from shiftsim.world.state import AgentKind
 
@@ -174,6 +175,99 @@ def test_the_picture_of_tracks_says_where_it_draws_one_row_in_several(tmp_path, 
 
 def test_in_a_grid_words_stand_for_abbreviations_and_a_line_explains_marks(scenario, shown):
     words = [text for text, _ in written(grid(scenario, shown[:2], at=[0.0, 1.0, 2.0]))]
-    assert words.count("at-fault collision") == 3
+    assert words.count("at-fault collision") == 1  # from its moment on
     assert "NCR" not in words
     assert any("dotted: the recorded driver" in text for text in words)
+
+
+@pytest.mark.parametrize("width", ["3.5in", "7in", "89mm"])
+@pytest.mark.parametrize("at", [[1.0], [0.0, 1.0, 3.0]])
+def test_a_picture_of_a_paper_has_its_width_and_letters_that_can_be_read(
+    scenario, shown, tmp_path, width, at
+):
+    form = FigureFormat.of(width, serif=True, plain=True)
+
+    save_figure(tmp_path / "a.pdf", scenario, shown[:4], at=at, form=form)
+    drawn = picture(scenario, shown[:4], at=at, form=form)
+
+    sizes, found = sizes_in_pdf(tmp_path / "a.pdf")
+    assert found == pytest.approx(form.width, abs=0.01)
+    assert min(sizes) >= 7.0
+    assert smallest(drawn) >= 7.0
+    assert b"STIXGeneral" in (tmp_path / "a.pdf").read_bytes()
+    assert overlaps(drawn) == []
+    assert cut_off(drawn) == []
+
+
+def test_a_plain_picture_has_neither_title_nor_notes(scenario, shown):
+    for at in ([1.0], [0.0, 3.0]):
+        full = [text for text, _ in written(picture(scenario, shown[:2], at=at, note="so"))]
+        plain = [
+            text
+            for text, _ in written(
+                picture(scenario, shown[:2], at=at, note="so", form=FigureFormat.of(plain=True))
+            )
+        ]
+        assert any(scenario.token in text for text in full)
+        assert not any(scenario.token in text for text in plain)
+        assert "so" not in " ".join(plain).split()
+
+
+def test_a_grid_of_four_planners_fits_a_page(scenario, shown):
+    width, height = grid(scenario, shown[:4], at=[0.0, 2.0, 3.0]).get_size_inches()
+    assert width == 7.0
+    assert height <= 9.0
+
+
+def test_a_grid_shows_what_is_around_an_ego_that_drives_to_the_right(scenario, shown):
+    times = [0.0, 2.0, 3.0]
+    for axes, time in zip(grid(scenario, shown[:1], at=times).axes, times, strict=True):
+        assert axes.get_xlim() == (-25.0, 25.0)
+        path = next(line for line in axes.lines if line.get_linestyle() == "-")
+        assert path.get_xydata()[-1] == pytest.approx([0.0, 0.0], abs=1e-6)
+        assert (path.get_xdata() <= 1e-6).all()
+        assert len(path.get_xdata()) == round(time * 10) + 1
+
+
+def test_a_film_follows_the_ego_and_its_path_grows(scenario, shown, tmp_path, monkeypatch):
+    from matplotlib.animation import PillowWriter
+
+    seen, steps = [], []
+
+    def look(writer, **settings):
+        (axes,) = writer.fig.axes
+        path = next(x for x in axes.lines if x.get_linestyle() == "-")
+        seen.append((len(path.get_xdata()), np.mean(axes.get_xlim()) - path.get_xdata()[-1]))
+
+    monkeypatch.setattr(PillowWriter, "grab_frame", look)
+    monkeypatch.setattr(PillowWriter, "finish", lambda writer: steps.append(writer.fps))
+    reports = []
+    save_figure(
+        tmp_path / "a.gif",
+        scenario,
+        shown[:1],
+        speed=4.0,
+        on_progress=lambda done, total: reports.append((done, total)),
+    )
+    lengths, away = zip(*seen, strict=True)
+    assert lengths == tuple(range(1, 41, 2))  # every other sample
+    assert steps == [20.0]  # of them per second: four times as fast
+    assert np.abs(away).max() < 1e-6
+    assert reports[-1] == (40, 40)
+
+
+@pytest.mark.parametrize(("width", "inches"), [("3.5in", 3.5), (7, 7.0), ("253pt", 3.5007)])
+def test_a_width_is_a_length(width, inches):
+    assert FigureFormat.of(width).width == pytest.approx(inches, abs=1e-3)
+
+
+@pytest.mark.parametrize("width", ["wide", "3.5 miles", "0.1in", "99in", "1.2.3in", 0])
+def test_what_is_no_width_is_refused(width):
+    with pytest.raises(ConfigError, match="no width") as caught:
+        FigureFormat.of(width)
+    assert "3.5in" in caught.value.hint
+
+
+def test_a_speed_that_is_none_is_refused(scenario, shown, tmp_path):
+    with pytest.raises(ConfigError, match="speed"):
+        save_figure(tmp_path / "a.gif", scenario, shown[:1], speed=0.0)
