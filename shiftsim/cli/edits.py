@@ -5,10 +5,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Annotated
 
-from typer import Argument, Option, echo
+from typer import Argument, Option
 
 from shiftsim import cli
-from shiftsim.cli import Json, new_app, plural, print_result
+from shiftsim.cli import Json, echo, new_app, plural, print_result
 from shiftsim.errors import ConfigError, ShiftsimError, beginning, one_of
 from shiftsim.files import write_text
 

@@ -3,10 +3,11 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from typer import Argument, Exit, Option, echo
+import typer
+from typer import Argument, Exit, Option
 
 from shiftsim import cli
-from shiftsim.cli import Json, Quiet, plural, print_json, progress_bar
+from shiftsim.cli import Json, Quiet, echo, plural, print_json, progress_bar
 from shiftsim.files import safe_join
 
 if TYPE_CHECKING:
@@ -102,7 +103,9 @@ def report(
     options = Options(tuple(table or default), by, published)
     whole = not table and kind != "csv"
     tables = opened.tables(options, with_coverage=whole, allow_partial=allow_partial)
-    echo("\n\n".join(render(one, kind, width=cli.terminal_width()) for one in tables))
+    look: dict[str, Any] = {"width": cli.terminal_width(), "mark": cli.paint_best}
+    words = "\n\n".join(render(one, kind, **look) for one in tables)
+    (echo if kind == "text" else typer.echo)(words)  # files are not broken into lines
     for name in table:
         if not any(one.name.split("_")[0] == name for one in tables):
             echo(f"no table {name}: these runs hold nothing of it", err=True)
@@ -124,7 +127,9 @@ def print_worst(runs: "Sequence[Run]", count: int) -> None:
         for row in rows:
             where = f"{row['token']}  {task_words(row)}"
             others = f"  ({row['others']} more like it)" if row["others"] else ""
-            echo(f"  {100.0 * row['cls']:6.2f}  {where}  {row['reason']}{others}".rstrip())
+            score = f"{100.0 * row['cls']:6.2f}"
+            score = score if row["cls"] else cli.paint(score, "red")
+            echo(f"  {score}  {where}  {row['reason']}{others}".rstrip())
 
 
 def explain(

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer import Argument, Option, echo
+from typer import Argument, Option
 
 from shiftsim import cli
-from shiftsim.cli import Json, Quiet, new_app, plural, print_json, print_result, progress_bar
+from shiftsim.cli import Json, Quiet, echo, new_app, plural, print_json, print_result, progress_bar
 from shiftsim.cli.report import Plain, Serif, Width
 from shiftsim.errors import one_of
 from shiftsim.files import store_path
@@ -291,7 +291,7 @@ def show_stats(
         out.write_text(text + "\n", "utf-8")
         echo(f"written: {out}")
     else:
-        echo(text)
+        (echo if style == "text" else typer.echo)(text)
         if left_out := len(opened) - len(tokens):
             echo(f" {plural(left_out, 'scenario')} of the store left out")
     if figure is not None:

@@ -5,10 +5,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from typer import Argument, Option, echo
+from typer import Argument, Option
 
 from shiftsim import cli
-from shiftsim.cli import Json, Quiet, new_app, print_result
+from shiftsim.cli import Json, Quiet, echo, new_app, print_result
 from shiftsim.train.folder import BEST, Settings, TrafficSettings
 
 app = new_app("Train networks.")

@@ -4,10 +4,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from typer import Argument, Option, echo
+from typer import Argument, Option
 
 from shiftsim import cli
-from shiftsim.cli import Quiet, plural, progress_bar, show_in_browser
+from shiftsim.cli import Quiet, echo, plural, progress_bar, show_in_browser
 from shiftsim.cli.report import Labels, Plain, RunFolder, Serif, Width
 from shiftsim.errors import ConfigError
 from shiftsim.files import safe_join
