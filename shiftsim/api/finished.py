@@ -152,13 +152,13 @@ class Run(results.Run):
         from shiftsim.report.palette import FigureFormat
         from shiftsim.view.still import picture
 
-        form = FigureFormat.of(width, serif=serif, plain=plain)
         gallery = self._gallery(**chosen)
         found = gallery.find(token)
         scenario = gallery.store.read(found)
-        shown, note = gallery.shown(found, scenario), gallery.shown_words(found)
+        form = FigureFormat.of(width, serif=serif, plain=plain)
+        form = form._replace(note=gallery.shown_words(found))
         times = [at] if isinstance(at, (int, float)) else list(at)
-        return picture(scenario, shown, at=times, in_grid=grid, note=note, form=form)
+        return picture(scenario, gallery.shown(found, scenario), at=times, in_grid=grid, form=form)
 
     def plot_open_against_closed(self, *others: results.Run, **form: Any) -> Any:
         """Open-loop scores and errors against closed-loop scores, as a matplotlib figure.

@@ -22,6 +22,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, redi
 from dataclasses import MISSING, fields
 from functools import cache, wraps
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Annotated, Any, TextIO, TypeAlias, get_args, get_origin
@@ -280,44 +281,36 @@ def planner_arguments(
 USAGE, DATA, UNFINISHED, INTERRUPTED = 1, 2, 3, 130
 # of whichever click typer was built on
 _ClickError: Any = typer.BadParameter.__mro__[2]
-# what for -> command -> where it is: a function, or further commands; imported when it is used
-_GROUPS = {
-    "Run": {
-        "demo": "run:demo",
-        "run": "run:run",
-        "bench": "bench:bench",
-        "score": "run:score",
-        "merge": "run:merge",
-        "bundle": "run:bundle",
-        "planners": "planners:app",
-        "doctor": "doctor:doctor",
-        "verify": "doctor:verify",
-    },
-    "Look": {
-        "report": "report:report",
-        "explain": "report:explain",
-        "view": "view:view",
-        "plot": "view:plot",
-        "diff": "report:diff",
-    },
-    "Data": {
-        "data": "bench:data",
-        "convert": "convert:app",
-        "check": "store:check",
-        "stats": "store:show_stats",
-        "filter": "store:filter_scenarios",
-        "inspect": "view:inspect",
-        "split": "store:make_split",
-        "edits": "edits:app",
-        "export": "store:export",
-    },
-    "Train": {
-        "train": "training:app",
-        "checkpoint": "planners:checkpoint",
-        "realism": "training:realism",
-    },
+# command -> where it is: a function, or further commands; imported when it is used
+_COMMANDS = {
+    "demo": "run:demo",
+    "run": "run:run",
+    "bench": "bench:bench",
+    "score": "run:score",
+    "merge": "run:merge",
+    "bundle": "run:bundle",
+    "planners": "planners:app",
+    "doctor": "doctor:doctor",
+    "verify": "doctor:verify",
+    "report": "report:report",
+    "explain": "report:explain",
+    "view": "view:view",
+    "plot": "view:plot",
+    "diff": "report:diff",
+    "data": "bench:data",
+    "convert": "convert:app",
+    "check": "store:check",
+    "stats": "store:show_stats",
+    "filter": "store:filter_scenarios",
+    "inspect": "view:inspect",
+    "split": "store:make_split",
+    "edits": "edits:app",
+    "export": "store:export",
+    "train": "training:app",
+    "checkpoint": "planners:checkpoint",
+    "realism": "training:realism",
 }
-_COMMANDS = {name: where for group in _GROUPS.values() for name, where in group.items()}
+_GROUPS = {"Run": "demo", "Look": "report", "Data": "data", "Train": "train"}  # by their first
 
 
 class Interrupted(Exception):
@@ -343,10 +336,12 @@ class _Commands(typer.core.TyperGroup):
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """The commands by what they are for."""
-        for group, commands in _GROUPS.items():
+        names = list(_COMMANDS)
+        starts = [*map(names.index, _GROUPS.values()), len(names)]
+        for group, (first, end) in zip(_GROUPS, pairwise(starts), strict=True):
+            words = [(name, _command(name).get_short_help_str(200)) for name in names[first:end]]
             with formatter.section(group):
-                words = {name: _command(name).get_short_help_str(200) for name in commands}
-                formatter.write_dl([*words.items()])
+                formatter.write_dl(words)
 
 
 @cache

@@ -267,8 +267,8 @@ def show_stats(
     """Scenarios, agents, speeds, lengths and interactions, per city and in all."""
     from shiftsim.benchmarks import published
     from shiftsim.data.store.statistics import store_stats
-    from shiftsim.report.dataset import draw_stats, stats_dict, stats_table
-    from shiftsim.report.palette import FigureFormat
+    from shiftsim.report.dataset import stats_dict, stats_figure, stats_table
+    from shiftsim.report.palette import FigureFormat, save_picture
 
     one_of("column", by, ("city", "type"))
     opened = cli.open_store(store)
@@ -283,7 +283,7 @@ def show_stats(
         name = opened.path.resolve().name
         title = f"{name}: {plural(len(tokens), 'scenario')}"
         form = FigureFormat.of(width, serif=serif, plain=plain)
-        draw_stats(found, figure, published(), title=title, form=form)
+        save_picture(stats_figure(found, published(), title=title, form=form), figure)
     if as_json:
         print_json(stats_dict(found, published()))
         return

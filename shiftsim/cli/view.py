@@ -111,8 +111,8 @@ def plot(
     gallery, token = _holding(found, token)
     scenario = gallery.store.read(token)
     shown = gallery.shown(token, scenario)
-    note = gallery.shown_words(token)
-    how: dict[str, Any] = {"at": _times(at), "in_grid": grid, "note": note, "form": form}
+    form = form._replace(note=gallery.shown_words(token))
+    how: dict[str, Any] = {"at": _times(at), "in_grid": grid, "form": form}
     with progress_bar(quiet=quiet or out.suffix.lower() not in FILMS) as advance:
         save_figure(out, scenario, shown, **how, speed=speed, on_progress=advance)
     _say_shown(gallery, token, "--planner, --noise and --seed choose others")

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from pathlib import Path
 from typing import Any, TypeAlias
 
 from shiftsim.data.store.statistics import (
@@ -12,19 +11,10 @@ from shiftsim.data.store.statistics import (
     StoreStats,
     store_stats,
 )
-from shiftsim.errors import ConfigError, DataError, one_of
+from shiftsim.errors import DataError, one_of
+from shiftsim.report import palette
 from shiftsim.report.groups import DataSet, Group, distinct_sets
-from shiftsim.report.palette import (
-    AGENTS,
-    DEFAULT_FORM,
-    PAGE,
-    SMALL,
-    TEXT,
-    FigureFormat,
-    in_format,
-    new_figure,
-    save_picture,
-)
+from shiftsim.report.palette import DEFAULT_FORM, SMALL, FigureFormat
 from shiftsim.report.paper import Published
 from shiftsim.report.tables import Number, Record, Row, Table, render
 from shiftsim.runs.results import Run
@@ -53,7 +43,7 @@ _NOTE = (
     "means per scenario; t0: present at iteration 0, else at any iteration; close agents: "
     "mean number near the ego's path within 3 s; at intersections: share of the scenarios; m, m/s"
 )
-_COLOURS = {f"{kind.name.lower()}s": colour for kind, colour in AGENTS.items()}
+_COLOURS = {f"{kind.name.lower()}s": colour for kind, colour in palette.AGENTS.items()}
 _OWN: dict[str, Any] = {"color": "#4a5560"}
 _PUBLISHED: dict[str, Any] = {"facecolor": "white", "edgecolor": "#4a5560", "hatch": "////"}
 _LINE, _SETS_HEIGHT = 0.4, 1.3  # inches: a city, the published sets
@@ -105,42 +95,21 @@ def stats_dict(stats: StoreStats, published: Published) -> dict[str, object]:
     }
 
 
-def draw_stats(
-    stats: StoreStats,
-    path: Path,
-    published: Published,
-    *,
-    title: str,
-    form: FigureFormat = DEFAULT_FORM,
-) -> None:
-    """Draw the store beside the published sets, and its cities; the path's ending is the format.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-        ConfigError: The ending is none that can be drawn.
-    """
-    figure = stats_figure(stats, published, title=title, form=form)
-    try:
-        save_picture(figure, path)
-    except ValueError as error:
-        raise ConfigError(f"{path}: {error}", hint="use .png, .svg or .pdf") from error
-
-
-@in_format
+@palette.in_format
 def stats_figure(
     stats: StoreStats, published: Published, *, title: str, form: FigureFormat = DEFAULT_FORM
 ) -> Any:
-    """The picture of `draw_stats` as a matplotlib figure; all bars lie, so that names have room.
+    """The store beside the published sets, and its cities; all bars lie, so that names have room.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
     """
     groups = stats.groups("city")
     means, cities = [*groups.values()], [name for name in groups if name != ALL]
-    width = form.width or PAGE
+    width = form.width or palette.PAGE
     across = 4 if width > _WIDE else 2
     height = (_LINE * len(groups) + 0.8) * (4 // across)
-    figure = new_figure(figsize=(width, _SETS_HEIGHT + height + 0.3))
+    figure = palette.new_figure(figsize=(width, _SETS_HEIGHT + height + 0.3))
     upper, lower = figure.subfigures(2, 1, height_ratios=(_SETS_HEIGHT, height))
     sets = upper.subplots()
     whole: list[_Bars] = [[(number, _PUBLISHED)] for number in PUBLISHED_SETS.values()]
@@ -175,7 +144,7 @@ def stats_figure(
     panels[0].set_yticks(range(len(groups)), [*groups])
     panels[0].invert_yaxis()
     if not form.plain:
-        figure.suptitle(title, fontsize=TEXT)
+        figure.suptitle(title, fontsize=palette.TEXT)
     return figure
 
 

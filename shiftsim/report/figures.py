@@ -5,7 +5,7 @@ those under noise hollow marks on dashed lines. Nothing is drawn of groups whose
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -19,23 +19,10 @@ from shiftsim.edits.sampling import GRADES, graded
 from shiftsim.errors import ConfigError
 from shiftsim.kernels import BoolArray, FloatArray
 from shiftsim.metrics import open_loop
+from shiftsim.report import palette
 from shiftsim.report.details import has_open_loop, open_loop_values, recorded_score
 from shiftsim.report.groups import COLUMNS, DataSet, Group, by_set
-from shiftsim.report.palette import (
-    COLUMN,
-    DEFAULT_FORM,
-    PAGE,
-    SMALL,
-    TEXT,
-    FigureFormat,
-    Style,
-    characters,
-    dashes,
-    in_format,
-    new_figure,
-    planner_styles,
-    save_picture,
-)
+from shiftsim.report.palette import DEFAULT_FORM, SMALL, TEXT, FigureFormat, Style, dashes
 from shiftsim.report.statistics import rank_correlation, score_interval
 from shiftsim.report.tables import Interval, Number
 from shiftsim.report.words import LONG
@@ -51,7 +38,7 @@ _RHO = "ρ: Spearman's rank correlation, of scenarios by planner, and of the pla
 _HEIGHT, _AROUND = 1.9, 0.6  # inches, of a panel and of the words above and below it
 _HIGHEST = 8.0  # inches, of all panels
 _BESIDE = 0.5  # inches, beside a panel: the labels of its axis
-_LONGEST = 18  # characters of a name at the end of a line
+_LONGEST = 18  # palette.characters of a name at the end of a line
 _WIDE = 5.0  # inches; what is wider needs both columns of a paper, and has panels side by side
 _NONE: Mapping[str, str] = MappingProxyType({})
 _BARS = "bars: 95 % bootstrap interval over recordings"
@@ -73,7 +60,7 @@ class Figure:
     def save(self, folder: Path, ending: str = "png") -> Path:
         """Write the picture and return where it is; the same picture gives the same bytes."""
         path = folder / f"{self.name}.{ending}"
-        save_picture(self.drawn, path)
+        palette.save_picture(self.drawn, path)
         return path
 
 
@@ -93,20 +80,25 @@ class _End(NamedTuple):
     colour: str
 
 
-@in_format
+@palette.in_format
 def figures(groups: Sequence[Group], *, form: FigureFormat = DEFAULT_FORM) -> list[Figure]:
     """All pictures that the groups allow.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
     """
-    out = []
-    styles = planner_styles(dict.fromkeys(group.planner for group in groups))
+    out: list[Figure] = []
+    styles = palette.planner_styles(dict.fromkeys(group.planner for group in groups))
     names: list[str] = []
     for data, mine in by_set(groups):
         # sets of one name are numbered, as it becomes that of a file
         name = f"{data.name}-{len(names) + 1}" if data.name in names else data.name
         names.append(data.name)
+
+        def add(kind: str, title: str, drawn: Any, note: str, name: str = name, **how: Any) -> None:
+            _finish(drawn, title, note, form, **how)
+            out.append(Figure(f"{kind}_{name}", title, drawn))
+
         shown = [group for group in mine if group.estimate().value is not None]
         clean = [group for group in shown if group.noise == "none"]
         found = {group.noise.partition("-")[0] for group in shown}
@@ -116,8 +108,8 @@ def figures(groups: Sequence[Group], *, form: FigureFormat = DEFAULT_FORM) -> li
             bars = f"bars: standard deviation over seeds; without several, {_BARS.split(': ')[1]}"
             note = f"n = {len(data.tokens)} scenarios; {bars}; thin line: the clean score"
             samples = {"clean": "none", "under noise": "some"}
-            _finish(drawn, data, "Noise robustness", note, form, samples)
-            out.append(Figure(f"robustness_{name}", f"Noise robustness on {data.label}", drawn))
+            title = f"Noise robustness on {data.label}"
+            add("robustness", title, drawn, f"{data.rules}\n{note}", samples=samples)
         if not clean:
             continue
         every = np.ones(len(data.tokens), np.bool_)
@@ -125,30 +117,25 @@ def figures(groups: Sequence[Group], *, form: FigureFormat = DEFAULT_FORM) -> li
             labels = ("difficulty of the edit", "closed-loop score")
             kinds = _difficulties(data, groups)
             drawn = _scores(clean, kinds, styles, form, noise="none", labels=labels)
-            note = f"recorded: the same scenarios without the edit; {_BARS}"
-            _finish(drawn, data, "Edits", note, form)
-            title = f"Scores by difficulty of the edits: {data.label}"
-            out.append(Figure(f"edits_{name}", title, drawn))
+            note = f"{data.rules}\nrecorded: the same scenarios without the edit; {_BARS}"
+            add("edits", f"Scores by difficulty of the edits: {data.label}", drawn, note)
+        note = f"{data.rules}\nclean rollouts; {_BARS}"
         parts = {city: data.within(city) for city in sorted({*data.cities} - {""})}
         if len(parts) > 1:
             places = [_place(f"all\n({len(every)})", every)]
             for city, where in parts.items():
                 places.append(_place(f"{city}\n({data.cities.count(city)})", where))
             drawn = _scores(clean, {"": places}, styles, form)
-            note = f"clean rollouts; {_BARS} (none for a single recording)"
-            _finish(drawn, data, "Score per city", note, form)
-            out.append(Figure(f"cities_{name}", f"Score per city of {data.label}", drawn))
+            lone = f"{note} (none for a single recording)"
+            add("cities", f"Score per city of {data.label}", drawn, lone)
         is_narrow = 0.0 < form.width < _WIDE  # where there is room for abbreviations only
-        places = [
-            _place(short if is_narrow else _in_lines(short), every, column)
-            for column, short in COLUMNS.items()
-        ]
+        headings = {short: short if is_narrow else _in_lines(short) for short in COLUMNS.values()}
+        places = [_place(headings[short], every, column) for column, short in COLUMNS.items()]
         drawn = _scores(clean, {"": places}, styles, form, labels=("", "score"))
-        _finish(drawn, data, "Metrics", f"clean rollouts; {_BARS}", form)
-        out.append(Figure(f"metrics_{name}", f"Metrics on {data.label}", drawn))
-    if any(map(has_open_loop, groups)):
-        out.append(open_against_closed(groups, form=form))
-    return out
+        add("metrics", f"Metrics on {data.label}", drawn, note)
+    return (
+        [*out, open_against_closed(groups, form=form)] if any(map(has_open_loop, groups)) else out
+    )
 
 
 def _in_lines(short: str) -> str:
@@ -156,7 +143,7 @@ def _in_lines(short: str) -> str:
     return "\n".join([*wrap(LONG[short], 12), f"({short})"])
 
 
-@in_format
+@palette.in_format
 def open_against_closed(groups: Sequence[Group], *, form: FigureFormat = DEFAULT_FORM) -> Figure:
     """Open loop against closed loop: a mark per planner and scenario, clean where there is that.
 
@@ -170,7 +157,7 @@ def open_against_closed(groups: Sequence[Group], *, form: FigureFormat = DEFAULT
     if not asked:
         raise ConfigError("no open-loop scores", hint="shiftsim run --open-loop makes them")
     shown = [group for group in asked if group.noise == "none"] or asked
-    styles = planner_styles(dict.fromkeys(group.planner for group in shown))
+    styles = palette.planner_styles(dict.fromkeys(group.planner for group in shown))
     ade = next(name for name, (short, *_) in open_loop.METRICS.items() if short == "ADE")
     kinds = {"open-loop score × 100": (open_loop.TOTAL, 100.0), _ADE: (ade, 1.0)}
     rows = list(dict.fromkeys(group.traffic for group in shown))
@@ -188,12 +175,9 @@ def open_against_closed(groups: Sequence[Group], *, form: FigureFormat = DEFAULT
         axes.legend(fontsize=SMALL, framealpha=0.8)
     labels = ", ".join(dict.fromkeys(group.data.label for group in shown))
     rules = dict.fromkeys(group.data.rules for group in shown)
-    width, notes = figure.get_figwidth(), () if form.plain else (*rules, _RHO)
-    if not form.plain:
-        words = wrap(f"Open loop against closed loop: {labels}", characters(width, TEXT))
-        figure.suptitle("\n".join(words), fontsize=TEXT)
-    _add_words(figure, notes, 0.2)
-    return Figure("open-against-closed", f"Open loop against closed loop on {labels}", figure)
+    title = f"Open loop against closed loop on {labels}"
+    _add_words(figure, title, "\n".join((*rules, _RHO)), form)
+    return Figure("open-against-closed", title, figure)
 
 
 def _scatter(
@@ -319,7 +303,7 @@ def _set_headings(axes: Any, headings: Sequence[str]) -> None:
     """Name the places on an axis, aslant where they would not fit else."""
     width = axes.figure.get_figwidth() / axes.get_subplotspec().get_gridspec().ncols - _BESIDE
     longest = max(len(line) for heading in headings for line in heading.splitlines())
-    if longest <= characters(width / len(headings)):
+    if longest <= palette.characters(width / len(headings)):
         axes.set_xticks(range(len(headings)), headings)
         return
     words = [heading.replace("\n", " ") for heading in headings]
@@ -398,10 +382,10 @@ def _panels(
     One that is not wide has all panels below each other. What `is_small` needs one column of a
     paper, if it is a single panel.
     """
-    width = form.width or (COLUMN if is_small and len(columns) == 1 else PAGE)
+    width = form.width or (palette.COLUMN if is_small and len(columns) == 1 else palette.PAGE)
     across = len(columns) if width > _WIDE else 1
     down = len(rows) * len(columns) // across
-    figure = new_figure(figsize=(width, min((_HEIGHT + _AROUND) * down, _HIGHEST)))
+    figure = palette.new_figure(figsize=(width, min((_HEIGHT + _AROUND) * down, _HIGHEST)))
     sharex: Any = "col" if across == len(columns) else False
     axes = figure.subplots(down, across, squeeze=False, sharex=sharex, sharey=True)
     names = product(rows, columns)
@@ -428,9 +412,8 @@ def _sample(noise: str) -> Any:
 
 def _finish(
     figure: Any,
-    data: DataSet,
     title: str,
-    note: str,
+    notes: str,
     form: FigureFormat,
     samples: Mapping[str, str] = _NONE,
 ) -> None:
@@ -438,29 +421,34 @@ def _finish(
     handles, labels = figure.axes[0].get_legend_handles_labels()
     handles += [*map(_sample, samples.values())]
     labels += samples
-    look = {"loc": "outside upper center", "frameon": False, "fontsize": SMALL}
-    if not form.plain:
-        length = characters(figure.get_figwidth(), TEXT)
-        look["title"] = "\n".join(wrap(f"{title}: {data.label}", length))
+    look = {"loc": "outside upper center", "frameon": False, "fontsize": SMALL, "handlelength": 3.2}
     for columns in range(min(4, max(1, len(labels))), 0, -1):  # as many as fit
-        legend = figure.legend(
-            handles, labels, ncols=columns, title_fontsize=TEXT, handlelength=3.2, **look
-        )
+        legend = figure.legend(handles, labels, ncols=columns, **look)
         box = legend.get_window_extent(figure.canvas.get_renderer())
         if box.width <= figure.bbox.width or columns == 1:
             break
         legend.remove()
-    _add_words(figure, () if form.plain else (data.rules, note), box.height / figure.dpi)
+    _add_words(figure, title, notes, form, legend)
 
 
-def _add_words(figure: Any, notes: Iterable[str], above: float) -> None:
-    """Notes below a figure, which grows by their height and by what is `above` [inch]."""
+def _add_words(figure: Any, title: str, notes: str, form: FigureFormat, legend: Any = None) -> None:
+    """Title and notes around a figure, which grows by their height and by that of its legend."""
     for axes in figure.axes:
         if len(axes.get_shared_x_axes().get_siblings(axes)) > 1:
             axes.label_outer()
-    length = characters(figure.get_figwidth())
-    lines = [line for note in notes for line in wrap(note, length)]
-    figure.supxlabel("\n".join(lines), fontsize=SMALL, color=_GREY)
-    below = 1.25 * SMALL / 72.0 * len(lines)
-    figure.set_figheight(figure.get_figheight() + above + below)
+    width, lines = figure.get_figwidth(), 0
+    if not form.plain:
+        wrapped = [
+            line for note in notes.splitlines() for line in wrap(note, palette.characters(width))
+        ]
+        figure.supxlabel("\n".join(wrapped), fontsize=SMALL, color=_GREY)
+        words = wrap(title, palette.characters(width, TEXT))
+        lines = len(wrapped) + 1 + len(words)
+        if legend:
+            legend.set_title("\n".join(words), {"size": TEXT})
+        else:
+            figure.suptitle("\n".join(words), fontsize=TEXT)
+    box = legend.get_window_extent(figure.canvas.get_renderer()) if legend else None
+    above = box.height / figure.dpi if box else 0.0
+    figure.set_figheight(figure.get_figheight() + above + 1.25 * SMALL / 72.0 * lines)
     figure.draw_without_rendering()

@@ -34,6 +34,7 @@ class FigureFormat(NamedTuple):
     width: float = 0.0  # inches; 0 for the figure's own
     serif: bool = False  # letters as in the text of a paper
     plain: bool = False  # without title and notes, which a caption says
+    note: str = ""  # what a figure of a scenario leaves out
 
     @classmethod
     def of(
@@ -44,11 +45,8 @@ class FigureFormat(NamedTuple):
         Raises:
             ConfigError: The width is no length between 2 and 40 inches.
         """
-        found = re.fullmatch(r"([\d.]+) ?(in|cm|mm|pt|)", str(width or "0"))
-        try:
-            inches = float(found[1]) * _INCHES[found[2]] if found else -1.0
-        except ValueError:
-            inches = -1.0
+        found = re.fullmatch(r"(\d+\.?\d*) ?(in|cm|mm|pt|)", str(width or 0))
+        inches = float(found[1]) * _INCHES[found[2]] if found else 0.0
         if width is not None and not 2.0 <= inches <= 40.0:
             raise ConfigError(f"{width!r} is no width of a figure", "--width 3.5in, 7in, 89mm …")
         return cls(inches, serif, plain)
@@ -101,8 +99,14 @@ def characters(width: float, size: float = SMALL) -> int:
 
 
 def save_picture(figure: Any, path: Path) -> None:
-    """Write a figure without time stamps: the same picture has the same bytes."""
+    """Write a figure without time stamps: the same picture has the same bytes.
+
+    Raises:
+        ConfigError: The ending is none that can be drawn.
+    """
     kind = path.suffix.lower()
+    if kind[1:] not in figure.canvas.get_supported_filetypes():
+        raise ConfigError(f"{path}: no picture ends in {kind!r}", hint="use .png, .svg or .pdf")
     with atomic_write(path) as partial:
         figure.savefig(partial, dpi=_DPI, format=kind[1:] or None, metadata=_PLAIN.get(kind))
 

@@ -15,19 +15,8 @@ import numpy as np
 from shiftsim.errors import ConfigError, MissingExtraError
 from shiftsim.geometry.boxes import to_frame
 from shiftsim.kernels import FloatArray
-from shiftsim.report.palette import (
-    DEFAULT_FORM,
-    PAGE,
-    SMALL,
-    TEXT,
-    FigureFormat,
-    Style,
-    characters,
-    in_format,
-    new_figure,
-    planner_styles,
-    save_picture,
-)
+from shiftsim.report import palette
+from shiftsim.report.palette import DEFAULT_FORM, SMALL, TEXT, FigureFormat, Style, characters
 from shiftsim.view import drawing
 from shiftsim.view.drawing import View
 from shiftsim.view.scene import Replay, ShownRollout, box_around
@@ -54,15 +43,11 @@ def save_figure(
     *,
     at: Sequence[float] = (0.0,),
     in_grid: bool = False,
-    note: str = "",
     form: FigureFormat = DEFAULT_FORM,
     speed: float = 1.0,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
-    """A still `at` seconds from the start, or a film of it all, by the ending of the file's name.
-
-    Several times, or `in_grid`, give a figure with a row per rollout and a column per time. `note`
-    says below the picture what it leaves out. A film is as much faster than time as `speed` says.
+    """A picture, or a film of all samples that is so much faster, by the ending of the file's name.
 
     Raises:
         ConfigError: The ending, a time or the speed is none of those possible.
@@ -77,109 +62,74 @@ def save_figure(
         raise ConfigError(f"speed {speed:g} is not within 0.1 … 100", hint="--speed 2")
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix.lower() in FILMS:
-        _film(path, scenario, shown, note, form=form, speed=speed, on_progress=on_progress)
+        _film(path, scenario, shown, form=form, speed=speed, on_progress=on_progress)
     else:
-        save_picture(picture(scenario, shown, at=at, in_grid=in_grid, note=note, form=form), path)
+        drawn = picture(scenario, shown, at=at, in_grid=in_grid, form=form)
+        palette.save_picture(drawn, path)
 
 
+@palette.in_format
 def picture(
     scenario: Scenario,
-    shown: Sequence[ShownRollout],
+    shown: Sequence[ShownRollout] = (),
     *,
     at: Sequence[float] = (0.0,),
     in_grid: bool = False,
-    note: str = "",
     form: FigureFormat = DEFAULT_FORM,
 ) -> Any:
-    """A still as a matplotlib figure, or, at several times or `in_grid`, a grid.
+    """A matplotlib figure of moments [s from the start]: as recorded if no rollout is shown.
+
+    One moment is a still, whose axes are those of the map. Several, or `in_grid`, give a row per
+    rollout and a column per moment: every panel shows the surroundings of its ego, which drives to
+    the right, with its path so far.
 
     Raises:
         ConfigError: There is no such time.
         MissingExtraError: matplotlib is missing.
     """
     if in_grid or len(at) > 1:
-        return grid(scenario, shown, at=at, note=note, form=form)
-    return still(scenario, shown, at=at[0], note=note, form=form)
-
-
-@in_format
-def still(
-    scenario: Scenario,
-    shown: Sequence[ShownRollout] = (),
-    *,
-    at: float = 0.0,
-    note: str = "",
-    form: FigureFormat = DEFAULT_FORM,
-) -> Any:
-    """A matplotlib figure of the moment `at` seconds from the start, as recorded if none is shown.
-
-    Its axes are those of the map.
-
-    Raises:
-        ConfigError: There is no such time.
-        MissingExtraError: matplotlib is missing.
-    """
-    row, styles = _sample_at(scenario, shown, at), _styles(shown)
+        return _grid(scenario, shown, at, form)
     view = View(np.zeros(3), _extent(Replay(scenario, shown).paths))
-    figure, (axes,) = _panels(1, view, form)
-    drawing.draw_map(axes, scenario.map, scenario.route, view)
-    drawing.draw_paths(axes, scenario, shown, styles, view)
-    marks = _finish(figure, axes, scenario, shown, view, note, form)
-    drawing.draw_moment(axes, scenario, shown, styles, row, view)
-    if not form.plain:
-        _heading(axes, scenario, at)
+    row = _sample_at(scenario, shown, at[0])
+    figure, axes, _, marks = _scene(scenario, shown, view, view, form)
+    drawing.draw_moment(axes, scenario, shown, _styles(shown), row, view)
+    _heading(axes, scenario, at[0], form)
     drawing.spread_labels(figure, axes, marks)
     return figure
 
 
-def _finish(
-    figure: Any,
-    axes: Any,
-    scenario: Scenario,
-    shown: Sequence[ShownRollout],
-    view: View,
-    note: str,
-    form: FigureFormat,
-) -> list[drawing.Mark]:
-    """Add scale, words and marks of violations to a scene, and return the marks."""
-    styles, is_narrow = _styles(shown), figure.get_figwidth() < _NARROW
-    found = [
-        drawing.draw_violation(axes, item, styles[item.planner], view, in_short=is_narrow)
-        for item in shown
-    ]
-    drawing.draw_scale(axes, view)
-    if not form.plain:
-        _heading(axes, scenario, 0.0)
-        axes.set_xlabel(_wrapped(note, characters(figure.get_figwidth())), fontsize=SMALL)
-    _add_legend(figure, axes)
-    return [mark for mark in found if mark]
+def _scene(
+    scenario: Scenario, shown: Sequence[ShownRollout], view: View, whole: View, form: FigureFormat
+) -> tuple[Any, Any, list[Any], list[drawing.Mark]]:
+    """Figure and axes with all that does not move, the paths, and the marks of violations.
 
-
-@in_format
-def grid(
-    scenario: Scenario,
-    shown: Sequence[ShownRollout],
-    *,
-    at: Sequence[float],
-    note: str = "",
-    form: FigureFormat = DEFAULT_FORM,
-) -> Any:
-    """A matplotlib figure with a row per rollout and a column per moment [s from the start].
-
-    Every panel shows the surroundings of its ego, which drives to the right, with its path so far.
-
-    Raises:
-        ConfigError: There is no such time.
-        MissingExtraError: matplotlib is missing.
+    `whole` is the view of all that will be seen.
     """
+    styles = _styles(shown)
+    figure, (axes,) = _panels(1, view, form)
+    drawing.draw_map(axes, scenario.map, scenario.route, whole)
+    paths = drawing.draw_paths(axes, scenario, shown, styles, view)
+    look = {"in_short": figure.get_figwidth() < _NARROW}
+    found = [drawing.draw_violation(axes, one, styles[one.planner], view, **look) for one in shown]
+    drawing.draw_scale(axes, view)
+    _heading(axes, scenario, 0.0, form)
+    note = "" if form.plain else form.note
+    axes.set_xlabel(_wrapped(note, characters(figure.get_figwidth())), fontsize=SMALL)
+    _add_legend(figure, axes)
+    return figure, axes, paths, [mark for mark in found if mark]
+
+
+def _grid(
+    scenario: Scenario, shown: Sequence[ShownRollout], at: Sequence[float], form: FigureFormat
+) -> Any:
+    """The figure with a row per rollout and a column per moment."""
     rows = [_sample_at(scenario, shown, time) for time in at]
-    styles, width = _styles(shown), form.width or PAGE
-    around = View(np.zeros(3), np.array([*-_NEAR, *_NEAR]))
-    captions = [_wrapped(drawing.caption(item, shown), characters(width)) for item in shown]
-    below = (
-        "" if form.plain else "\n".join(_wrapped(w, characters(width)) for w in (_KEY, note) if w)
-    )
-    above = "" if form.plain else _wrapped(_words(scenario), characters(width, TEXT))
+    styles, width = _styles(shown), form.width or palette.PAGE
+    around, length = View(np.zeros(3), np.array([*-_NEAR, *_NEAR])), characters(width)
+    captions = [_wrapped(drawing.caption(item, shown), length) for item in shown]
+    below = "\n".join(_wrapped(words, length) for words in (_KEY, form.note) if words)
+    above = _wrapped(_words(scenario), characters(width, TEXT))
+    above, below = ("", "") if form.plain else (above, below)
     figure, panels = _cells(width, len(at), captions, above, below)
     for item, line, caption in zip(shown, panels, captions, strict=True):
         line[0].set_title(caption, fontsize=SMALL, loc="left", pad=3)
@@ -210,7 +160,7 @@ def _cells(
     side = min((width - 0.04 * (columns + 1)) / columns, room * _NEAR[0] / _NEAR[1])
     tall = side * _NEAR[1] / _NEAR[0]
     height = top + sum(strips) + tall * len(captions) + bottom
-    figure, y, rows = new_figure(None, figsize=(width, height)), height - top, []
+    figure, y, rows = palette.new_figure(None, figsize=(width, height)), height - top, []
     for strip in strips:
         y -= strip + tall
         lefts = [0.04 + (side + 0.04) * column for column in range(columns)]
@@ -242,12 +192,11 @@ def overview(
         MissingExtraError: matplotlib is missing.
     """
     form = FigureFormat.of(width, serif=serif, plain=plain)
-    draw: Callable[..., Any] = still if isinstance(thing, Scenario) else _whole_map
-    return draw(thing, form=form)
+    return picture(thing, form=form) if isinstance(thing, Scenario) else _map(thing, form=form)
 
 
-@in_format
-def _whole_map(thing: VectorMap, *, form: FigureFormat) -> Any:
+@palette.in_format
+def _map(thing: VectorMap, *, form: FigureFormat) -> Any:
     bounds = thing.edges.polygons.bounds
     view = View(np.zeros(3), _extent([bounds[:, :2], bounds[:, 2:]]))
     figure, (axes,) = _panels(1, view, form)
@@ -293,7 +242,7 @@ def svg_of(figure: Any) -> str:
 
 
 def _styles(shown: Sequence[ShownRollout]) -> dict[str, Style]:
-    return planner_styles(item.planner for item in shown)
+    return palette.planner_styles(item.planner for item in shown)
 
 
 def _times(scenario: Scenario, shown: Sequence[ShownRollout]) -> FloatArray:
@@ -319,10 +268,10 @@ def _extent(paths: Sequence[FloatArray]) -> FloatArray:
 
 def _panels(columns: int, view: View, form: FigureFormat) -> tuple[Any, Any]:
     """A figure with axes side by side that are as high as the view needs."""
-    width = form.width or PAGE
+    width = form.width or palette.PAGE
     sides = view.box[2:] - view.box[:2]
     height = width / columns * sides[1] / sides[0] + 0.5
-    figure = new_figure("compressed", figsize=(width, height))
+    figure = palette.new_figure("compressed", figsize=(width, height))
     axes = figure.subplots(1, columns, squeeze=False)[0]
     for one in axes:
         _set_view(one, view.box)
@@ -365,17 +314,17 @@ def _words(scenario: Scenario) -> str:
     return "  ".join(words).replace("$", r"\$")
 
 
-def _heading(axes: Any, scenario: Scenario, time: float) -> None:
-    words = f"{_words(scenario)}  {time:.1f} s"
-    axes.set_title(_wrapped(words, characters(axes.figure.get_figwidth(), TEXT)), fontsize=TEXT)
+def _heading(axes: Any, scenario: Scenario, time: float, form: FigureFormat) -> None:
+    words = "" if form.plain else f"{_words(scenario)}  {time:.1f} s"
+    length = characters(axes.figure.get_figwidth(), TEXT)
+    axes.set_title(_wrapped(words, length), fontsize=TEXT)
 
 
-@in_format
+@palette.in_format
 def _film(
     path: Path,
     scenario: Scenario,
     shown: Sequence[ShownRollout],
-    note: str,
     *,
     form: FigureFormat,
     speed: float,
@@ -385,29 +334,24 @@ def _film(
 
     The view has the size and direction that it needs to follow all egos.
     """
-    styles = _styles(shown)
     view, centres = _following(scenario, shown)
-    figure, (axes,) = _panels(1, view, form)
-    drawn_box = box_around([centres]) + view.box
-    drawing.draw_map(axes, scenario.map, scenario.route, view._replace(box=drawn_box))
-    lines = drawing.draw_paths(axes, scenario, shown, styles, view)
-    paths = [line.get_xydata() for line in lines]
-    marks = _finish(figure, axes, scenario, shown, view, note, form)
+    whole = view._replace(box=box_around([centres]) + view.box)
+    figure, axes, lines, marks = _scene(scenario, shown, view, whole, form)
     drawing.spread_labels(figure, axes, marks, keep_inside=False)
     writer, step = _writer(path, speed)
     figure.set_layout_engine("none")  # it is laid out, and each frame would be again
+    driven = [line.get_xydata() for line in lines]
     times = _times(scenario, shown).tolist()
     with writer.saving(figure, str(path), _FILM_DPI):
         for row in range(0, len(times), step):
-            drawn = drawing.draw_moment(axes, scenario, shown, styles, row, view)
-            for line, path_so_far in zip(lines, paths, strict=True):
-                line.set_data(*path_so_far[: row + 1].T)
+            drawn = drawing.draw_moment(axes, scenario, shown, _styles(shown), row, view)
+            for line, xy in zip(lines, driven, strict=True):
+                line.set_data(*xy[: row + 1].T)
             for mark in marks:
                 drawing.show_from(mark, times[row])
-            x0, y0, x1, y1 = view.box + np.tile(centres[row], 2)
-            axes.set(xlim=(x0, x1), ylim=(y0, y1))
-            if not form.plain:
-                _heading(axes, scenario, times[row])
+            box = view.box + np.tile(centres[row], 2)
+            axes.set(xlim=box[::2], ylim=box[1::2])
+            _heading(axes, scenario, times[row], form)
             writer.grab_frame()
             on_progress(min(row + step, len(times)), len(times))
             for artist in drawn:
