@@ -156,9 +156,10 @@ class Run(results.Run):
         found = gallery.find(token)
         scenario = gallery.store.read(found)
         form = FigureFormat.of(width, serif=serif, plain=plain)
+        shown = gallery.shown(found, scenario)
         form = form._replace(note=gallery.shown_words(found))
         times = [at] if isinstance(at, (int, float)) else list(at)
-        return picture(scenario, gallery.shown(found, scenario), at=times, in_grid=grid, form=form)
+        return picture(scenario, shown, at=times, in_grid=grid, form=form)
 
     def plot_open_against_closed(self, *others: results.Run, **form: Any) -> Any:
         """Open-loop scores and errors against closed-loop scores, as a matplotlib figure.

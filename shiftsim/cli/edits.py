@@ -12,7 +12,10 @@ from shiftsim.cli import Json, echo, new_app, plural, print_result
 from shiftsim.errors import ConfigError, ShiftsimError, beginning, one_of
 from shiftsim.files import write_text
 
-app = new_app("Edits of recorded scenarios: check them, look at them, import interPlan's.")
+app = new_app(
+    "Edits of recorded scenarios: check them, look at them, import interPlan's.",
+    no_args_is_help=True,
+)
 
 File = Annotated[str, Argument(metavar="FILE", help="A .toml file of edits.")]
 Store = Annotated[str, Option("--store", "-s", help="Name or folder. [demo]")]

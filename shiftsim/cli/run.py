@@ -18,6 +18,7 @@ from shiftsim.cli import Json, Quiet, echo, plural, print_result, progress_bar, 
 from shiftsim.cli.report import print_worst
 from shiftsim.errors import ConfigError
 from shiftsim.files import DEFAULT_STORE, read_toml, store_path
+from shiftsim.planners.table import PLANNERS
 from shiftsim.runs.config import make_config
 
 if TYPE_CHECKING:
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
 _MAX_NAMED_FAILURES = 5
 _WORST = 3
 _KERNELS = 230  # at most, of a run that also makes its store; constant-velocity needs 70
-_WITH_TORCH = {"carl", "diffusion-planner", "plantf", "pluto"}
 _BEFORE = {
     "new": "nothing there yet",
     "unfinished": "goes on with what is finished",
@@ -73,21 +73,22 @@ def run_settings(
     as_json: bool = False,
 ) -> None:
     """Run what the settings say, print what it gave, and leave with the right code."""
-    names = {str(name).partition(":")[0] for name in values.get("planners", ())}
-    what = "loading torch" if names & _WITH_TORCH else "loading NumPy and numba"
-    with stdout_to_stderr(), cli.waiting(what, quiet=quiet or as_json) as note:
+    learned = (name for name, entry in PLANNERS.items() if entry.kind == "learned")
+    named = str(values.get("planners"))  # whatever a file holds there
+    what = "torch" if any(name in named for name in learned) else "NumPy and numba"
+    with stdout_to_stderr(), cli.waiting(f"loading {what}", quiet=quiet or as_json) as note:
         from shiftsim.runs.execute import execute
         from shiftsim.runs.prepare import prepare
 
         with _compiling_shown(note):
             plan = prepare(make_config(values, where=where))
-    announce([plan], _plan_lines(plan), dry_run=dry_run, quiet=quiet, as_json=as_json)
+    lines = () if quiet else _plan_lines(plan)
+    announce([plan], lines, dry_run=dry_run, as_json=as_json)
     if dry_run:
         return
     words = [word for word in sys.argv[1:] if word not in ("--resume", "--retry-failed")]
-    with progress_of(
-        [plan], plan.folder, [*words, "--resume"], live, quiet or as_json
-    ) as on_progress:
+    words.append("--resume")
+    with progress_of([plan], plan.folder, words, live, quiet or as_json) as on_progress:
         finished = execute(plan, on_progress=on_progress, argv=sys.argv)
     leave_with(finished, allow_partial=plan.config.allow_partial, as_json=as_json)
 
@@ -190,19 +191,14 @@ def _time_shares(progress: "Progress") -> str:
 
 
 def announce(
-    plans: "Sequence[RunPlan]",
-    lines: Iterable[str],
-    *,
-    dry_run: bool,
-    quiet: bool,
-    as_json: bool,
+    plans: "Sequence[RunPlan]", lines: Iterable[str], *, dry_run: bool, as_json: bool
 ) -> None:
     """Print what will be run; before anything else that scenarios are synthetic, where they are."""
     for found in dict.fromkeys(tuple(p.provenance.items()) for p in plans if p.provenance):
         text = ", ".join(str(value) if k == "name" else f"{k} {value}" for k, value in found)
         echo(f"data        generated, not recorded: {text}", err=as_json)
-    if not (quiet or as_json):
-        echo("\n".join([*lines, ""]))
+    if not as_json and (words := [*lines]):
+        echo("\n".join([*words, ""]))
     for store in dict.fromkeys(plan.store for plan in plans):
         cli.open_store(store)
     if dry_run:
@@ -417,11 +413,7 @@ def demo(
         if not folder.exists():
             with _compiling_shown(note):
                 shiftsim.demo_store(folder)
-    values = {
-        **DEMO,
-        "store": str(folder) if out else DEFAULT_STORE,
-        **settings,
-    }
+    values = {**DEMO, "store": str(folder) if out else DEFAULT_STORE, **settings}
     try:
         run_settings(values, "demo", quiet=quiet)
     finally:

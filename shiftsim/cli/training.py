@@ -11,7 +11,7 @@ from shiftsim import cli
 from shiftsim.cli import Json, Quiet, echo, new_app, print_result
 from shiftsim.train.folder import BEST, Settings, TrafficSettings
 
-app = new_app("Train networks.")
+app = new_app("Train networks.", no_args_is_help=True)
 
 
 @app.command()

@@ -129,18 +129,17 @@ def figures(groups: Sequence[Group], *, form: FigureFormat = DEFAULT_FORM) -> li
             lone = f"{note} (none for a single recording)"
             add("cities", f"Score per city of {data.label}", drawn, lone)
         is_narrow = 0.0 < form.width < _WIDE  # where there is room for abbreviations only
-        headings = {short: short if is_narrow else _in_lines(short) for short in COLUMNS.values()}
-        places = [_place(headings[short], every, column) for column, short in COLUMNS.items()]
+        places = [
+            _place(
+                name if is_narrow else "\n".join([*wrap(LONG[name], 12), f"({name})"]), every, key
+            )
+            for key, name in COLUMNS.items()
+        ]
         drawn = _scores(clean, {"": places}, styles, form, labels=("", "score"))
         add("metrics", f"Metrics on {data.label}", drawn, note)
     return (
         [*out, open_against_closed(groups, form=form)] if any(map(has_open_loop, groups)) else out
     )
-
-
-def _in_lines(short: str) -> str:
-    """The name of a metric in short lines."""
-    return "\n".join([*wrap(LONG[short], 12), f"({short})"])
 
 
 @palette.in_format
@@ -436,19 +435,17 @@ def _add_words(figure: Any, title: str, notes: str, form: FigureFormat, legend: 
     for axes in figure.axes:
         if len(axes.get_shared_x_axes().get_siblings(axes)) > 1:
             axes.label_outer()
-    width, lines = figure.get_figwidth(), 0
+    width, words, below = figure.get_figwidth(), list[str](), list[str]()
     if not form.plain:
-        wrapped = [
-            line for note in notes.splitlines() for line in wrap(note, palette.characters(width))
-        ]
-        figure.supxlabel("\n".join(wrapped), fontsize=SMALL, color=_GREY)
         words = wrap(title, palette.characters(width, TEXT))
-        lines = len(wrapped) + 1 + len(words)
-        if legend:
-            legend.set_title("\n".join(words), {"size": TEXT})
-        else:
-            figure.suptitle("\n".join(words), fontsize=TEXT)
-    box = legend.get_window_extent(figure.canvas.get_renderer()) if legend else None
-    above = box.height / figure.dpi if box else 0.0
-    figure.set_figheight(figure.get_figheight() + above + 1.25 * SMALL / 72.0 * lines)
+        for note in notes.splitlines():
+            below += wrap(note, palette.characters(width))
+    figure.supxlabel("\n".join(below), fontsize=SMALL, color=_GREY)
+    height = figure.get_figheight() + 1.25 * SMALL / 72.0 * len([*words, *below])
+    if legend:
+        legend.set_title("\n".join(words), {"size": TEXT})
+        height += legend.get_window_extent(figure.canvas.get_renderer()).height / figure.dpi
+    else:
+        figure.suptitle("\n".join(words), fontsize=TEXT)
+    figure.set_figheight(height)
     figure.draw_without_rendering()
