@@ -66,7 +66,7 @@ def _fitted(line: str, width: int) -> list[str]:
         return [line]
     begin = re.match(r" *(\S+ {2,})?", line)
     indent = " " * (begin.end() if begin else 0)
-    whole = {"break_long_words": False, "break_on_hyphens": False, "replace_whitespace": False}
+    whole: Any = {"break_long_words": False, "break_on_hyphens": False, "replace_whitespace": False}
     return wrap(line, width, subsequent_indent=indent or "  ", **whole)
 
 

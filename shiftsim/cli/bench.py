@@ -74,8 +74,8 @@ def bench(
         print_result(costs_of.as_json(plan, costs, shards=shards), lines, as_json=as_json)
         return
     plans = list(plan.runs.values())
-    lines = () if quiet else _plan_lines(plan)
-    announce(plans, lines, dry_run=dry_run, as_json=as_json)
+    words = () if quiet else _plan_lines(plan)
+    announce(plans, words, dry_run=dry_run, as_json=as_json)
     if dry_run:
         return
     with progress_of(plans, plan.folder, sys.argv[1:], live, quiet or as_json) as on_progress:

@@ -410,11 +410,7 @@ def _sample(noise: str) -> Any:
 
 
 def _finish(
-    figure: Any,
-    title: str,
-    notes: str,
-    form: FigureFormat,
-    samples: Mapping[str, str] = _NONE,
+    figure: Any, title: str, notes: str, form: FigureFormat, samples: Mapping[str, str] = _NONE
 ) -> None:
     """Legend, title and what stands beside every score; `samples` are noises by their label."""
     handles, labels = figure.axes[0].get_legend_handles_labels()

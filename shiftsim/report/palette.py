@@ -24,7 +24,8 @@ SMALL, TEXT = 7.0, 8.0  # points at that width; nothing is smaller
 _INCHES = {"in": 1.0, "": 1.0, "cm": 1 / 2.54, "mm": 1 / 25.4, "pt": 1 / 72.27}
 _SERIF = {"font.family": ["STIXGeneral", "DejaVu Serif"], "mathtext.fontset": "stix"}
 _DPI = 200
-_Call, _Made = ParamSpec("_Call"), TypeVar("_Made")
+_Call = ParamSpec("_Call")
+_Made = TypeVar("_Made")
 _PLAIN = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 
 

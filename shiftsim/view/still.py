@@ -375,7 +375,7 @@ def _writer(path: Path, speed: float) -> tuple[Any, int]:
     from matplotlib.animation import FFMpegWriter, PillowWriter
 
     step = math.ceil(_FPS * speed / _MOST_FPS)
-    fps = _FPS * speed / step
+    fps: Any = _FPS * speed / step
     if path.suffix.lower() != ".mp4":
         return PillowWriter(fps=fps), step
     if not _has_ffmpeg(FFMpegWriter):
