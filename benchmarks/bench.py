@@ -31,6 +31,7 @@ from shiftsim.report.groups import (
     read_groups,
     token_digest,
 )
+from shiftsim.report.palette import DEFAULT_FORM, FigureFormat
 from shiftsim.report.tables import FORMATS, Cell, Number, Table
 from shiftsim.runs.avoidable import grade
 from shiftsim.runs.config import make_config
@@ -284,6 +285,7 @@ class OpenedRuns(NamedTuple):
         pages: bool = False,
         allow_partial: bool = False,
         title: str = "",
+        form: FigureFormat = DEFAULT_FORM,
         on_progress: Callable[[int, int], None] = lambda done, total: None,
     ) -> list[Path]:
         """Write tables and pictures to a folder, and return the files.
@@ -300,7 +302,7 @@ class OpenedRuns(NamedTuple):
         is_whole = options.tables == tuple(build.TABLES)
         groups = self.groups(allow_partial=allow_partial)
         tables = self._tables(groups, options, is_whole)
-        drawn = figures(groups) if pictures or pages else []
+        drawn = figures(groups, form=form) if pictures or pages else []
         title = title or f"Report on {', '.join(run.path.name for run in self.runs)}"
         if not pages:
             return build.write_report(folder, title, self.runs, tables, drawn, formats or FORMATS)

@@ -134,8 +134,10 @@ def beginning(where: str, what: str, text: str, choices: Iterable[str]) -> str:
     if found:
         such = f"such as {', '.join(found[:4])}"
         raise ConfigError(f"{len(found)} {what}s of {where} begin with {text!r}", such)
-    near = nearest(text, valid) or next(iter(valid), "")
-    hint = f"did you mean {near!r}?" if near else f"{where} is empty"
+    starts = {choice[: len(text)]: choice for choice in valid}
+    near = difflib.get_close_matches(text, starts, n=1, cutoff=0.75)
+    hint = f"did you mean {starts[near[0]]!r}?" if near else f"there are {listed(valid, 3)}"
+    hint = hint if valid else f"{where} is empty"
     raise ConfigError(f"{where} has no {what} {text!r}", hint)
 
 

@@ -1,5 +1,8 @@
 """What is written in a matplotlib figure, and where."""
 
+import re
+import zlib
+from contextlib import suppress
 from itertools import combinations
 
 
@@ -40,6 +43,27 @@ def overlaps(figure):
         for (one, a), (other, b) in combinations(boxes, 2)
         if a.padded(-1.0).overlaps(b.padded(-1.0))
     ]
+
+
+def smallest(figure):
+    """Size of the smallest letters of a figure [points]."""
+    from matplotlib.text import Text
+
+    figure.draw_without_rendering()
+    shown = (text for text in figure.findobj(Text) if text.get_text().strip())
+    return min(text.get_fontsize() for text in shown)
+
+
+def sizes_in_pdf(path):
+    """Sizes of all letters in a PDF file [points], and its width [inch]."""
+    content = path.read_bytes()
+    width = float(re.search(rb"/MediaBox \[ ?0 0 ([\d.]+)", content)[1]) / 72.0
+    sizes = []
+    for stream in re.findall(rb"stream\r?\n(.*?)\r?\nendstream", content, re.S):
+        with suppress(zlib.error):
+            drawn = zlib.decompress(stream)
+            sizes += [float(size) for size in re.findall(rb"/F\S+ ([\d.]+) Tf", drawn)]
+    return sizes, width
 
 
 def cut_off(figure):

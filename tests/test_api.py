@@ -95,7 +95,7 @@ def test_a_scenario_is_found_by_the_beginning_of_its_token(store):
     )
     assert store[short].token == token
     with pytest.raises(
-        shiftsim.ShiftsimError, match="has no scenario 'nothing'\nhint: did you mean"
+        shiftsim.ShiftsimError, match="has no scenario 'nothing'\nhint: there are 0"
     ):
         store["nothing"]
     with pytest.raises(shiftsim.ShiftsimError, match="4 scenarios of store 'toy' begin with ''"):

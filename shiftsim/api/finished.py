@@ -88,14 +88,18 @@ class Run(results.Run):
 
         There is a file per format. `pictures=False` leaves pictures out, `pages=True` writes HTML
         pages with a replay of every scenario, `allow_partial=True` labels means over what finished.
+        Pictures have the `width`, and are `serif` and `plain`, as those of `plot`.
 
         Raises:
             ConfigError: There is no such table or format.
             MissingExtraError: matplotlib is missing.
         """
         from shiftsim.report.build import TABLES, Options
+        from shiftsim.report.palette import FigureFormat
 
         options = Options(tuple(tables or TABLES), by)
+        form = {name: settings.pop(name) for name in FigureFormat._fields if name in settings}
+        settings["form"] = FigureFormat.of(**form)
         return list(self._opened(*others).report(Path(folder), options, formats, **settings))
 
     def worst(self, count: int = 10) -> list[dict[str, Any]]:
@@ -123,39 +127,54 @@ class Run(results.Run):
         return Explanation("\n\n".join("\n".join(explain_lines(task)) for task in tasks))
 
     def plot(
-        self, token: str, *, at: float | Sequence[float] = 0.0, grid: bool = False, **chosen: Any
+        self,
+        token: str,
+        *,
+        at: float | Sequence[float] = 0.0,
+        grid: bool = False,
+        width: float | str | None = None,
+        serif: bool = False,
+        plain: bool = False,
+        **chosen: Any,
     ) -> Any:
         """The driven paths of one scenario `at` seconds from the start, as a matplotlib figure.
 
         Several times, or `grid`, give a row per rollout and a column per time. `planner`, `noise`
-        and `seed`, a value or a list of them each, choose rollouts.
+        and `seed`, a value or a list of them each, choose rollouts. A figure is as wide as a column
+        of a paper, in inches or as `3.5in` or `89mm`, may have its `serif` letters, and is `plain`
+        without the title and notes that a caption says.
 
         Raises:
-            ConfigError: There is no stored rollout of it, or no such time.
+            ConfigError: There is no stored rollout of it, or no such time or width.
             DataError: The store of the run is not there.
             MissingExtraError: matplotlib is missing.
         """
-        from shiftsim.view import still
+        from shiftsim.report.palette import FigureFormat
+        from shiftsim.view.still import picture
 
         gallery = self._gallery(**chosen)
         found = gallery.find(token)
         scenario = gallery.store.read(found)
-        shown, note = gallery.shown(found, scenario), gallery.shown_words(found)
+        form = FigureFormat.of(width, serif=serif, plain=plain)
+        shown = gallery.shown(found, scenario)
+        form = form._replace(note=gallery.shown_words(found))
         times = [at] if isinstance(at, (int, float)) else list(at)
-        if grid or len(times) > 1:
-            return still.grid(scenario, shown, at=times, note=note)
-        return still.still(scenario, shown, at=times[0], note=note)
+        return picture(scenario, shown, at=times, in_grid=grid, form=form)
 
-    def plot_open_against_closed(self, *others: results.Run) -> Any:
+    def plot_open_against_closed(self, *others: results.Run, **form: Any) -> Any:
         """Open-loop scores and errors against closed-loop scores, as a matplotlib figure.
+
+        `width`, `serif` and `plain` are as those of `plot`.
 
         Raises:
             ConfigError: The runs were not made with `open_loop=True`.
             MissingExtraError: matplotlib is missing.
         """
         from shiftsim.report.figures import open_against_closed
+        from shiftsim.report.palette import FigureFormat
 
-        return open_against_closed(self._opened(*others).groups(allow_partial=True)).drawn
+        groups = self._opened(*others).groups(allow_partial=True)
+        return open_against_closed(groups, form=FigureFormat.of(**form)).drawn
 
     def view(self, token: str) -> Any:
         """The replay of one scenario: a `Page`, which notebooks show and `.save(path)` writes.

@@ -12,6 +12,7 @@ tasks, 130 interrupted; `verify` has its own.
 import inspect
 import json
 import os
+import re
 import shlex
 import shutil
 import sys
@@ -21,21 +22,23 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, redi
 from dataclasses import MISSING, fields
 from functools import cache, wraps
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Annotated, Any, TextIO, TypeAlias, get_args, get_origin
 from urllib.parse import unquote
 
 import typer
-from typer import Option, echo
+from typer import Option
 
-from shiftsim.errors import FAILED, DataError, ShiftsimError
+from shiftsim.errors import FAILED, DataError, ShiftsimError, nearest
 from shiftsim.runs.config import RunConfig, parse_argument
 
 if TYPE_CHECKING:
     from shiftsim.data.store.reading import ScenarioStore
 
 Json = Annotated[bool, Option("--json", help="Print JSON.")]
-Quiet = Annotated[bool, Option("--quiet", "-q", help="Print no progress.")]
+Quiet = Annotated[bool, Option("--quiet", "-q", help="Print results only.")]
 
 
 def new_app(help: str = "", **settings: Any) -> typer.Typer:
@@ -50,9 +53,38 @@ def new_app(help: str = "", **settings: Any) -> typer.Typer:
     )
 
 
+def echo(text: str = "", *, err: bool = False) -> None:
+    """Print lines; a terminal gets those that are too long for it broken between words."""
+    width = terminal_width(sys.stderr if err else sys.stdout)
+    lines = [part for line in text.split("\n") for part in _fitted(line, width)]
+    typer.echo("\n".join(lines), err=err)
+
+
+def _fitted(line: str, width: int) -> list[str]:
+    """A line in parts; what follows its first column, or indent, is in one column."""
+    if not width or len(re.sub(r"\x1b\[[\d;]*m", "", line)) <= width:
+        return [line]
+    begin = re.match(r" *(\S+ {2,})?", line)
+    indent = " " * (begin.end() if begin else 0)
+    whole: Any = {"break_long_words": False, "break_on_hyphens": False, "replace_whitespace": False}
+    return wrap(line, width, subsequent_indent=indent or "  ", **whole)
+
+
+def paint(text: str, colour: str, *, err: bool = False) -> str:
+    """A text in a colour where there is a terminal, and nobody objects by NO_COLOR."""
+    stream = sys.stderr if err else sys.stdout
+    has_colour = stream.isatty() and not os.environ.get("NO_COLOR")
+    return typer.style(text, fg=colour, bold=True) if has_colour else text
+
+
+def paint_best(text: str) -> str:
+    """The best number of a table."""
+    return paint(text, "green")
+
+
 def print_json(value: Any) -> None:
     """Print a value as JSON; what JSON does not know becomes text."""
-    echo(json.dumps(value, indent=2, ensure_ascii=False, default=str))
+    typer.echo(json.dumps(value, indent=2, ensure_ascii=False, default=str))
 
 
 def print_result(values: Any, lines: Iterable[str], *, as_json: bool) -> None:
@@ -90,9 +122,10 @@ def plural(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
-def terminal_width() -> int:
-    """Columns of the terminal; 0 where the output goes elsewhere."""
-    return shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
+def terminal_width(stream: TextIO | None = None) -> int:
+    """Columns of the terminal; 0 where a stream, the output if none is named, goes elsewhere."""
+    is_terminal = (stream or sys.stdout).isatty()
+    return shutil.get_terminal_size().columns if is_terminal else 0
 
 
 def show_in_browser(address: str) -> None:
@@ -110,6 +143,27 @@ Advance = Callable[..., None]  # done, total and, where there is one, a note
 def progress_bar(*, quiet: bool) -> AbstractContextManager[Advance]:
     """Yields what shows done, total and a note: as a bar with the remaining time, or in lines."""
     return _bar() if sys.stderr.isatty() and not quiet else nullcontext(_lines(quiet))
+
+
+@contextmanager
+def waiting(words: str, *, quiet: bool) -> Iterator[Callable[[str], None]]:
+    """Yields what says what is waited for: on a terminal in a line that goes away at the end."""
+    is_line = sys.stderr.isatty() and not quiet
+    piped = _lines(quiet)
+
+    def note(text: str) -> None:
+        if is_line:
+            typer.echo(f"\r\x1b[2K{text} …", err=True, nl=False)
+        else:
+            piped(0, 0, text)
+
+    if is_line:
+        note(words)
+    try:
+        yield note
+    finally:
+        if is_line:
+            typer.echo("\r\x1b[2K", err=True, nl=False)
 
 
 @contextmanager
@@ -139,10 +193,10 @@ def _lines(quiet: bool) -> Advance:
     def advance(done: int, total: int, note: str = "") -> None:
         nonlocal last
         tenth = 10 * done // total if total else 0
-        if quiet or tenth <= last or (total and not tenth):
+        if quiet or tenth <= last or (not tenth and (done or not note)):
             return
         last = tenth
-        if not total:
+        if not tenth:
             echo(f" {note}", err=True)
             return
         elapsed = time.monotonic() - began
@@ -231,31 +285,32 @@ _ClickError: Any = typer.BadParameter.__mro__[2]
 _COMMANDS = {
     "demo": "run:demo",
     "run": "run:run",
+    "bench": "bench:bench",
     "score": "run:score",
     "merge": "run:merge",
     "bundle": "run:bundle",
-    "bench": "bench:bench",
+    "planners": "planners:app",
+    "doctor": "doctor:doctor",
+    "verify": "doctor:verify",
     "report": "report:report",
     "explain": "report:explain",
-    "diff": "report:diff",
-    "check": "store:check",
-    "verify": "doctor:verify",
-    "doctor": "doctor:doctor",
-    "data": "bench:data",
     "view": "view:view",
     "plot": "view:plot",
-    "inspect": "view:inspect",
-    "filter": "store:filter_scenarios",
+    "diff": "report:diff",
+    "data": "bench:data",
+    "convert": "convert:app",
+    "check": "store:check",
     "stats": "store:show_stats",
+    "filter": "store:filter_scenarios",
+    "inspect": "view:inspect",
     "split": "store:make_split",
     "edits": "edits:app",
-    "planners": "planners:app",
-    "convert": "convert:app",
     "export": "store:export",
-    "checkpoint": "planners:checkpoint",
     "train": "training:app",
+    "checkpoint": "planners:checkpoint",
     "realism": "training:realism",
 }
+_GROUPS = {"Run": "demo", "Look": "report", "Data": "data", "Train": "train"}  # by their first
 
 
 class Interrupted(Exception):
@@ -272,6 +327,21 @@ class _Commands(typer.core.TyperGroup):
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """One of them, imported; None where there is none."""
         return _command(cmd_name) if cmd_name in _COMMANDS else None
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command that is meant, or an error that names the nearest one."""
+        if args and args[0] not in _COMMANDS and (near := nearest(args[0], _COMMANDS)):
+            ctx.fail(f"No such command {args[0]!r}. Did you mean {near!r}?")
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """The commands by what they are for."""
+        names = list(_COMMANDS)
+        starts = [*map(names.index, _GROUPS.values()), len(names)]
+        for group, (first, end) in zip(_GROUPS, pairwise(starts), strict=True):
+            words = [(name, _command(name).get_short_help_str(200)) for name in names[first:end]]
+            with formatter.section(group):
+                formatter.write_dl(words)
 
 
 @cache
@@ -340,6 +410,9 @@ def _run(words: list[str], debug: bool) -> int:
         where = f"{error.filename}: " if error.filename else ""
         return _print_error(f"{where}{error.strerror or error}", "check path and disk", DATA)
     except _ClickError as error:
+        if type(error).__name__ == "NoArgsIsHelpError":
+            typer.echo(error.format_message())
+            return 0
         context = getattr(error, "ctx", None)
         path = context.command_path if context is not None else "shiftsim"
         return _print_error(error.format_message(), f"{path} --help", USAGE)
@@ -352,7 +425,8 @@ def _run(words: list[str], debug: bool) -> int:
 
 def _print_error(fact: str, hint: str, code: int) -> int:
     over = "\r" if code == INTERRUPTED and sys.stderr.isatty() else ""  # the ^C of the terminal
-    echo(f"{over}error: {fact}", err=True)
+    typer.echo(over, err=True, nl=False)
+    echo(f"{paint('error:', 'red', err=True)} {fact}", err=True)
     if hint:
         echo(f"hint: {hint}", err=True)
     return code

@@ -4,10 +4,10 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 import typer
-from typer import Argument, Option, echo
+from typer import Argument, Option
 
 from shiftsim import cli
-from shiftsim.cli import Json, Quiet, plural, print_json, print_result, stdout_to_stderr
+from shiftsim.cli import Json, Quiet, echo, plural, print_json, print_result, stdout_to_stderr
 from shiftsim.cli.run import DryRun, Live, announce, progress_of
 from shiftsim.errors import MissingExtraError
 from shiftsim.runs.config import split_label
@@ -74,7 +74,8 @@ def bench(
         print_result(costs_of.as_json(plan, costs, shards=shards), lines, as_json=as_json)
         return
     plans = list(plan.runs.values())
-    announce(plans, _plan_lines(plan), dry_run=dry_run, as_json=as_json)
+    words = () if quiet else _plan_lines(plan)
+    announce(plans, words, dry_run=dry_run, as_json=as_json)
     if dry_run:
         return
     with progress_of(plans, plan.folder, sys.argv[1:], live, quiet or as_json) as on_progress:
@@ -142,7 +143,8 @@ def _report(plan: "Plan", *, published: bool, allow_partial: bool, as_json: bool
     shown = ("coverage", _MAIN_TABLE[plan.track.name], "planner-comparison")
     for table in tables:
         if table.name.partition("_")[0] in shown:
-            echo("\n" + render(table, "text", width=cli.terminal_width()))
+            look: dict[str, Any] = {"width": cli.terminal_width(), "mark": cli.paint_best}
+            echo("\n" + render(table, "text", **look))
     echo(f"\n report: {plan.folder / 'report'} ({plural(len(files), 'file')})")
 
 

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer import Argument, Option, echo
+from typer import Argument, Option
 
 import shiftsim
 from shiftsim import cli
-from shiftsim.cli import Json, Quiet, new_app, plural, print_json, print_result, progress_bar
+from shiftsim.cli import Json, Quiet, echo, new_app, plural, print_json, print_result, progress_bar
 from shiftsim.errors import ConfigError, ConversionError, MissingExtraError
 from shiftsim.files import read_toml, store_path
 

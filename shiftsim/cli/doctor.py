@@ -9,11 +9,11 @@ from time import perf_counter
 from typing import Any
 
 import typer
-from typer import Argument, Option, echo
+from typer import Argument, Option
 
 import shiftsim
 from shiftsim import cli
-from shiftsim.cli import Advance, Json, Quiet, print_result, progress_bar
+from shiftsim.cli import Advance, Json, Quiet, echo, print_result, progress_bar
 from shiftsim.errors import ConfigError, DataError, one_of
 
 

@@ -5,14 +5,17 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Annotated
 
-from typer import Argument, Option, echo
+from typer import Argument, Option
 
 from shiftsim import cli
-from shiftsim.cli import Json, new_app, plural, print_result
+from shiftsim.cli import Json, echo, new_app, plural, print_result
 from shiftsim.errors import ConfigError, ShiftsimError, beginning, one_of
 from shiftsim.files import write_text
 
-app = new_app("Edits of recorded scenarios: check them, look at them, import interPlan's.")
+app = new_app(
+    "Edits of recorded scenarios: check them, look at them, import interPlan's.",
+    no_args_is_help=True,
+)
 
 File = Annotated[str, Argument(metavar="FILE", help="A .toml file of edits.")]
 Store = Annotated[str, Option("--store", "-s", help="Name or folder. [demo]")]

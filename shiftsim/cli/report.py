@@ -3,10 +3,11 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from typer import Argument, Exit, Option, echo
+import typer
+from typer import Argument, Exit, Option
 
 from shiftsim import cli
-from shiftsim.cli import Json, Quiet, plural, print_json, progress_bar
+from shiftsim.cli import Json, Quiet, echo, plural, print_json, progress_bar
 from shiftsim.files import safe_join
 
 if TYPE_CHECKING:
@@ -33,6 +34,12 @@ Labels = Annotated[
         help="NAME=LABEL, or RUN/NAME=LABEL: what a planner is called; repeatable.",
     ),
 ]
+Width = Annotated[
+    str | None,
+    Option("--width", help="Of figures: 3.5in, 7in (columns of a paper), 89mm … [as they need]"),
+]
+Serif = Annotated[bool, Option("--serif", help="Figures with letters as in the text of a paper.")]
+Plain = Annotated[bool, Option("--plain", help="Figures without title and notes.")]
 RunFolder = Annotated[Path, Argument(metavar="RUN", help="A run folder, or that of a benchmark.")]
 
 
@@ -50,6 +57,9 @@ def report(
     by: str | None = Option(None, help="Scores per scenario_type, city or seed as well."),
     published: bool = Option(False, "--published", help="The paper's figures beside the own ones."),
     figures: bool = Option(False, "--figures", help="Pictures as well, into --out (RUN/report)."),
+    width: Width = None,
+    serif: Serif = False,
+    plain: Plain = False,
     worst: int = Option(5, help="Name the N worst scenarios."),
     labels: Labels = None,
     out: Path | None = Option(None, help="Write everything into this folder."),
@@ -65,9 +75,11 @@ def report(
     """Tables and pictures of one or several runs, or of a benchmark's folder."""
     from shiftsim.benchmarks.bench import open_runs
     from shiftsim.report.build import BRIEF, TABLES, Options
+    from shiftsim.report.palette import FigureFormat
     from shiftsim.report.scores import summary
     from shiftsim.report.tables import render
 
+    form = FigureFormat.of(width, serif=serif, plain=plain)
     opened = open_runs(folders, labels or ())
     if as_json:
         print_json([summary(run) for run in opened.runs])
@@ -76,7 +88,7 @@ def report(
         out = safe_join(folders[0], "report")
     title = f"Report on {', '.join(folder.resolve().name for folder in folders)}"
     options = Options(tuple(table or TABLES), by, published)
-    shared: dict[str, Any] = {"allow_partial": allow_partial, "title": title}
+    shared: dict[str, Any] = {"allow_partial": allow_partial, "title": title, "form": form}
     if out is not None:
         files = opened.report(out, options, style, pictures=figures, **shared)
         echo(f"{plural(len(files), 'file')} in {out}: {', '.join(path.name for path in files)}")
@@ -91,7 +103,9 @@ def report(
     options = Options(tuple(table or default), by, published)
     whole = not table and kind != "csv"
     tables = opened.tables(options, with_coverage=whole, allow_partial=allow_partial)
-    echo("\n\n".join(render(one, kind, width=cli.terminal_width()) for one in tables))
+    look: dict[str, Any] = {"width": cli.terminal_width(), "mark": cli.paint_best}
+    words = "\n\n".join(render(one, kind, **look) for one in tables)
+    (echo if kind == "text" else typer.echo)(words)  # files are not broken into lines
     for name in table:
         if not any(one.name.split("_")[0] == name for one in tables):
             echo(f"no table {name}: these runs hold nothing of it", err=True)
@@ -113,7 +127,9 @@ def print_worst(runs: "Sequence[Run]", count: int) -> None:
         for row in rows:
             where = f"{row['token']}  {task_words(row)}"
             others = f"  ({row['others']} more like it)" if row["others"] else ""
-            echo(f"  {100.0 * row['cls']:6.2f}  {where}  {row['reason']}{others}".rstrip())
+            score = f"{100.0 * row['cls']:6.2f}"
+            score = score if row["cls"] else cli.paint(score, "red")
+            echo(f"  {score}  {where}  {row['reason']}{others}".rstrip())
 
 
 def explain(

@@ -6,19 +6,19 @@ import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer import Argument, Option, echo
+from typer import Argument, Option
 
 import shiftsim
 from shiftsim import cli
-from shiftsim.cli import Json, Quiet, plural, print_result, progress_bar, stdout_to_stderr
+from shiftsim.cli import Json, Quiet, echo, plural, print_result, progress_bar, stdout_to_stderr
 from shiftsim.cli.report import print_worst
 from shiftsim.errors import ConfigError
 from shiftsim.files import DEFAULT_STORE, read_toml, store_path
+from shiftsim.planners.table import PLANNERS
 from shiftsim.runs.config import make_config
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _MAX_NAMED_FAILURES = 5
 _WORST = 3
-_KERNELS_OF_A_RUN = "70 to 160"  # constant-velocity in replayed, PDM-Closed in reactive traffic
+_KERNELS = 230  # at most, of a run that also makes its store; constant-velocity needs 70
 _BEFORE = {
     "new": "nothing there yet",
     "unfinished": "goes on with what is finished",
@@ -73,18 +73,22 @@ def run_settings(
     as_json: bool = False,
 ) -> None:
     """Run what the settings say, print what it gave, and leave with the right code."""
-    from shiftsim.runs.execute import execute
-    from shiftsim.runs.prepare import prepare
+    learned = (name for name, entry in PLANNERS.items() if entry.kind == "learned")
+    named = str(values.get("planners"))  # whatever a file holds there
+    what = "torch" if any(name in named for name in learned) else "NumPy and numba"
+    with stdout_to_stderr(), cli.waiting(f"loading {what}", quiet=quiet or as_json) as note:
+        from shiftsim.runs.execute import execute
+        from shiftsim.runs.prepare import prepare
 
-    with stdout_to_stderr():
-        plan = prepare(make_config(values, where=where))
-    announce([plan], _plan_lines(plan), dry_run=dry_run, as_json=as_json)
+        with _compiling_shown(note):
+            plan = prepare(make_config(values, where=where))
+    lines = () if quiet else _plan_lines(plan)
+    announce([plan], lines, dry_run=dry_run, as_json=as_json)
     if dry_run:
         return
     words = [word for word in sys.argv[1:] if word not in ("--resume", "--retry-failed")]
-    with progress_of(
-        [plan], plan.folder, [*words, "--resume"], live, quiet or as_json
-    ) as on_progress:
+    words.append("--resume")
+    with progress_of([plan], plan.folder, words, live, quiet or as_json) as on_progress:
         finished = execute(plan, on_progress=on_progress, argv=sys.argv)
     leave_with(finished, allow_partial=plan.config.allow_partial, as_json=as_json)
 
@@ -100,12 +104,19 @@ def progress_of(
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with stdout_to_stderr(), progress_bar(quiet=quiet) as advance:
+            done, total = 0, sum(len(plan.tasks) for plan in plans)
+
+            def note(text: str) -> None:
+                advance(done, total, text)
 
             def show(progress: "Progress") -> None:
-                advance(progress.done, progress.total, _time_shares(progress))
+                nonlocal done
+                done = progress.done
+                advance(done, progress.total, _time_shares(progress))
 
+            note("")
             page = _live_page(plans, folder, show) if live else nullcontext(show)
-            with _compiling_shown(partial(advance, 0, 0)), page as on_progress:
+            with _compiling_shown(note), page as on_progress:
                 yield on_progress
     except KeyboardInterrupt:
         command = shlex.join(["shiftsim", *words])
@@ -129,7 +140,7 @@ def _compiling_shown(show: Callable[[str], None]) -> Iterator[None]:
         while not ended.wait(0.5):
             count = len(machine_code())
             if count > known:
-                show(f"compiling kernels, once per version: {count} of {_KERNELS_OF_A_RUN}")
+                show(f"compiling kernels, once per version: {count} of up to {_KERNELS}")
                 known = count
 
     thread = threading.Thread(target=watch, daemon=True)
@@ -159,7 +170,7 @@ def _live_page(
     planners = [name for plan in plans for name in plan.config.planners]
     page = LiveRun(str(folder), sum(len(plan.tasks) for plan in plans), planners, read)
     with LiveServer(page) as server:
-        echo(f"live        {server.address}", err=True)
+        typer.echo(f"live, as long as the run lasts:\n{server.address}", err=True)
         cli.show_in_browser(server.address)
         yield add
 
@@ -186,8 +197,8 @@ def announce(
     for found in dict.fromkeys(tuple(p.provenance.items()) for p in plans if p.provenance):
         text = ", ".join(str(value) if k == "name" else f"{k} {value}" for k, value in found)
         echo(f"data        generated, not recorded: {text}", err=as_json)
-    if not as_json:
-        echo("\n".join([*lines, ""]))
+    if not as_json and (words := [*lines]):
+        echo("\n".join([*words, ""]))
     for store in dict.fromkeys(plan.store for plan in plans):
         cli.open_store(store)
     if dry_run:
@@ -212,6 +223,8 @@ def _plan_lines(plan: "RunPlan") -> Iterator[str]:
         if weights := _weights(planner.fingerprint):
             yield f"weights     {name}, {weights}"
     yield f"noise       {' '.join(config.noise)}   seeds {' '.join(map(str, config.seeds))}"
+    if len(config.seeds) == 1 and (n := config.seeds[0]) > 1:
+        yield f"            {n} is the number of a single seed; for {n} seeds: --seeds 0-{n - 1}"
     first = ""
     if config.limit and config.limit < scenarios.size:
         first = f", the first of {scenarios.size}"
@@ -273,7 +286,8 @@ def _print_results(finished: "Run", *, allow_partial: bool) -> None:
 
     counts = finished.manifest["counts"]
     echo()
-    echo(score_table([finished], allow_partial=allow_partial))
+    look = {"width": cli.terminal_width(), "mark": cli.paint_best}
+    echo(score_table([finished], allow_partial=allow_partial, **look))
     print_worst([finished], _WORST)
     lost = failures(finished)
     alike: dict[tuple[str, ...], list[dict[str, Any]]] = {}
@@ -282,7 +296,7 @@ def _print_results(finished: "Run", *, allow_partial: bool) -> None:
     for (status, error, hint), rows in list(alike.items())[:_MAX_NAMED_FAILURES]:
         more = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
         first = f"{rows[0]['token']} {rows[0]['planner']} {rows[0]['noise']}"
-        echo(f" {status}: {first}{more}: {error}")
+        echo(f" {cli.paint(status, 'red')}: {first}{more}: {error}")
         if hint:
             echo(f"   hint: {hint}")
     if len(alike) > _MAX_NAMED_FAILURES:
@@ -390,27 +404,29 @@ def demo(
         return
     if seed is not None:
         raise ConfigError("--seed is of random towns only", hint="say how many with --towns")
-    from shiftsim.api import DEMO
-
     folder = out.absolute() if out else store_path(DEFAULT_STORE)
-    if not folder.exists():
-        echo(f"generating and converting recordings, compiling kernels → {folder}")
-        shiftsim.demo_store(folder)
-    values = {
-        **DEMO,
-        "store": str(folder) if out else DEFAULT_STORE,
-        **settings,
-    }
+    if not (folder.exists() or quiet):
+        echo(f"generating and converting recordings → {folder}")
+    with cli.waiting("loading NumPy and numba", quiet=quiet) as note:
+        from shiftsim.api import DEMO
+
+        if not folder.exists():
+            with _compiling_shown(note):
+                shiftsim.demo_store(folder)
+    values = {**DEMO, "store": str(folder) if out else DEFAULT_STORE, **settings}
     try:
         run_settings(values, "demo", quiet=quiet)
     finally:
         named = f" --store {out}" if out else ""
-        echo("\nnext:")
-        echo(f"  shiftsim run --planner idm --noise awgn-mid --seeds 0,1,2{named}")
-        echo(f"  shiftsim run --planner my_package.my_module:MyPlanner{named}")
-        echo("  shiftsim report runs/<id>        shiftsim view runs/<id>")
-        echo("  shiftsim explain runs/<id> TOKEN")
-        echo("  shiftsim planners list           shiftsim --help")
+        lines = (
+            "\nnext:",
+            f"  shiftsim run --planner idm --noise awgn-mid --seeds 0,1,2{named}",
+            f"  shiftsim run --planner my_package.my_module:MyPlanner{named}",
+            "  shiftsim report runs/<id>        shiftsim view runs/<id>",
+            "  shiftsim explain runs/<id> TOKEN",
+            "  shiftsim planners list           shiftsim --help",
+        )
+        print_result(None, () if quiet else lines, as_json=False)
 
 
 def _make_towns(

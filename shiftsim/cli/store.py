@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer import Argument, Option, echo
+from typer import Argument, Option
 
 from shiftsim import cli
-from shiftsim.cli import Json, Quiet, new_app, plural, print_json, print_result, progress_bar
+from shiftsim.cli import Json, Quiet, echo, new_app, plural, print_json, print_result, progress_bar
+from shiftsim.cli.report import Plain, Serif, Width
 from shiftsim.errors import one_of
 from shiftsim.files import store_path
 
@@ -257,13 +258,17 @@ def show_stats(
     style: str = Option("text", "--format", "-f", help="text, or csv with a row per scenario."),
     out: Path | None = Option(None, help="Write the table to this file."),
     figure: Path | None = Option(None, help="Draw bars into this file (.png, .svg, .pdf)."),
+    width: Width = None,
+    serif: Serif = False,
+    plain: Plain = False,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Scenarios, agents, speeds, lengths and interactions, per city and in all."""
     from shiftsim.benchmarks import published
     from shiftsim.data.store.statistics import store_stats
-    from shiftsim.report.dataset import draw_stats, stats_dict, stats_table
+    from shiftsim.report.dataset import stats_dict, stats_figure, stats_table
+    from shiftsim.report.palette import FigureFormat, save_picture
 
     one_of("column", by, ("city", "type"))
     opened = cli.open_store(store)
@@ -272,12 +277,13 @@ def show_stats(
         found = store_stats(
             opened, tokens, progress=lambda done, total, token: advance(done, total)
         )
-    width = cli.terminal_width() if out is None else 0
-    text = stats_table(found, by=by, style=style, width=width)
+    columns = cli.terminal_width() if out is None else 0
+    text = stats_table(found, by=by, style=style, width=columns)
     if figure is not None:
         name = opened.path.resolve().name
         title = f"{name}: {plural(len(tokens), 'scenario')}"
-        draw_stats(found, figure, published(), title=title)
+        form = FigureFormat.of(width, serif=serif, plain=plain)
+        save_picture(stats_figure(found, published(), title=title, form=form), figure)
     if as_json:
         print_json(stats_dict(found, published()))
         return
@@ -285,7 +291,7 @@ def show_stats(
         out.write_text(text + "\n", "utf-8")
         echo(f"written: {out}")
     else:
-        echo(text)
+        (echo if style == "text" else typer.echo)(text)
         if left_out := len(opened) - len(tokens):
             echo(f" {plural(left_out, 'scenario')} of the store left out")
     if figure is not None:

@@ -5,13 +5,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from typer import Argument, Option, echo
+from typer import Argument, Option
 
 from shiftsim import cli
-from shiftsim.cli import Json, Quiet, new_app, print_result
+from shiftsim.cli import Json, Quiet, echo, new_app, print_result
 from shiftsim.train.folder import BEST, Settings, TrafficSettings
 
-app = new_app("Train networks.")
+app = new_app("Train networks.", no_args_is_help=True)
 
 
 @app.command()

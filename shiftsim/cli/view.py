@@ -4,11 +4,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from typer import Argument, Option, echo
+from typer import Argument, Option
 
 from shiftsim import cli
-from shiftsim.cli import Quiet, plural, progress_bar, show_in_browser
-from shiftsim.cli.report import Labels, RunFolder
+from shiftsim.cli import Quiet, echo, plural, progress_bar, show_in_browser
+from shiftsim.cli.report import Labels, Plain, RunFolder, Serif, Width
 from shiftsim.errors import ConfigError
 from shiftsim.files import safe_join
 
@@ -78,6 +78,10 @@ def plot(
     token: str | None = Argument(None, metavar="[TOKEN]", help="A scenario."),
     at: str = Option("0", help="Time of a still from the start [s]; several, such as 0,5,10."),
     grid: bool = Option(False, "--grid", help="A row per rollout, a column per time."),
+    width: Width = None,
+    serif: Serif = False,
+    plain: Plain = False,
+    speed: float = Option(1.0, help="How much faster than time a film is."),
     open_against_closed: bool = Option(
         False,
         "--open-against-closed",
@@ -92,16 +96,18 @@ def plot(
     seed: Seeds = None,
     store: Store = None,
     labels: Labels = None,
+    quiet: Quiet = False,
 ) -> None:
     """The driven paths of several rollouts over the map, as a still or a film."""
     from shiftsim.benchmarks.bench import open_runs
     from shiftsim.report.figures import open_against_closed as scatter
-    from shiftsim.report.palette import save_picture
-    from shiftsim.view.still import save_figure
+    from shiftsim.report.palette import FigureFormat, save_picture
+    from shiftsim.view.still import FILMS, save_figure
 
+    form = FigureFormat.of(width, serif=serif, plain=plain)
     if open_against_closed:
         opened = open_runs([run, *(others or ())], labels or ())
-        save_picture(scatter(opened.groups(allow_partial=True)).drawn, out)
+        save_picture(scatter(opened.groups(allow_partial=True), form=form).drawn, out)
         echo(f"written: {out}")
         return
     if token is None:
@@ -110,8 +116,10 @@ def plot(
     gallery, token = _holding(found, token)
     scenario = gallery.store.read(token)
     shown = gallery.shown(token, scenario)
-    note = gallery.shown_words(token)
-    save_figure(out, scenario, shown, at=_times(at), in_grid=grid, note=note)
+    form = form._replace(note=gallery.shown_words(token))
+    how: dict[str, Any] = {"at": _times(at), "in_grid": grid, "form": form}
+    with progress_bar(quiet=quiet or out.suffix.lower() not in FILMS) as advance:
+        save_figure(out, scenario, shown, **how, speed=speed, on_progress=advance)
     _say_shown(gallery, token, "--planner, --noise and --seed choose others")
     echo(f"written: {out}")
 

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from pathlib import Path
 from typing import Any, TypeAlias
 
 from shiftsim.data.store.statistics import (
@@ -12,9 +11,10 @@ from shiftsim.data.store.statistics import (
     StoreStats,
     store_stats,
 )
-from shiftsim.errors import ConfigError, DataError, one_of
+from shiftsim.errors import DataError, one_of
+from shiftsim.report import palette
 from shiftsim.report.groups import DataSet, Group, distinct_sets
-from shiftsim.report.palette import AGENTS, new_figure, save_picture
+from shiftsim.report.palette import DEFAULT_FORM, SMALL, FigureFormat
 from shiftsim.report.paper import Published
 from shiftsim.report.tables import Number, Record, Row, Table, render
 from shiftsim.runs.results import Run
@@ -36,17 +36,18 @@ _MEANS = {  # headings of the means
     "route_m": "route",
 }
 _AXES = {
-    "interactions": "mean number of agents near\nthe ego's path within 3 s",
-    "mean_speed_mps": "mean speed of the ego [m/s]",
+    "interactions": "mean agents near the\nego's path within 3 s",
+    "mean_speed_mps": "mean speed of\nthe ego [m/s]",
 }
 _NOTE = (
     "means per scenario; t0: present at iteration 0, else at any iteration; close agents: "
     "mean number near the ego's path within 3 s; at intersections: share of the scenarios; m, m/s"
 )
-_COLOURS = {f"{kind.name.lower()}s": colour for kind, colour in AGENTS.items()}
+_COLOURS = {f"{kind.name.lower()}s": colour for kind, colour in palette.AGENTS.items()}
 _OWN: dict[str, Any] = {"color": "#4a5560"}
 _PUBLISHED: dict[str, Any] = {"facecolor": "white", "edgecolor": "#4a5560", "hatch": "////"}
-_LINE, _SETS_HEIGHT = 0.45, 1.5  # inches: a city, the published sets
+_LINE, _SETS_HEIGHT = 0.4, 1.3  # inches: a city, the published sets
+_WIDE = 5.0  # inches; what is narrower has two panels side by side, not four
 
 
 def stats_table(stats: StoreStats, *, by: str = "city", style: str = "text", width: int = 0) -> str:
@@ -94,30 +95,21 @@ def stats_dict(stats: StoreStats, published: Published) -> dict[str, object]:
     }
 
 
-def draw_stats(stats: StoreStats, path: Path, published: Published, *, title: str) -> None:
-    """Draw the store beside the published sets, and its cities; the path's ending is the format.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-        ConfigError: The ending is none that can be drawn.
-    """
-    figure = stats_figure(stats, published, title=title)
-    try:
-        save_picture(figure, path)
-    except ValueError as error:
-        raise ConfigError(f"{path}: {error}", hint="use .png, .svg or .pdf") from error
-
-
-def stats_figure(stats: StoreStats, published: Published, *, title: str) -> Any:
-    """The picture of `draw_stats` as a matplotlib figure; all bars lie, so that names have room.
+@palette.in_format
+def stats_figure(
+    stats: StoreStats, published: Published, *, title: str, form: FigureFormat = DEFAULT_FORM
+) -> Any:
+    """The store beside the published sets, and its cities; all bars lie, so that names have room.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
     """
     groups = stats.groups("city")
     means, cities = [*groups.values()], [name for name in groups if name != ALL]
-    height = _LINE * len(groups) + 0.5
-    figure = new_figure(figsize=(10.0, _SETS_HEIGHT + height + 1.0))
+    width = form.width or palette.PAGE
+    across = 4 if width > _WIDE else 2
+    height = (_LINE * len(groups) + 0.8) * (4 // across)
+    figure = palette.new_figure(figsize=(width, _SETS_HEIGHT + height + 0.3))
     upper, lower = figure.subfigures(2, 1, height_ratios=(_SETS_HEIGHT, height))
     sets = upper.subplots()
     whole: list[_Bars] = [[(number, _PUBLISHED)] for number in PUBLISHED_SETS.values()]
@@ -125,7 +117,8 @@ def stats_figure(stats: StoreStats, published: Published, *, title: str) -> Any:
     sets.set_yticks(range(4), ["this store", *(f"{name} (published)" for name in PUBLISHED_SETS)])
     sets.invert_yaxis()
 
-    panels = lower.subplots(1, 4, sharey=True, width_ratios=(1.0, 1.5, 1.0, 1.0))
+    ratios = (1.0, 1.5, 1.0, 1.0) if across == 4 else (1.0, 1.5)
+    panels = lower.subplots(4 // across, across, sharey=True, width_ratios=ratios).ravel()
     counts: list[_Bars] = [[(groups[city]["scenarios"], _OWN)] for city in cities]
     sites = [published.count(city) for city in cities]
     for bars, number in zip(counts, sites, strict=True):
@@ -140,17 +133,18 @@ def stats_figure(stats: StoreStats, published: Published, *, title: str) -> Any:
         [(row.get(f"{kind}_t0", 0.0), {"color": colour}) for kind, colour in _COLOURS.items()]
         for row in means
     ]
-    label = "agents per scenario: mean at its start (full),\nin all of it (pale)"
+    label = "mean agents per scenario: at its\nstart (full), in all of it (pale)"
     _draw(panels[1], pale, "{:.1f}", label)
     _draw(panels[1], full, "", label)
     handles = panels[1].containers[-len(_COLOURS) :]
-    place = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 3}
-    panels[1].legend(handles, _COLOURS, frameon=False, fontsize=7, **place)
+    look = {"frameon": False, "fontsize": SMALL, "handlelength": 1.0, "columnspacing": 0.8}
+    lower.legend(handles, _COLOURS, loc="outside upper center", ncols=3, **look)
     for axes, (column, words) in zip(panels[2:], _AXES.items(), strict=True):
         _draw(axes, [[(row.get(column, 0.0), _OWN)] for row in means], "{:.1f}", words)
     panels[0].set_yticks(range(len(groups)), [*groups])
     panels[0].invert_yaxis()
-    figure.suptitle(title, fontsize=11)
+    if not form.plain:
+        figure.suptitle(title, fontsize=palette.TEXT)
     return figure
 
 
@@ -163,9 +157,9 @@ def _draw(axes: Any, rows: Sequence[_Bars], form: str, label: str) -> None:
             axes.barh(y, value, 0.9 * width, **look)
             where: dict[str, Any] = {"xytext": (2, 0), "textcoords": "offset points"}
             if form:
-                axes.annotate(form.format(value), (value, y), fontsize=7, va="center", **where)
-    axes.set_xlabel(label, fontsize=8)
-    axes.tick_params(labelsize=8)
+                axes.annotate(form.format(value), (value, y), fontsize=SMALL, va="center", **where)
+    axes.set_xlabel(label, fontsize=SMALL)
+    axes.tick_params(labelsize=SMALL)
     axes.margins(x=0.18)
     axes.set_xlim(left=0.0)
     axes.spines[["top", "right"]].set_visible(False)

@@ -19,9 +19,10 @@ from shiftsim.edits.sampling import GRADES, graded
 from shiftsim.errors import ConfigError
 from shiftsim.kernels import BoolArray, FloatArray
 from shiftsim.metrics import open_loop
+from shiftsim.report import palette
 from shiftsim.report.details import has_open_loop, open_loop_values, recorded_score
 from shiftsim.report.groups import COLUMNS, DataSet, Group, by_set
-from shiftsim.report.palette import Style, dashes, new_figure, planner_styles, save_picture
+from shiftsim.report.palette import DEFAULT_FORM, SMALL, TEXT, FigureFormat, Style, dashes
 from shiftsim.report.statistics import rank_correlation, score_interval
 from shiftsim.report.tables import Interval, Number
 from shiftsim.report.words import LONG
@@ -31,11 +32,14 @@ _KINDS = {"awgn": "white noise (AWGN)", "ou": "correlated noise (OU)"}
 _TRAFFIC = {"NR": "non-reactive traffic", "R": "reactive traffic"}
 _SPREAD = 0.62  # how much of a place on the axis the planners share
 _GREY = "0.45"
-_NOTE = 6.5  # points
 _MEAN = {"markeredgecolor": "black", "markeredgewidth": 0.9}
 _ADE = "average displacement error (ADE) [m]"
 _RHO = "ρ: Spearman's rank correlation, of scenarios by planner, and of the planners' means"
-_COLUMN = 5.0  # inches; wider pictures are too small in one column of a paper
+_HEIGHT, _AROUND = 1.9, 0.6  # inches, of a panel and of the words above and below it
+_HIGHEST = 8.0  # inches, of all panels
+_BESIDE = 0.5  # inches, beside a panel: the labels of its axis
+_LONGEST = 18  # palette.characters of a name at the end of a line
+_WIDE = 5.0  # inches; what is wider needs both columns of a paper, and has panels side by side
 _NONE: Mapping[str, str] = MappingProxyType({})
 _BARS = "bars: 95 % bootstrap interval over recordings"
 
@@ -51,12 +55,12 @@ class Figure:
     @property
     def is_wide(self) -> bool:
         """Whether it needs both columns of a paper."""
-        return bool(self.drawn.get_figwidth() > _COLUMN)
+        return bool(self.drawn.get_figwidth() > _WIDE)
 
     def save(self, folder: Path, ending: str = "png") -> Path:
         """Write the picture and return where it is; the same picture gives the same bytes."""
         path = folder / f"{self.name}.{ending}"
-        save_picture(self.drawn, path)
+        palette.save_picture(self.drawn, path)
         return path
 
 
@@ -67,60 +71,79 @@ class _Place(NamedTuple):
     score: Callable[[Group], tuple[Number | None, Interval | None]]  # with its interval
 
 
-def figures(groups: Sequence[Group]) -> list[Figure]:
+class _End(NamedTuple):
+    """Where a planner's line ends, and what names it there."""
+
+    label: str
+    x: float
+    y: float
+    colour: str
+
+
+@palette.in_format
+def figures(groups: Sequence[Group], *, form: FigureFormat = DEFAULT_FORM) -> list[Figure]:
     """All pictures that the groups allow.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
     """
-    out = []
-    styles = planner_styles(dict.fromkeys(group.planner for group in groups))
+    out: list[Figure] = []
+    styles = palette.planner_styles(dict.fromkeys(group.planner for group in groups))
     names: list[str] = []
     for data, mine in by_set(groups):
         # sets of one name are numbered, as it becomes that of a file
         name = f"{data.name}-{len(names) + 1}" if data.name in names else data.name
         names.append(data.name)
+
+        def add(kind: str, title: str, drawn: Any, note: str, name: str = name, **how: Any) -> None:
+            _finish(drawn, title, note, form, **how)
+            out.append(Figure(f"{kind}_{name}", title, drawn))
+
         shown = [group for group in mine if group.estimate().value is not None]
         clean = [group for group in shown if group.noise == "none"]
         found = {group.noise.partition("-")[0] for group in shown}
         if kinds := {_KINDS[kind]: _levels(kind, shown) for kind in _KINDS if kind in found}:
             labels = ("strength of the noise", "closed-loop score")
-            drawn = _scores(shown, kinds, styles, (4.1, 3.3), noise="some", labels=labels)
+            drawn = _scores(shown, kinds, styles, form, noise="some", labels=labels)
             bars = f"bars: standard deviation over seeds; without several, {_BARS.split(': ')[1]}"
             note = f"n = {len(data.tokens)} scenarios; {bars}; thin line: the clean score"
             samples = {"clean": "none", "under noise": "some"}
-            _finish(drawn, data, "Noise robustness", note, samples)
-            out.append(Figure(f"robustness_{name}", f"Noise robustness on {data.label}", drawn))
+            title = f"Noise robustness on {data.label}"
+            add("robustness", title, drawn, f"{data.rules}\n{note}", samples=samples)
         if not clean:
             continue
         every = np.ones(len(data.tokens), np.bool_)
         if any(grade for _, grade in map(graded, data.types)):
             labels = ("difficulty of the edit", "closed-loop score")
             kinds = _difficulties(data, groups)
-            drawn = _scores(clean, kinds, styles, (3.4, 3.1), noise="none", labels=labels)
-            _finish(drawn, data, "Edits", f"recorded: the same scenarios without the edit; {_BARS}")
-            title = f"Scores by difficulty of the edits: {data.label}"
-            out.append(Figure(f"edits_{name}", title, drawn))
+            drawn = _scores(clean, kinds, styles, form, noise="none", labels=labels)
+            note = f"{data.rules}\nrecorded: the same scenarios without the edit; {_BARS}"
+            add("edits", f"Scores by difficulty of the edits: {data.label}", drawn, note)
+        note = f"{data.rules}\nclean rollouts; {_BARS}"
         parts = {city: data.within(city) for city in sorted({*data.cities} - {""})}
         if len(parts) > 1:
             places = [_place(f"all\n({len(every)})", every)]
             for city, where in parts.items():
                 places.append(_place(f"{city}\n({data.cities.count(city)})", where))
-            drawn = _scores(clean, {"": places}, styles)
-            note = f"clean rollouts; {_BARS} (none for a single recording)"
-            _finish(drawn, data, "Score per city", note)
-            out.append(Figure(f"cities_{name}", f"Score per city of {data.label}", drawn))
+            drawn = _scores(clean, {"": places}, styles, form)
+            lone = f"{note} (none for a single recording)"
+            add("cities", f"Score per city of {data.label}", drawn, lone)
+        is_narrow = 0.0 < form.width < _WIDE  # where there is room for abbreviations only
         places = [
-            _place("\n".join([*wrap(LONG[short], 12), f"({short})"]), every, column)
-            for column, short in COLUMNS.items()
+            _place(
+                name if is_narrow else "\n".join([*wrap(LONG[name], 12), f"({name})"]), every, key
+            )
+            for key, name in COLUMNS.items()
         ]
-        drawn = _scores(clean, {"": places}, styles, labels=("", "score"))
-        _finish(drawn, data, "Metrics", f"clean rollouts; {_BARS}")
-        out.append(Figure(f"metrics_{name}", f"Metrics on {data.label}", drawn))
-    return [*out, open_against_closed(groups)] if any(map(has_open_loop, groups)) else out
+        drawn = _scores(clean, {"": places}, styles, form, labels=("", "score"))
+        add("metrics", f"Metrics on {data.label}", drawn, note)
+    return (
+        [*out, open_against_closed(groups, form=form)] if any(map(has_open_loop, groups)) else out
+    )
 
 
-def open_against_closed(groups: Sequence[Group]) -> Figure:
+@palette.in_format
+def open_against_closed(groups: Sequence[Group], *, form: FigureFormat = DEFAULT_FORM) -> Figure:
     """Open loop against closed loop: a mark per planner and scenario, clean where there is that.
 
     The legends have Spearman's rank correlations over scenarios, and over the planners' means.
@@ -133,11 +156,11 @@ def open_against_closed(groups: Sequence[Group]) -> Figure:
     if not asked:
         raise ConfigError("no open-loop scores", hint="shiftsim run --open-loop makes them")
     shown = [group for group in asked if group.noise == "none"] or asked
-    styles = planner_styles(dict.fromkeys(group.planner for group in shown))
+    styles = palette.planner_styles(dict.fromkeys(group.planner for group in shown))
     ade = next(name for name, (short, *_) in open_loop.METRICS.items() if short == "ADE")
     kinds = {"open-loop score × 100": (open_loop.TOTAL, 100.0), _ADE: (ade, 1.0)}
     rows = list(dict.fromkeys(group.traffic for group in shown))
-    figure, panels = _panels(rows, [*kinds], (3.6, 3.4))
+    figure, panels = _panels(rows, [*kinds], form)
     for axes, traffic, label in panels:
         metric, scale = kinds[label]
         points = [
@@ -147,14 +170,13 @@ def open_against_closed(groups: Sequence[Group]) -> Figure:
         ]
         _scatter(axes, points, styles)
         _finish_axes(axes, _TRAFFIC.get(traffic, traffic))
-        axes.set_xlabel(label, fontsize=9)
-        axes.legend(fontsize=6.5, framealpha=0.8)
+        axes.set_xlabel(label, fontsize=SMALL)
+        axes.legend(fontsize=SMALL, framealpha=0.8)
     labels = ", ".join(dict.fromkeys(group.data.label for group in shown))
-    figure.suptitle(f"Open loop against closed loop: {labels}", fontsize=10)
     rules = dict.fromkeys(group.data.rules for group in shown)
-    lines = [line for rule in (*rules, _RHO) for line in wrap(rule, _per_line(figure, _NOTE))]
-    figure.supxlabel("\n".join(lines), fontsize=_NOTE, color=_GREY)
-    return Figure("open-against-closed", f"Open loop against closed loop on {labels}", figure)
+    title = f"Open loop against closed loop on {labels}"
+    _add_words(figure, title, "\n".join((*rules, _RHO)), form)
+    return Figure("open-against-closed", title, figure)
 
 
 def _scatter(
@@ -225,7 +247,8 @@ def _levels(kind: str, groups: Sequence[Group]) -> list[_Place]:
             found, interval = scores.get((group.traffic, group.planner, noise), (None, None))
             if found is None or found.value is None or found.std is None:
                 return found, interval
-            return found, Interval(found.value - found.std, found.value + found.std)
+            low, high = found.value - found.std, found.value + found.std
+            return found, Interval(max(low, 0.0), min(high, 100.0))
 
         return _Place(level, score)
 
@@ -236,38 +259,86 @@ def _scores(
     groups: Sequence[Group],
     columns: Mapping[str, Sequence[_Place]],
     styles: dict[str, Style],
-    size: tuple[float, float] | None = None,
+    form: FigureFormat,
     *,
     noise: str = "",
     labels: tuple[str, str] = ("", "closed-loop score"),
 ) -> Any:
     """Planners side by side at every place, a row of panels per traffic mode.
 
-    `columns` are the panels of a row by title, `size` that of one, `labels` those of the axes.
-    Places are joined by lines if a `noise` is given, which look like it.
+    `columns` are the panels of a row by title, `labels` those of the axes. Places are joined by
+    lines if a `noise` is given, which look like it.
     """
     planners = list(dict.fromkeys(group.planner for group in groups))
     spread = {"": _SPREAD, "none": 0.06 * len(planners)}.get(noise, 0.02 * len(planners))
-    size = size or (max(5.5, 1.05 * max(map(len, columns.values()))), 2.9)
     rows = list(dict.fromkeys(group.traffic for group in groups))
-    figure, panels = _panels(rows, [*columns], size)
+    figure, panels = _panels(rows, [*columns], form, is_small=bool(noise))
+    ends: dict[Any, list[_End]] = {}
     for axes, traffic, title in panels:
         mine = [group for group in groups if group.traffic == traffic]
         for group in {group.planner: group for group in mine}.values():
             shift = spread * ((planners.index(group.planner) + 0.5) / len(planners) - 0.5)
             is_whole = all(one.is_complete for one in mine if one.planner == group.planner)
             label = group.planner if is_whole else f"{group.planner} (partial)"
-            _series(axes, group, columns[title], shift, styles[group.planner], noise, label)
+            style = styles[group.planner]
+            last = _series(axes, group, columns[title], shift, style, noise, label)
+            ends.setdefault(axes, []).append(_End(label, *last, style.colour))
         headings = [place.heading for place in columns[title]]
         for x in () if noise else range(1, len(headings)):
             axes.axvline(x - 0.5, color="0.9", linewidth=0.7, zorder=0)
-        axes.set_xticks(range(len(headings)), headings)
+        _set_headings(axes, headings)
         margin = 0.35 if noise else 0.5
         axes.set_xlim(-margin, len(headings) - 1 + margin)
-        axes.set_xlabel(labels[0], fontsize=8)
+        axes.set_xlabel(labels[0], fontsize=SMALL)
         words = (title, _TRAFFIC.get(traffic, traffic))
-        _finish_axes(axes, ", ".join(filter(None, words)), labels[1])
+        is_alone = form.plain and len(panels) == 1
+        _finish_axes(axes, "" if is_alone else ", ".join(filter(None, words)), labels[1])
+    if noise:
+        _name_lines(ends)
     return figure
+
+
+def _set_headings(axes: Any, headings: Sequence[str]) -> None:
+    """Name the places on an axis, aslant where they would not fit else."""
+    width = axes.figure.get_figwidth() / axes.get_subplotspec().get_gridspec().ncols - _BESIDE
+    longest = max(len(line) for heading in headings for line in heading.splitlines())
+    if longest <= palette.characters(width / len(headings)):
+        axes.set_xticks(range(len(headings)), headings)
+        return
+    words = [heading.replace("\n", " ") for heading in headings]
+    aslant = {"rotation": 35, "ha": "right", "rotation_mode": "anchor"}
+    axes.set_xticks(range(len(headings)), words, **aslant)
+    axes.figure.set_figheight(axes.figure.get_figheight() + 0.04 * longest)
+
+
+def _name_lines(ends: Mapping[Any, Sequence[_End]]) -> None:
+    """Name the planners at the ends of their lines if all find room; no legend names them then."""
+    from matplotlib.colors import to_rgb
+
+    figure = next(iter(ends)).figure
+    height = figure.get_figheight() / figure.axes[0].get_gridspec().nrows - _AROUND
+    step = 106.0 * 1.25 * SMALL / 72.0 / height  # of lines of text, in scores
+    found = [end for each in ends.values() for end in each]
+    most = max(map(len, ends.values()))
+    if max(len(end.label) for end in found) > _LONGEST or most * step > 104.0:
+        return
+    for axes, each in ends.items():
+        named = sorted((end for end in each if math.isfinite(end.y)), key=lambda end: end.y)
+        heights = [end.y for end in named]
+        for i in range(1, len(heights)):  # each above the one before, but the last not too high
+            heights[i] = max(heights[i], heights[i - 1] + step)
+        highest = 101.0
+        for i in reversed(range(len(heights))):
+            heights[i] = min(heights[i], highest)
+            highest = heights[i] - step
+        for line in axes.lines:
+            line.set_label(f"_{line.get_label()}")
+        for end, height in zip(named, heights, strict=True):
+            dark = tuple(0.65 * part for part in to_rgb(end.colour))
+            place = {"xytext": (1.03, height), "textcoords": ("axes fraction", "data")}
+            leader = {"arrowstyle": "-", "color": end.colour, "lw": 0.7, "shrinkA": 0, "shrinkB": 4}
+            look = {"fontsize": SMALL, "va": "center", "color": dark, "arrowprops": leader}
+            axes.annotate(end.label, (end.x, end.y), annotation_clip=False, **place, **look)
 
 
 def _series(
@@ -278,43 +349,57 @@ def _series(
     style: Style,
     noise: str,
     label: str,
-) -> None:
-    """One planner's scores, a little beside the places, so that bars do not cover each other."""
-    means = {}
-    for x, (found, interval) in enumerate(place.score(group) for place in places):
+) -> tuple[float, float]:
+    """One planner's scores, a little beside the places, so that bars do not cover each other.
+
+    A line has a gap where there is no score. Returns the last point.
+    """
+    xs, ys = np.arange(len(places)) + shift, np.full(len(places), math.nan)
+    for index, (found, interval) in enumerate(place.score(group) for place in places):
         if interval is not None:
-            axes.vlines(x + shift, interval.low, interval.high, color=style.colour, linewidth=1.3)
+            low, high = interval.low, interval.high
+            axes.vlines(xs[index], low, high, color=style.colour, linewidth=1.3)
         if found is not None and found.value is not None:
-            means[x + shift] = found.value
+            ys[index] = found.value
+    known = np.flatnonzero(np.isfinite(ys))
+    last = (float(xs[known[-1]]), float(ys[known[-1]])) if len(known) else (math.nan, math.nan)
     line = {"linestyle": dashes(noise) if noise else "none", "linewidth": 1.3}
     if noise in ("", "none"):
-        axes.plot([*means], [*means.values()], label=label, **style.marks("none"), **line)
-        return
-    axes.plot([*means], [*means.values()], **style.marks(noise), **line)
-    clean = means.get(shift, math.nan)
-    axes.axhline(clean, linewidth=0.8, alpha=0.35, color=style.colour, zorder=1)
-    axes.plot([shift], [clean], label=label, linestyle="none", zorder=4, **style.marks("none"))
+        axes.plot(xs, ys, label=label, **style.marks("none"), **line)
+        return last
+    axes.plot(xs, ys, **style.marks(noise), **line)
+    axes.axhline(ys[0], linewidth=0.8, alpha=0.35, color=style.colour, zorder=1)
+    axes.plot(xs[:1], ys[:1], label=label, linestyle="none", zorder=4, **style.marks("none"))
+    return last
 
 
 def _panels(
-    rows: Sequence[str], columns: Sequence[str], size: tuple[float, float]
+    rows: Sequence[str], columns: Sequence[str], form: FigureFormat, *, is_small: bool = False
 ) -> tuple[Any, list[tuple[Any, str, str]]]:
-    """A figure, and its axes with the names of their row and column."""
-    figure = new_figure(figsize=(size[0] * len(columns) + 0.6, size[1] * len(rows) + 1.1))
-    axes = figure.subplots(len(rows), len(columns), squeeze=False, sharey=True)
+    """A figure, and its axes with the names of their row and column.
+
+    One that is not wide has all panels below each other. What `is_small` needs one column of a
+    paper, if it is a single panel.
+    """
+    width = form.width or (palette.COLUMN if is_small and len(columns) == 1 else palette.PAGE)
+    across = len(columns) if width > _WIDE else 1
+    down = len(rows) * len(columns) // across
+    figure = palette.new_figure(figsize=(width, min((_HEIGHT + _AROUND) * down, _HIGHEST)))
+    sharex: Any = "col" if across == len(columns) else False
+    axes = figure.subplots(down, across, squeeze=False, sharex=sharex, sharey=True)
     names = product(rows, columns)
     return figure, [(one, *name) for one, name in zip(axes.flat, names, strict=True)]
 
 
 def _finish_axes(axes: Any, title: str, label: str = "closed-loop score") -> None:
-    axes.set_title(title, fontsize=9)
+    axes.set_title(title, fontsize=TEXT)
     axes.set_ylim(-3.0, 103.0)
-    axes.set_ylabel(f"{label} × 100", fontsize=9)
-    axes.label_outer()
+    axes.set_ylabel(f"{label} × 100" if axes.get_subplotspec().is_first_col() else "")
+    axes.yaxis.label.set_fontsize(SMALL)
     axes.grid(axis="y", color="0.9", linewidth=0.7)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.tick_params(labelsize=8)
+    axes.tick_params(labelsize=SMALL)
 
 
 def _sample(noise: str) -> Any:
@@ -325,24 +410,38 @@ def _sample(noise: str) -> Any:
 
 
 def _finish(
-    figure: Any, data: DataSet, title: str, note: str, samples: Mapping[str, str] = _NONE
+    figure: Any, title: str, notes: str, form: FigureFormat, samples: Mapping[str, str] = _NONE
 ) -> None:
     """Legend, title and what stands beside every score; `samples` are noises by their label."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
     handles += [*map(_sample, samples.values())]
     labels += samples
-    look = {"loc": "outside upper center", "frameon": False, "fontsize": 8, "handlelength": 3.2}
-    look |= {"title": "\n".join(wrap(f"{title}: {data.label}", _per_line(figure, 10)))}
+    look = {"loc": "outside upper center", "frameon": False, "fontsize": SMALL, "handlelength": 3.2}
     for columns in range(min(4, max(1, len(labels))), 0, -1):  # as many as fit
-        legend = figure.legend(handles, labels, ncols=columns, title_fontsize=10, **look)
+        legend = figure.legend(handles, labels, ncols=columns, **look)
         box = legend.get_window_extent(figure.canvas.get_renderer())
         if box.width <= figure.bbox.width or columns == 1:
             break
         legend.remove()
-    lines = [*wrap(data.rules, _per_line(figure, _NOTE)), *wrap(note, _per_line(figure, _NOTE))]
-    figure.supxlabel("\n".join(lines), fontsize=_NOTE, color=_GREY)
+    _add_words(figure, title, notes, form, legend)
 
 
-def _per_line(figure: Any, size: float) -> int:
-    """How many characters of a size [points] surely fit into the width of a figure."""
-    return int(figure.get_figwidth() * 72.0 / (0.62 * size))
+def _add_words(figure: Any, title: str, notes: str, form: FigureFormat, legend: Any = None) -> None:
+    """Title and notes around a figure, which grows by their height and by that of its legend."""
+    for axes in figure.axes:
+        if len(axes.get_shared_x_axes().get_siblings(axes)) > 1:
+            axes.label_outer()
+    width, words, below = figure.get_figwidth(), list[str](), list[str]()
+    if not form.plain:
+        words = wrap(title, palette.characters(width, TEXT))
+        for note in notes.splitlines():
+            below += wrap(note, palette.characters(width))
+    figure.supxlabel("\n".join(below), fontsize=SMALL, color=_GREY)
+    height = figure.get_figheight() + 1.25 * SMALL / 72.0 * len([*words, *below])
+    if legend:
+        legend.set_title("\n".join(words), {"size": TEXT})
+        height += legend.get_window_extent(figure.canvas.get_renderer()).height / figure.dpi
+    else:
+        figure.suptitle("\n".join(words), fontsize=TEXT)
+    figure.set_figheight(height)
+    figure.draw_without_rendering()

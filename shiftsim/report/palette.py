@@ -9,19 +9,68 @@ CIELAB to normal eyes and under all kinds of colour-blindness, at least 6 in lig
 Markers tell planners apart without any colour.
 """
 
-from collections.abc import Iterable
+import re
+from collections.abc import Callable, Iterable
+from functools import wraps
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar
 
-from shiftsim.errors import import_extra
+from shiftsim.errors import ConfigError, import_extra
 from shiftsim.files import atomic_write
 from shiftsim.world.state import AgentKind
 
+COLUMN, PAGE = 3.5, 7.0  # inches, one column and both columns of a paper
+SMALL, TEXT = 7.0, 8.0  # points at that width; nothing is smaller
+_INCHES = {"in": 1.0, "": 1.0, "cm": 1 / 2.54, "mm": 1 / 25.4, "pt": 1 / 72.27}
+_SERIF = {"font.family": ["STIXGeneral", "DejaVu Serif"], "mathtext.fontset": "stix"}
+_DPI = 200
+_Call = ParamSpec("_Call")
+_Made = TypeVar("_Made")
 _PLAIN = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 
 
+class FigureFormat(NamedTuple):
+    """How a figure is laid out for the page that it is meant for."""
+
+    width: float = 0.0  # inches; 0 for the figure's own
+    serif: bool = False  # letters as in the text of a paper
+    plain: bool = False  # without title and notes, which a caption says
+    note: str = ""  # what a figure of a scenario leaves out
+
+    @classmethod
+    def of(
+        cls, width: float | str | None = None, *, serif: bool = False, plain: bool = False
+    ) -> "FigureFormat":
+        """A format of a width [inches] that may have a unit, as in `3.5in`, `89mm` or `252pt`.
+
+        Raises:
+            ConfigError: The width is no length between 2 and 40 inches.
+        """
+        found = re.fullmatch(r"(\d+\.?\d*) ?(in|cm|mm|pt|)", str(width or 0))
+        inches = float(found[1]) * _INCHES[found[2]] if found else 0.0
+        if width is not None and not 2.0 <= inches <= 40.0:
+            raise ConfigError(f"{width!r} is no width of a figure", "--width 3.5in, 7in, 89mm …")
+        return cls(inches, serif, plain)
+
+
+DEFAULT_FORM = FigureFormat()
+
+
+def in_format(draw: Callable[_Call, _Made]) -> Callable[_Call, _Made]:
+    """Let a function draw with the letters that its argument `form`, a `FigureFormat`, names."""
+
+    @wraps(draw)
+    def call(*values: _Call.args, **named: _Call.kwargs) -> _Made:
+        matplotlib = _matplotlib()
+        is_serif = getattr(named.get("form"), "serif", False)
+        with matplotlib.rc_context(_SERIF if is_serif else {}):
+            return draw(*values, **named)
+
+    return call
+
+
 def new_figure(
-    layout: Literal["constrained", "compressed"] = "constrained", **settings: Any
+    layout: Literal["constrained", "compressed"] | None = "constrained", **settings: Any
 ) -> Any:
     """An empty figure of matplotlib that can be measured.
 
@@ -30,21 +79,37 @@ def new_figure(
     Raises:
         MissingExtraError: matplotlib is not installed.
     """
-    matplotlib: Any = import_extra("matplotlib", "plots")
+    _matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    matplotlib.rcParams.update({"svg.hashsalt": "shiftsim", "pdf.fonttype": 42})
     figure = Figure(layout=layout, **settings)
     FigureCanvasAgg(figure)
     return figure
 
 
+def _matplotlib() -> Any:
+    found: Any = import_extra("matplotlib", "plots")
+    found.rcParams.update({"svg.hashsalt": "shiftsim", "pdf.fonttype": 42})
+    return found
+
+
+def characters(width: float, size: float = SMALL) -> int:
+    """How many characters of a size [points] surely fit into a width [inch]."""
+    return int(width * 72.0 / (0.58 * size))
+
+
 def save_picture(figure: Any, path: Path) -> None:
-    """Write a figure without time stamps: the same picture has the same bytes."""
+    """Write a figure without time stamps: the same picture has the same bytes.
+
+    Raises:
+        ConfigError: The ending is none that can be drawn.
+    """
     kind = path.suffix.lower()
+    if kind[1:] not in figure.canvas.get_supported_filetypes():
+        raise ConfigError(f"{path}: no picture ends in {kind!r}", hint="use .png, .svg or .pdf")
     with atomic_write(path) as partial:
-        figure.savefig(partial, dpi=150, format=kind[1:] or None, metadata=_PLAIN.get(kind))
+        figure.savefig(partial, dpi=_DPI, format=kind[1:] or None, metadata=_PLAIN.get(kind))
 
 
 RECORDED = "#1f1f1f"  # the recorded driver

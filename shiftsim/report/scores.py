@@ -33,12 +33,14 @@ from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
 
 
-def score_table(runs: Sequence[Run], *, allow_partial: bool = False) -> str:
+def score_table(runs: Sequence[Run], *, allow_partial: bool = False, **look: Any) -> str:
     """The scores of runs as text; threshold profile, metric version and count stand with it.
 
-    `allow_partial` prints the mean over the finished tasks of an incomplete row, labelled so.
+    `allow_partial` prints the mean over the finished tasks of an incomplete row, labelled so;
+    `look` has the width and marks of `tables.text`.
     """
-    return text(replace(scores(read_groups(runs, allow_partial=allow_partial)), title=""))
+    table = scores(read_groups(runs, allow_partial=allow_partial))
+    return text(replace(table, title=""), **look)
 
 
 def scores(groups: Sequence[Group], *, by: str | None = None) -> Table:

@@ -123,12 +123,16 @@ def shown(cell: Cell) -> str:
     return "" if cell is None else str(cell)
 
 
-def text(table: Table, width: int = 0) -> str:
-    """A table in plain text; wider than `width` it is printed in pieces, 0 for any."""
-    columns = []
+def text(table: Table, width: int = 0, mark: Callable[[str], str] = str) -> str:
+    """A table in plain text; wider than `width` it is printed in pieces, 0 for any.
+
+    `mark` changes the look, not the width, of the best numbers of each setting.
+    """
+    columns, best = [], _best_of_planners(table) if mark is not str else ()
     for index, cells in enumerate(zip(*table.lines, strict=True)):
         side, size = "<" if index < table.num_labels else ">", max(map(len, cells))
-        columns.append([f"{cell:{side}{size}}" for cell in cells])
+        padded = [f"{cell:{side}{size}}" for cell in cells]
+        columns.append([mark(c) if (n, index) in best else c for n, c in enumerate(padded, -1)])
     out = [table.title] if table.title else []
     for piece, chosen in enumerate(_pieces([len(c[0]) for c in columns], table.num_labels, width)):
         lines = zip(*(columns[i] for i in chosen), strict=True)
@@ -153,10 +157,10 @@ def _pieces(widths: Sequence[int], num_labels: int, width: int) -> list[list[int
     return pieces
 
 
-def render(table: Table, style: str, *, width: int = 0) -> str:
-    """A table in one of `FORMATS`; as text, those wider than `width` are printed in pieces."""
+def render(table: Table, style: str, *, width: int = 0, mark: Callable[[str], str] = str) -> str:
+    """A table in one of `FORMATS`; `width` and `mark` are those of `text`."""
     one_of("format", style, FORMATS)
-    return text(table, width) if style == "text" else _WRITERS[style](table)
+    return text(table, width, mark) if style == "text" else _WRITERS[style](table)
 
 
 def _markdown(table: Table) -> str:
@@ -304,6 +308,20 @@ def _best(table: Table, settings: Sequence[Row]) -> set[tuple[int, int]]:
                 best = choose(numbers.values())
                 out |= {place for place, value in numbers.items() if value == best}
     return out
+
+
+def _best_of_planners(table: Table) -> set[tuple[int, int]]:
+    """Row and column of the best numbers of a table as people read it."""
+    best = table.best or (table.paper.best if table.paper else {})
+    if not best or "planner" not in table.header:
+        return set()
+    planner, labels = list(table.header).index("planner"), range(table.num_labels)
+    # rows below that of a planner, such as deviations, have a setting of their own
+    settings: list[Row] = [
+        tuple(row[i] for i in labels if i != planner) if row[planner] else (str(number),)
+        for number, row in enumerate(table.rows)
+    ]
+    return _best(replace(table, best=best), settings)
 
 
 def _float(table: Table, tabular: Sequence[str], sizes: Sequence[int]) -> str:

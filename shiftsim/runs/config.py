@@ -96,7 +96,7 @@ class RunConfig:
         ("none",), "none, awgn-low … ou-high, all; repeatable. [none]", "--noise", "-n"
     )
     seeds: tuple[int, ...] = setting(
-        (0,), "Noise seeds, such as 0,1,2 or 0-2. [0]", parse=parse_seeds
+        (0,), "Noise seeds: 0,1,2 or 0-2 are three, 3 is number 3 alone. [0]", parse=parse_seeds
     )
     store: str = setting(DEFAULT_STORE, "Name or folder. [demo]", "--store", "-s")
     split: str = setting("", "Name or file (.toml, .txt). [whole store; of demo demo-mini]")

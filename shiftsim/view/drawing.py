@@ -9,17 +9,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shiftsim.geometry.boxes import boxes_to_corners
+from shiftsim.geometry.boxes import boxes_to_corners, to_frame, turned
 from shiftsim.kernels import FloatArray
-from shiftsim.report.palette import AGENTS, ALARM, OTHER_AGENT, RECORDED, Style, dashes
+from shiftsim.report.palette import AGENTS, ALARM, OTHER_AGENT, RECORDED, SMALL, Style, dashes
 from shiftsim.report.words import violation_words, violations, worst_moment
 from shiftsim.sim.log import as_recorded
-from shiftsim.view.scene import ShownRollout, map_lines
+from shiftsim.view.scene import ShownRollout, box_around, map_lines
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import PACIFICA, AgentKind, center_poses
 
-SMALL = 8  # points, of most words
 _AREAS = {  # what is drawn first lies below
     "walkway": "#e8e0cc",
     "drivable": "#c9cbca",
@@ -35,23 +34,44 @@ _AROUND = ((0.8, 0.6), (-0.8, 0.6), (0.8, -0.6), (-0.8, -0.6), (1, 0), (-1, 0), 
 _AWAY = (8.0, 22.0, 40.0, 62.0, 90.0)  # points
 
 
-def draw_scene(
+class View(NamedTuple):
+    """A box of a frame, which a picture shows; its x axis points to the right."""
+
+    frame: FloatArray  # (3,) pose of the frame in the map: x [m], y [m], heading [rad]
+    box: FloatArray  # (4,) min x, min y, max x, max y in the frame [m]
+
+    def place(self, points: FloatArray) -> FloatArray:
+        """Points (K, 2) of the map in the frame."""
+        return turned(points - self.frame[:2], float(self.frame[2]))
+
+    @property
+    def map_box(self) -> FloatArray:
+        """(4,) min x, min y, max x, max y of all that the box covers of the map [m]."""
+        x0, y0, x1, y1 = self.box
+        corners = turned(np.array([(x0, y0), (x0, y1), (x1, y0), (x1, y1)]), -float(self.frame[2]))
+        return box_around([corners + self.frame[:2]])
+
+
+def draw_paths(
     axes: Any,
     scenario: Scenario,
     shown: Sequence[ShownRollout],
     styles: Mapping[str, Style],
-    extent: FloatArray,
-) -> None:
-    """What does not move: the map, and the paths of the recorded driver and of the rollouts."""
-    draw_map(axes, scenario.map, scenario.route, extent)
+    view: View,
+    upto: int | None = None,
+) -> list[Any]:
+    """The paths of the recorded driver and of the rollouts, these up to a sample; their lines."""
     dotted = {"color": RECORDED, "linewidth": 1.1, "linestyle": ":", "zorder": 6.5}
-    axes.plot(*scenario.expert[:, :2].T, label="recorded driver", **dotted)
+    axes.plot(*view.place(scenario.expert[:, :2]).T, label="recorded driver", **dotted)
+    lines = []
     for number, item in enumerate(shown):
         ego, style = item.log.ego, styles[item.planner]
         every = (min(10 + number * _EVERY // len(shown), len(ego) - 1), _EVERY)
         look = {"linewidth": 1.8, "linestyle": dashes(item.noise), "markevery": every}
         look |= style.marks(item.noise, 5.5)
-        axes.plot(ego[:, 0], ego[:, 1], zorder=6, label=caption(item, shown), **look)
+        path = view.place(ego[:upto, :2])
+        lines += axes.plot(*path.T, zorder=6, label=caption(item, shown), **look)
+    return lines
 
 
 def draw_moment(
@@ -60,6 +80,7 @@ def draw_moment(
     shown: Sequence[ShownRollout],
     styles: Mapping[str, Style],
     row: int,
+    view: View,
 ) -> list[Any]:
     """What moves, at one sample: the tracks, and the egos of the rollouts, or the recorded one."""
     drawn: list[Any] = []
@@ -68,7 +89,8 @@ def draw_moment(
     for kind in np.unique(tracks.kinds):
         there = tracks.valid[row] & (tracks.kinds == kind)
         colour = AGENTS.get(AgentKind(int(kind)), OTHER_AGENT)
-        drawn += _boxes(axes, tracks.poses[row, there], tracks.sizes[row, there], facecolors=colour)
+        poses = to_frame(tracks.poses[row, there], view.frame)
+        drawn += _boxes(axes, poses, tracks.sizes[row, there], facecolors=colour)
     size = np.array([[PACIFICA.length, PACIFICA.width]])
     for item in items:
         colour = styles[item.planner].colour if shown else RECORDED
@@ -76,7 +98,8 @@ def draw_moment(
         if item.noise != "none":  # hollow and dashed
             look = {"facecolors": "#ffffffd0", "edgecolors": colour, "linewidths": 1.6}
             look["linestyles"] = [(0, (2.2, 1.0))]
-        drawn += _boxes(axes, center_poses(item.log.ego[row : row + 1, :3]), size, zorder=7, **look)
+        pose = to_frame(center_poses(item.log.ego[row : row + 1, :3]), view.frame)
+        drawn += _boxes(axes, pose, size, zorder=7, **look)
     return drawn
 
 
@@ -97,7 +120,7 @@ def draw_map(
     axes: Any,
     road: VectorMap,
     route: Sequence[str],
-    extent: FloatArray,
+    view: View,
     areas: Mapping[str, str] = _AREAS,
     lines: Mapping[str, str] = _LINES,
 ) -> None:
@@ -106,7 +129,10 @@ def draw_map(
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path as Outline
 
-    layers = map_lines(road, route, extent)
+    layers = {
+        name: [view.place(line) for line in found]
+        for name, found in map_lines(road, route, view.map_box).items()
+    }
     for name, colour in areas.items():
         if layers[name]:
             outline = Outline.make_compound_path(*(Outline(r, closed=True) for r in layers[name]))
@@ -116,15 +142,16 @@ def draw_map(
         axes.add_collection(thin, autolim=False)
 
 
-def draw_scale(axes: Any, extent: FloatArray) -> None:
+def draw_scale(axes: Any, view: View) -> None:
     """A bar of a round length in the lower left corner."""
-    width = extent[2] - extent[0]
+    width = view.box[2] - view.box[0]
     length = next(v for v in (100, 50, 20, 10, 5, 2, 1) if v <= max(width / 4.0, 1.0))
-    x, y = extent[0] + 0.04 * width, extent[1] + 0.04 * (extent[3] - extent[1])
-    axes.plot([x, x + length], [y, y], color="black", linewidth=2, zorder=9)
+    x, y, frame = 0.04, 0.05, axes.transAxes
+    axes.plot([x, x + length / width], [y, y], "k", lw=2, zorder=9, transform=frame)
     box = {"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 1.0}
-    place = {"xytext": (0, 5), "textcoords": "offset points", "ha": "center", "va": "bottom"}
-    axes.annotate(f"{length} m", (x + length / 2.0, y), fontsize=SMALL, bbox=box, zorder=9, **place)
+    place = {"xytext": (0, 3), "textcoords": "offset points", "ha": "center", "va": "bottom"}
+    at = {"xy": (x + length / width / 2.0, y), "xycoords": frame}
+    axes.annotate(f"{length} m", **at, fontsize=SMALL, bbox=box, zorder=9, **place)
 
 
 def caption(item: ShownRollout, shown: Sequence[ShownRollout]) -> str:
@@ -152,7 +179,7 @@ class Mark(NamedTuple):
 
 
 def draw_violation(
-    axes: Any, item: ShownRollout, style: Style, *, in_short: bool = False
+    axes: Any, item: ShownRollout, style: Style, view: View, *, in_short: bool = False
 ) -> Mark | None:
     """A burst where the worst violation began, and what it was; `in_short` without numbers."""
     worst = worst_moment(violations(item.metrics))
@@ -160,48 +187,59 @@ def draw_violation(
         return None
     time_us = item.log.time_us
     row = int(np.searchsorted(time_us, time_us[0] + worst.time * 1e6 - 1.0))
-    place = center_poses(item.log.ego[min(row, len(time_us) - 1), :3])[:2]
+    place = view.place(center_poses(item.log.ego[min(row, len(time_us) - 1), :3])[:2])
     look = {"linestyle": "none", "marker": BURST, "markersize": 11, "markeredgecolor": "white"}
     (burst,) = axes.plot(*place[:, None], color=ALARM, zorder=9, **look)
     box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": style.colour, "lw": 0.9}
     leader = {"arrowstyle": "-", "color": style.colour, "lw": 0.8, "shrinkA": 0, "shrinkB": 4}
-    is_right = place[0] > sum(axes.get_xlim()) / 2.0
     words = violation_words(worst.row, item.log.tracks)
     label = axes.annotate(
         words.partition(",")[0] if in_short else words,
         place,
-        xytext=(-6 if in_short and is_right else 6, 12 if in_short else 6),
-        ha="right" if in_short and is_right else "left",
+        xytext=(6, 6),
         textcoords="offset points",
-        fontsize=SMALL - 1,
+        fontsize=SMALL,
         bbox=box,
         arrowprops=leader,
         zorder=10,
+        annotation_clip=False,
+        in_layout=False,
     )
     return Mark(worst.time, burst, label)
 
 
-def spread_labels(figure: Any, axes: Any, marks: Sequence[Mark]) -> None:
+def show_from(mark: Mark, time: float) -> None:
+    """Show a mark if it is one of a moment up to a time, and inside the picture."""
+    for artist in (mark.burst, mark.label):
+        artist.set_visible(mark.time <= time + 1e-6)
+    mark.label.set_annotation_clip(True)
+
+
+def spread_labels(
+    figure: Any, axes: Any, marks: Sequence[Mark], *, keep_inside: bool = True
+) -> None:
     """Move the labels of marks to where they cover neither one another nor other words.
 
-    Nor marks and paths. Each takes the best of some places around its mark, the nearest one where
-    several are as good.
+    Nor marks and paths, and, if wanted, where they are inside the picture. Each takes the best of
+    some places around its mark, the nearest one where several are as good.
     """
     from matplotlib.transforms import Bbox
 
     figure.draw_without_rendering()
     renderer, frame = figure.canvas.get_renderer(), axes.get_window_extent()
     unit = figure.dpi / 72.0  # pixels per point
-    paths = axes.transData.transform(np.concatenate([line.get_xydata() for line in axes.lines]))
+    paths = np.concatenate(
+        [line.get_transform().transform(line.get_xydata()) for line in axes.lines]
+    )
     taken = [mark.burst.get_window_extent(renderer).padded(6.0 * unit) for mark in marks]
     others = set(axes.texts) - {mark.label for mark in marks}  # the scale
-    taken += [words.get_window_extent(renderer) for words in others]
+    taken += [words.get_window_extent(renderer).padded(4.0 * unit) for words in others]
 
     def cost(spot: Any) -> float:
         inside = Bbox.intersection(spot, frame)
         cut = 1.0 - (inside.width * inside.height / (spot.width * spot.height) if inside else 0.0)
         covered = min(spot.count_contains(paths) / 20.0, 0.9)
-        return float(sum(map(spot.overlaps, taken)) + 9.0 * cut + covered)
+        return float(sum(map(spot.overlaps, taken)) + 9.0 * cut * keep_inside + covered)
 
     for mark in marks:
         box = mark.label.get_bbox_patch().get_window_extent(renderer)

@@ -1,7 +1,8 @@
 """Stills and films: the driven paths of several rollouts over the map, as the paper shows them."""
 
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.util import find_spec
 from io import StringIO
@@ -12,9 +13,12 @@ from typing import Any
 import numpy as np
 
 from shiftsim.errors import ConfigError, MissingExtraError
+from shiftsim.geometry.boxes import to_frame
 from shiftsim.kernels import FloatArray
-from shiftsim.report.palette import Style, new_figure, planner_styles, save_picture
+from shiftsim.report import palette
+from shiftsim.report.palette import DEFAULT_FORM, SMALL, TEXT, FigureFormat, Style, characters
 from shiftsim.view import drawing
+from shiftsim.view.drawing import View
 from shiftsim.view.scene import Replay, ShownRollout, box_around
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
@@ -22,13 +26,14 @@ from shiftsim.world.scenario import Scenario
 STILLS = (".pdf", ".png", ".svg")
 FILMS = (".mp4", ".gif")
 _PAD = 12.0  # m around the driven paths
-_FPS = 10
+_FPS, _MOST_FPS = 10, 20  # samples per second, pictures per second of a film
 _KEY = "dotted: the recorded driver; red mark: where most of the score was lost"
 _FILM_DPI = 100
-_LARGEST = 6.0  # inches, of a single scene
+_FLAT, _TALL = 0.5, 0.8  # height of a scene by its width, at least and at most
+_NEAR = np.array([25.0, 15.0])  # m along and across around the ego, in grids and films
+_HIGHEST = 9.0  # inches, of a grid: the text of a page
+_NARROW = 5.0  # inches; there, marks are named without numbers
 _EDITED = "#7b2fbf"  # as in replays
-_EDIT_WIDTH = 110  # characters of the words below the picture of an edit
-_WIDTH = 7.2  # inches, of a grid: the text of a paper in two columns
 
 
 def save_figure(
@@ -38,15 +43,14 @@ def save_figure(
     *,
     at: Sequence[float] = (0.0,),
     in_grid: bool = False,
-    note: str = "",
+    form: FigureFormat = DEFAULT_FORM,
+    speed: float = 1.0,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
-    """A still `at` seconds from the start, or a film of it all, by the ending of the file's name.
-
-    Several times, or `in_grid`, give a figure with a row per rollout and a column per time. `note`
-    says below the picture what it leaves out.
+    """A picture, or a film of all samples that is so much faster, by the ending of the file's name.
 
     Raises:
-        ConfigError: The ending or a time is none of those possible.
+        ConfigError: The ending, a time or the speed is none of those possible.
         MissingExtraError: matplotlib, or for mp4 ffmpeg, is missing.
     """
     if path.suffix.lower() not in STILLS + FILMS:
@@ -54,90 +58,151 @@ def save_figure(
             f"{str(path)!r} ends in {path.suffix!r}",
             hint=f"pictures: {' '.join(STILLS)}; films: {' '.join(FILMS)}",
         )
+    if not 0.1 <= speed <= 100.0:
+        raise ConfigError(f"speed {speed:g} is not within 0.1 … 100", hint="--speed 2")
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix.lower() in FILMS:
-        _film(path, scenario, shown, note)
-    elif in_grid or len(at) > 1:
-        save_picture(grid(scenario, shown, at=at, note=note), path)
+        _film(path, scenario, shown, form=form, speed=speed, on_progress=on_progress)
     else:
-        save_picture(still(scenario, shown, at=at[0], note=note), path)
+        drawn = picture(scenario, shown, at=at, in_grid=in_grid, form=form)
+        palette.save_picture(drawn, path)
 
 
-def still(
-    scenario: Scenario, shown: Sequence[ShownRollout] = (), *, at: float = 0.0, note: str = ""
+@palette.in_format
+def picture(
+    scenario: Scenario,
+    shown: Sequence[ShownRollout] = (),
+    *,
+    at: Sequence[float] = (0.0,),
+    in_grid: bool = False,
+    form: FigureFormat = DEFAULT_FORM,
 ) -> Any:
-    """A matplotlib figure of the moment `at` seconds from the start, as recorded if none is shown.
+    """A matplotlib figure of moments [s from the start]: as recorded if no rollout is shown.
+
+    One moment is a still, whose axes are those of the map. Several, or `in_grid`, give a row per
+    rollout and a column per moment: every panel shows the surroundings of its ego, which drives to
+    the right, with its path so far.
 
     Raises:
         ConfigError: There is no such time.
         MissingExtraError: matplotlib is missing.
     """
-    row = _sample_at(scenario, shown, at)
-    figure, axes, _ = _scene(scenario, shown, at, note)
-    drawing.draw_moment(axes, scenario, shown, _styles(shown), row)
+    if in_grid or len(at) > 1:
+        return _grid(scenario, shown, at, form)
+    view = View(np.zeros(3), _extent(Replay(scenario, shown).paths))
+    row = _sample_at(scenario, shown, at[0])
+    figure, axes, _, marks = _scene(scenario, shown, view, view, form)
+    drawing.draw_moment(axes, scenario, shown, _styles(shown), row, view)
+    _heading(axes, scenario, at[0], form)
+    drawing.spread_labels(figure, axes, marks)
     return figure
 
 
 def _scene(
-    scenario: Scenario, shown: Sequence[ShownRollout], at: float, note: str
-) -> tuple[Any, Any, list[drawing.Mark]]:
-    """Figure and axes with all that does not move, and the marks of violations."""
-    extent, styles = _extent(Replay(scenario, shown).paths), _styles(shown)
-    figure, ((axes,),) = _panels(1, 1, extent)
-    drawing.draw_scene(axes, scenario, shown, styles, extent)
-    found = (drawing.draw_violation(axes, item, styles[item.planner]) for item in shown)
-    marks = [mark for mark in found if mark]
-    drawing.draw_scale(axes, extent)
-    _heading(axes, scenario, at)
-    axes.set_xlabel(note, fontsize=drawing.SMALL)
-    _add_legend(figure, axes)
-    drawing.spread_labels(figure, axes, marks)
-    return figure, axes, marks
+    scenario: Scenario, shown: Sequence[ShownRollout], view: View, whole: View, form: FigureFormat
+) -> tuple[Any, Any, list[Any], list[drawing.Mark]]:
+    """Figure and axes with all that does not move, the paths, and the marks of violations.
 
-
-def grid(
-    scenario: Scenario, shown: Sequence[ShownRollout], *, at: Sequence[float], note: str = ""
-) -> Any:
-    """A matplotlib figure with a row per rollout and a column per moment [s from the start].
-
-    Raises:
-        ConfigError: There is no such time.
-        MissingExtraError: matplotlib is missing.
+    `whole` is the view of all that will be seen.
     """
+    styles = _styles(shown)
+    figure, (axes,) = _panels(1, view, form)
+    drawing.draw_map(axes, scenario.map, scenario.route, whole)
+    paths = drawing.draw_paths(axes, scenario, shown, styles, view)
+    look = {"in_short": figure.get_figwidth() < _NARROW}
+    found = [drawing.draw_violation(axes, one, styles[one.planner], view, **look) for one in shown]
+    drawing.draw_scale(axes, view)
+    _heading(axes, scenario, 0.0, form)
+    note = "" if form.plain else form.note
+    axes.set_xlabel(_wrapped(note, characters(figure.get_figwidth())), fontsize=SMALL)
+    _add_legend(figure, axes)
+    return figure, axes, paths, [mark for mark in found if mark]
+
+
+def _grid(
+    scenario: Scenario, shown: Sequence[ShownRollout], at: Sequence[float], form: FigureFormat
+) -> Any:
+    """The figure with a row per rollout and a column per moment."""
     rows = [_sample_at(scenario, shown, time) for time in at]
-    extent, styles = _extent(Replay(scenario, shown).paths), _styles(shown)
-    figure, panels = _panels(len(shown), len(at), extent)
-    sides = extent[2:] - extent[:2]
-    per_line = max(20, int(15 * sides[1] / sides[0] * _width(len(at), extent)))  # characters
-    for item, line in zip(shown, panels, strict=True):
-        for row, axes in zip(rows, line, strict=True):
-            drawing.draw_scene(axes, scenario, [item], styles, extent)
-            drawing.draw_moment(axes, scenario, [item], styles, row)
-            drawing.draw_violation(axes, item, styles[item.planner], in_short=True)
-        line[0].set_ylabel(
-            _wrapped(drawing.caption(item, shown), per_line), fontsize=drawing.SMALL - 1
-        )
-    for time, axes in zip(at, panels[0], strict=True):
-        axes.set_title(f"{time:g} s", fontsize=drawing.SMALL + 1)
-    drawing.draw_scale(panels[-1][0], extent)
-    figure.supxlabel("\n".join(filter(None, (_KEY, note))), fontsize=drawing.SMALL - 1)
-    figure.suptitle(_words(scenario), fontsize=drawing.SMALL + 1)
+    styles, width = _styles(shown), form.width or palette.PAGE
+    around, length = View(np.zeros(3), np.array([*-_NEAR, *_NEAR])), characters(width)
+    captions = [_wrapped(drawing.caption(item, shown), length) for item in shown]
+    below = "\n".join(_wrapped(words, length) for words in (_KEY, form.note) if words)
+    above = _wrapped(_words(scenario), characters(width, TEXT))
+    above, below = ("", "") if form.plain else (above, below)
+    figure, panels = _cells(width, len(at), captions, above, below)
+    for item, line, caption in zip(shown, panels, captions, strict=True):
+        line[0].set_title(caption, fontsize=SMALL, loc="left", pad=3)
+        for row, time, axes in zip(rows, at, line, strict=True):
+            view = around._replace(frame=item.log.ego[row, :3])
+            _set_view(axes, view.box)
+            drawing.draw_map(axes, scenario.map, scenario.route, view)
+            drawing.draw_paths(axes, scenario, [item], styles, view, row + 1)
+            drawing.draw_moment(axes, scenario, [item], styles, row, view)
+            mark = drawing.draw_violation(axes, item, styles[item.planner], view, in_short=True)
+            if mark:
+                where = {"anncoords": "axes fraction", "position": (0.5, 0.95)}
+                mark.label.set(**where, ha="center", va="top")
+                drawing.show_from(mark, time)
+    for time, axes in zip(at, panels[-1], strict=True):
+        axes.set_xlabel(f"{time:g} s", fontsize=TEXT, labelpad=2)
+    drawing.draw_scale(panels[-1][0], around)
     return figure
 
 
-def overview(thing: Scenario | VectorMap) -> Any:
+def _cells(
+    width: float, columns: int, captions: Sequence[str], above: str, below: str
+) -> tuple[Any, list[list[Any]]]:
+    """A figure of a width [inch] with rows of axes, a caption above each row, and words around."""
+    top, bottom = _height(above, TEXT), _height(below, SMALL) + 0.2  # where times stand
+    strips = [_height(caption, SMALL) for caption in captions]
+    room = (_HIGHEST - top - bottom - sum(strips)) / len(captions)
+    side = min((width - 0.04 * (columns + 1)) / columns, room * _NEAR[0] / _NEAR[1])
+    tall = side * _NEAR[1] / _NEAR[0]
+    height = top + sum(strips) + tall * len(captions) + bottom
+    figure, y, rows = palette.new_figure(None, figsize=(width, height)), height - top, []
+    for strip in strips:
+        y -= strip + tall
+        lefts = [0.04 + (side + 0.04) * column for column in range(columns)]
+        places = [(x / width, y / height, side / width, tall / height) for x in lefts]
+        rows.append([figure.add_axes(place) for place in places])
+    figure.text(0.5, 1.0 - 0.03 / height, above, fontsize=TEXT, ha="center", va="top")
+    figure.text(0.5, 0.03 / height, below, fontsize=SMALL, ha="center", va="bottom")
+    return figure, rows
+
+
+def _height(text: str, size: float) -> float:
+    """Height of lines [inch], with some room."""
+    return len(text.splitlines()) * 1.25 * size / 72.0 + 0.06
+
+
+def overview(
+    thing: Scenario | VectorMap,
+    *,
+    width: float | str | None = None,
+    serif: bool = False,
+    plain: bool = False,
+) -> Any:
     """A matplotlib figure of a scenario at its first iteration, or of a whole map.
 
+    It is as wide as a column of a paper, in inches or as `3.5in`, and `plain` without its title.
+
     Raises:
+        ConfigError: The width is none.
         MissingExtraError: matplotlib is missing.
     """
-    if isinstance(thing, Scenario):
-        return still(thing)
+    form = FigureFormat.of(width, serif=serif, plain=plain)
+    return picture(thing, form=form) if isinstance(thing, Scenario) else _map(thing, form=form)
+
+
+@palette.in_format
+def _map(thing: VectorMap, *, form: FigureFormat) -> Any:
     bounds = thing.edges.polygons.bounds
-    extent = _extent([bounds[:, :2], bounds[:, 2:]])
-    figure, ((axes,),) = _panels(1, 1, extent)
-    drawing.draw_map(axes, thing, (), extent)
-    drawing.draw_scale(axes, extent)
+    view = View(np.zeros(3), _extent([bounds[:, :2], bounds[:, 2:]]))
+    figure, (axes,) = _panels(1, view, form)
+    drawing.draw_map(axes, thing, (), view)
+    drawing.draw_scale(axes, view)
+    _trim(figure)
     return figure
 
 
@@ -151,18 +216,20 @@ def before_and_after(recorded: Scenario, edited: Scenario) -> Any:
     names, words = (edited.script.tokens, edited.script.words) if edited.script else ((), ())
     is_edited = np.array([name in names for name in tracks.tokens], np.bool_)
     changed = tracks.poses[row, tracks.valid[row] & is_edited, :2]
-    extent = _extent([recorded.expert[:, :2], edited.expert[:, :2], changed])
-    figure, (both,) = _panels(1, 2, extent)
+    paths = [recorded.expert[:, :2], edited.expert[:, :2], changed]
+    view = View(np.zeros(3), _extent(paths))
+    figure, both = _panels(2, view, DEFAULT_FORM)
     for scenario, axes in zip((recorded, edited), both, strict=True):
-        drawing.draw_scene(axes, scenario, (), {}, extent)
-        drawing.draw_moment(axes, scenario, (), {}, 0)
-        drawing.draw_scale(axes, extent)
+        drawing.draw_map(axes, scenario.map, scenario.route, view)
+        drawing.draw_paths(axes, scenario, (), {}, view)
+        drawing.draw_moment(axes, scenario, (), {}, 0, view)
+        drawing.draw_scale(axes, view)
         title = f"{scenario.token}  {scenario.scenario_type}"
-        axes.set_title(title.replace("$", r"\$"), fontsize=9)
+        axes.set_title(_wrapped(title, characters(figure.get_figwidth(), TEXT) // 2), fontsize=TEXT)
     ring = {"s": 90, "facecolors": "none", "edgecolors": _EDITED, "linewidths": 1.4, "zorder": 8}
     both[1].scatter(*changed.T, label="edited", **ring)
-    lines = [part for line in words for part in wrap(line, _EDIT_WIDTH)]
-    figure.supxlabel("\n".join(lines), fontsize=8)
+    lines = [_wrapped(line, characters(figure.get_figwidth())) for line in words]
+    figure.supxlabel("\n".join(lines), fontsize=SMALL)
     _add_legend(figure, both[1])
     return figure
 
@@ -175,7 +242,7 @@ def svg_of(figure: Any) -> str:
 
 
 def _styles(shown: Sequence[ShownRollout]) -> dict[str, Style]:
-    return planner_styles(item.planner for item in shown)
+    return palette.planner_styles(item.planner for item in shown)
 
 
 def _times(scenario: Scenario, shown: Sequence[ShownRollout]) -> FloatArray:
@@ -195,49 +262,46 @@ def _extent(paths: Sequence[FloatArray]) -> FloatArray:
     """(4,) min x, min y, max x, max y of a picture that shows paths (N, 2) [m]."""
     low, high = box_around(paths, _PAD).reshape(2, 2)
     middle, half = (low + high) / 2.0, (high - low) / 2.0
-    half = np.maximum(half, half.max() * 0.5)  # never a mere strip
+    half = np.maximum(half, (half[1] / _TALL, half[0] * _FLAT))  # neither a strip nor a tower
     return np.array([*(middle - half), *(middle + half)])
 
 
-def _panels(rows: int, columns: int, extent: FloatArray) -> tuple[Any, Any]:
-    """A figure with axes (rows, columns) that are as wide and high as the extent needs."""
-    sides, width = extent[2:] - extent[:2], _width(columns, extent)
-    height = width * sides[1] / sides[0]
-    size = (width * columns + 0.4, (height + 0.1) * rows + 0.5)
-    figure = new_figure(layout="compressed", figsize=size)
-    grid_of_axes = figure.subplots(rows, columns, squeeze=False)
-    for axes in grid_of_axes.flat:
-        axes.set_xlim(extent[0], extent[2])
-        axes.set_ylim(extent[1], extent[3])
-        axes.set_aspect("equal")
-        axes.set_xticks([])
-        axes.set_yticks([])
-    return figure, grid_of_axes
+def _panels(columns: int, view: View, form: FigureFormat) -> tuple[Any, Any]:
+    """A figure with axes side by side that are as high as the view needs."""
+    width = form.width or palette.PAGE
+    sides = view.box[2:] - view.box[:2]
+    height = width / columns * sides[1] / sides[0] + 0.5
+    figure = palette.new_figure("compressed", figsize=(width, height))
+    axes = figure.subplots(1, columns, squeeze=False)[0]
+    for one in axes:
+        _set_view(one, view.box)
+    return figure, axes
 
 
-def _width(columns: int, extent: FloatArray) -> float:
-    """Width of one scene of a row [inch]."""
-    sides = extent[2:] - extent[:2]
-    return float(min(_WIDTH / columns, _LARGEST * sides[0] / sides.max()))
+def _set_view(axes: Any, box: FloatArray) -> None:
+    """Show a box, with neither ticks nor distortion."""
+    axes.set(xlim=box[::2], ylim=box[1::2], aspect="equal", xticks=[], yticks=[])
+    axes.spines[:].set(linewidth=0.6)
 
 
 def _add_legend(figure: Any, axes: Any) -> None:
-    """Beside a tall scene, else below it; the figure grows by as much."""
-    width, height = figure.get_size_inches()
-    is_tall = height > 1.3 * width
-    place = "outside right upper" if is_tall else "outside lower left"
-    look: dict[str, Any] = {"fontsize": drawing.SMALL, "frameon": False, "handlelength": 3.0}
+    """Below the scene; the figure grows by as much."""
+    look: dict[str, Any] = {"fontsize": SMALL, "frameon": False, "handlelength": 3.0}
     handles, labels = axes.get_legend_handles_labels()
-    length = 38 if is_tall else 85  # characters
+    length = characters(figure.get_figwidth()) - 8  # beside a line of the legend
     labels = [_wrapped(label, length, subsequent_indent="  ") for label in labels]
-    legend = figure.legend(handles, labels, loc=place, **look)
+    legend = figure.legend(handles, labels, loc="outside lower left", **look)
     box = legend.get_window_extent(figure.canvas.get_renderer())
-    own_width, own_height = box.width / figure.dpi + 0.1, box.height / figure.dpi + 0.1
-    if is_tall:
-        figure.set_size_inches(width + own_width, max(height, own_height))
-    else:
-        figure.set_size_inches(max(width, own_width), height + own_height)
-    figure.draw_without_rendering()  # the layout settles in two steps
+    width, height = figure.get_size_inches()
+    figure.set_size_inches(width, height + box.height / figure.dpi + 0.05)
+    _trim(figure)
+
+
+def _trim(figure: Any) -> None:
+    """Make a figure as high as what is in it; the layout settles in two steps."""
+    figure.draw_without_rendering()
+    figure.set_size_inches(figure.get_figwidth(), figure.get_tightbbox().height + 0.08)
+    figure.draw_without_rendering()
 
 
 def _wrapped(text: str, length: int, **settings: Any) -> str:
@@ -250,35 +314,76 @@ def _words(scenario: Scenario) -> str:
     return "  ".join(words).replace("$", r"\$")
 
 
-def _heading(axes: Any, scenario: Scenario, time: float) -> None:
-    axes.set_title(f"{_words(scenario)}  {time:.1f} s", fontsize=drawing.SMALL + 1)
+def _heading(axes: Any, scenario: Scenario, time: float, form: FigureFormat) -> None:
+    words = "" if form.plain else f"{_words(scenario)}  {time:.1f} s"
+    length = characters(axes.figure.get_figwidth(), TEXT)
+    axes.set_title(_wrapped(words, length), fontsize=TEXT)
 
 
-def _film(path: Path, scenario: Scenario, shown: Sequence[ShownRollout], note: str) -> None:
-    """All samples, one after the other; a violation is marked from its first moment on."""
-    figure, axes, marks = _scene(scenario, shown, 0.0, note)
-    from matplotlib.animation import FFMpegWriter, PillowWriter
+@palette.in_format
+def _film(
+    path: Path,
+    scenario: Scenario,
+    shown: Sequence[ShownRollout],
+    *,
+    form: FigureFormat,
+    speed: float,
+    on_progress: Callable[[int, int], None],
+) -> None:
+    """The samples, one after the other; paths grow, a violation is marked from its moment on.
 
-    writer: Any = PillowWriter(fps=_FPS)
-    if path.suffix.lower() == ".mp4":
-        if not _has_ffmpeg(FFMpegWriter):
-            raise MissingExtraError(
-                "mp4 needs ffmpeg",
-                hint="install ffmpeg, or pip install imageio-ffmpeg, or write a .gif",
-            )
-        writer = FFMpegWriter(fps=_FPS, extra_args=["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2"])
-    styles = _styles(shown)
+    The view has the size and direction that it needs to follow all egos.
+    """
+    view, centres = _following(scenario, shown)
+    whole = view._replace(box=box_around([centres]) + view.box)
+    figure, axes, lines, marks = _scene(scenario, shown, view, whole, form)
+    drawing.spread_labels(figure, axes, marks, keep_inside=False)
+    writer, step = _writer(path, speed)
     figure.set_layout_engine("none")  # it is laid out, and each frame would be again
+    driven = [line.get_xydata() for line in lines]
+    times = _times(scenario, shown).tolist()
     with writer.saving(figure, str(path), _FILM_DPI):
-        for row, time in enumerate(_times(scenario, shown).tolist()):
-            drawn = drawing.draw_moment(axes, scenario, shown, styles, row)
+        for row in range(0, len(times), step):
+            drawn = drawing.draw_moment(axes, scenario, shown, _styles(shown), row, view)
+            for line, xy in zip(lines, driven, strict=True):
+                line.set_data(*xy[: row + 1].T)
             for mark in marks:
-                for artist in (mark.burst, mark.label):
-                    artist.set_visible(mark.time <= time + 1e-6)
-            _heading(axes, scenario, time)
+                drawing.show_from(mark, times[row])
+            box = view.box + np.tile(centres[row], 2)
+            axes.set(xlim=box[::2], ylim=box[1::2])
+            _heading(axes, scenario, times[row], form)
             writer.grab_frame()
+            on_progress(min(row + step, len(times)), len(times))
             for artist in drawn:
                 artist.remove()
+
+
+def _following(scenario: Scenario, shown: Sequence[ShownRollout]) -> tuple[View, FloatArray]:
+    """A view around its origin, and its centres (T, 2) as it follows all egos."""
+    start, way = scenario.expert[0, :3], scenario.expert[-1, :2] - scenario.expert[0, :2]
+    heading = np.arctan2(way[1], way[0]) if np.hypot(*way) > 1.0 else start[2]
+    frame = np.array([*start[:2], heading])
+    egos = np.array([to_frame(item.log.ego[:, :3], frame)[:, :2] for item in shown])
+    low, high = egos.min(axis=0), egos.max(axis=0)
+    half = ((high - low) / 2.0).max(axis=0) + _NEAR
+    half = np.maximum(half, (half[1] / _TALL, half[0] * _FLAT))
+    return View(frame, np.array([*-half, *half])), (low + high) / 2.0
+
+
+def _writer(path: Path, speed: float) -> tuple[Any, int]:
+    """What writes a film, and every how many samples it has a picture."""
+    from matplotlib.animation import FFMpegWriter, PillowWriter
+
+    step = math.ceil(_FPS * speed / _MOST_FPS)
+    fps: Any = _FPS * speed / step
+    if path.suffix.lower() != ".mp4":
+        return PillowWriter(fps=fps), step
+    if not _has_ffmpeg(FFMpegWriter):
+        raise MissingExtraError(
+            "mp4 needs ffmpeg",
+            hint="install ffmpeg, or pip install imageio-ffmpeg, or write a .gif",
+        )
+    return FFMpegWriter(fps=fps, extra_args=["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2"]), step
 
 
 def _has_ffmpeg(writer: Any) -> bool:

@@ -11,7 +11,7 @@ from shiftsim.data.readers.tracks.table import TrackTable
 from shiftsim.data.store.reading import open_store
 from shiftsim.kernels import FloatArray
 from shiftsim.report.palette import AGENTS, OTHER_AGENT, RECORDED, new_figure, save_picture
-from shiftsim.view.drawing import draw_map
+from shiftsim.view.drawing import View, draw_map
 from shiftsim.view.scene import box_around, indices_near
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AgentKind
@@ -78,7 +78,8 @@ def _words(inspection: TracksReader, egos: Egos) -> list[str]:
 def _draw_panel(axes: Any, inspection: TracksReader, egos: Egos, extent: FloatArray) -> None:
     pad = _MARGIN * max(float((extent[2:] - extent[:2]).max()), 10.0)
     box = box_around([extent.reshape(2, 2)], pad)
-    draw_map(axes, inspection.road, (), box, {"drivable": "#c9cbca"}, {"centre": "#b8b8b2"})
+    view = View(np.zeros(3), box)
+    draw_map(axes, inspection.road, (), view, {"drivable": "#c9cbca"}, {"centre": "#b8b8b2"})
     _draw_directions(axes, inspection.road, box)
     _draw_tracks(axes, inspection.table)
     _draw_egos(axes, egos)
@@ -143,5 +144,5 @@ def _draw_egos(axes: Any, egos: Egos) -> None:
             to = x[-1] + 6.0 * np.cos(heading[-1]), y[-1] + 6.0 * np.sin(heading[-1])
             style = {"arrowstyle": "-|>", "color": RECORDED}
             axes.annotate("", xy=to, xytext=(x[-1], y[-1]), arrowprops=style, zorder=5)
-            text: dict[str, Any] = {"xytext": (4, 3), "textcoords": "offset points", "fontsize": 6}
+            text: dict[str, Any] = {"xytext": (4, 3), "textcoords": "offset points", "fontsize": 7}
             axes.annotate(name, (x[0], y[0]), color=RECORDED, zorder=6, **text)

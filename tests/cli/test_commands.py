@@ -102,7 +102,7 @@ def test_flags_win_over_the_settings_file(place):
         (("run", "--config", "absent.toml"), 1, "cannot read 'absent.toml'", "check the path"),
         (("run", "-p", "mine:Absent", "-s", "toy"), 1, "no class 'Absent'", "Failing, Slow"),
         (("report", "runs/absent"), 1, "no run folder", "runs/good"),
-        (("explain", "runs/good", "beef"), 1, "no scenario 'beef'", "did you mean"),
+        (("explain", "runs/good", "beef"), 1, "no scenario 'beef'", "there are 00"),
         (("check", "absent"), 2, "absent", ""),
         (("verify", "."), 1, "without --experiment", "pytest tests/parity --reference DIR"),
         (("jump",), 1, "No such command", "--help"),

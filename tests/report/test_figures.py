@@ -1,13 +1,14 @@
 """Pictures of a report."""
 
+import numpy as np
 import pytest
 from made_runs import random_scores, write_run
-from pictures import cut_off, overlaps, written
+from pictures import cut_off, overlaps, sizes_in_pdf, smallest, written
 
 from shiftsim.report import palette
 from shiftsim.report.build import write_report
 from shiftsim.report.groups import read_groups
-from shiftsim.report.palette import planner_styles
+from shiftsim.report.palette import FigureFormat, planner_styles
 from shiftsim.report.words import LONG
 from shiftsim.train import folder
 
@@ -31,10 +32,10 @@ def groups(run):
     return read_groups([run])
 
 
-def drawn(groups):
+def drawn(groups, **form):
     from shiftsim.report.figures import figures
 
-    return {figure.name: figure for figure in figures(groups)}
+    return {figure.name: figure for figure in figures(groups, form=FigureFormat.of(**form))}
 
 
 def test_there_are_pictures_of_robustness_cities_and_metrics(groups):
@@ -128,7 +129,7 @@ def test_clean_is_full_and_solid_and_noise_hollow_and_dashed(groups):
     axes = drawn(groups)["robustness_made-up"].drawn.axes[0]
     mine = [line for line in axes.lines if line.get_color() == colour]
     faces = {
-        (len(line.get_xdata()), line.get_linestyle(), line.get_markerfacecolor())
+        (np.isfinite(line.get_ydata()).sum(), line.get_linestyle(), line.get_markerfacecolor())
         for line in mine
         if line.get_marker() not in ("None", "", "_", "|")
     }
@@ -164,3 +165,58 @@ def test_the_curve_of_a_training_is_drawn_in_the_colours_of_all_pictures(tmp_pat
     assert looks == [(colour, "-"), (colour, "--")]
     assert overlaps(figure) == []
     assert cut_off(figure) == []
+
+
+@pytest.mark.parametrize("width", ["3.5in", "7in"])
+def test_letters_can_be_read_at_the_width_of_a_paper(tmp_path, width):
+    groups = read_groups([write_run(tmp_path / "run", planners=PAPER, noise=ALL)])
+    for name, figure in drawn(groups, width=width, serif=True, plain=True).items():
+        sizes, found = sizes_in_pdf(figure.save(tmp_path, "pdf"))
+        assert found == pytest.approx(float(width[:-2]), abs=0.01), name
+        assert min(sizes) >= 7.0, name
+        assert smallest(figure.drawn) >= 7.0, name
+        assert cut_off(figure.drawn) == [], name
+        assert overlaps(figure.drawn) == [], name
+
+
+def test_a_plain_figure_leaves_title_and_notes_to_the_caption(groups):
+    for figure in drawn(groups, plain=True).values():
+        words = [text for text, _ in written(figure.drawn)]
+        assert not any("made-up" in text or "bars:" in text for text in words)
+        assert any("closed-loop score" in text or "score ×" in text for text in words)
+
+
+def test_no_line_leads_over_a_level_that_was_not_run(groups):
+    white, correlated = drawn(groups)["robustness_made-up"].drawn.axes
+    gaps = {
+        tuple(np.isfinite(line.get_ydata()).tolist())
+        for axes in (white, correlated)
+        for line in axes.lines
+        if line.get_linestyle() == "--"
+    }
+    assert (True, True, False, True) in gaps  # white noise at none, low and high
+    assert (True, False, True, False) in gaps  # correlated noise at none and mid
+
+
+def test_intervals_stay_within_what_scores_can_be(tmp_path):
+    def score(planner, noise, seed, number):
+        return float(seed)  # a deviation of 70 around 50
+
+    settings = {"noise": ("none", "ou-high"), "seeds": (0, 1), "score": score}
+    figure = drawn(read_groups([write_run(tmp_path / "run", **settings)]))["robustness_made-up"]
+    (axes,) = figure.drawn.axes
+    ends = [
+        y for bars in axes.collections for path in bars.get_paths() for y in path.vertices[:, 1]
+    ]
+    assert (min(ends), max(ends)) == (0.0, 100.0)
+
+
+def test_names_stand_at_the_ends_of_lines_where_they_find_room(tmp_path):
+    for names, is_direct in ((PAPER, True), (OWN, False)):
+        groups = read_groups([write_run(tmp_path / names[0], planners=names, noise=ALL)])
+        figure = drawn(groups)["robustness_made-up"].drawn
+        (legend,) = figure.legends
+        in_legend = {text.get_text() for text in legend.get_texts()}
+        named = {text.get_text() for axes in figure.axes for text in axes.texts}
+        assert (named == {*names}) is is_direct
+        assert ({*names} <= in_legend) is not is_direct

@@ -184,7 +184,7 @@ def test_the_name_of_a_class_is_that_in_tables_unless_a_label_is_given(call, tmp
     planners = [f"{file}:Named", f"far={file}:Named", f"{file}:Borrowed"]
     words = [word for planner in planners for word in ("-p", planner)]
     more = ("--planner-arg", "far.headway=4", "--workers", 1, "--limit", 1)
-    code, out, _ = call("run", *words, *more, "--out", tmp_path / "run", "-q")
+    code, out, _ = call("run", *words, *more, "--out", tmp_path / "run")
     run = shiftsim.open_run(tmp_path / "run")
     assert code == 0
     assert f"planner     far = {file}:Named  headway=4" in out

@@ -7,14 +7,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pictures import cut_off, overlaps, written
+from pictures import cut_off, overlaps, sizes_in_pdf, smallest, written
 from worlds import cruise_scenario, standing_tracks, straight_road
 
+from shiftsim.errors import ConfigError
 from shiftsim.planners.registry import load_planner
-from shiftsim.report.palette import ALARM, RECORDED, planner_styles
+from shiftsim.report.palette import ALARM, RECORDED, FigureFormat, planner_styles
 from shiftsim.sim.loop import simulate
 from shiftsim.view.scene import ShownRollout
-from shiftsim.view.still import grid, overview, save_figure, still
+from shiftsim.view.still import overview, picture, save_figure
 from shiftsim.view.tracks import save_tracks_picture
 from shiftsim.world.state import AgentKind
 
@@ -57,7 +58,7 @@ def said(scenario, text):
 
 
 def test_a_still_says_planner_noise_score_and_metric_in_words(scenario, shown):
-    words = " ".join(text for text, _ in written(still(scenario, shown, at=1.0)))
+    words = " ".join(text for text, _ in written(picture(scenario, shown, at=[1.0])))
     plain = " ".join(words.split())
     assert "idm: score 87" in plain
     assert said(scenario, f"idm, ou-high: score 0; {IN_FULL}") in plain
@@ -68,7 +69,7 @@ def test_a_still_of_several_seeds_names_them(scenario, shown):
     noisy = [one for one in shown if one.noise != "none"][:1]
     several = [*noisy, replace(noisy[0], seed=2)]
     words = " ".join(
-        " ".join(text for text, _ in written(still(scenario, several, at=1.0))).split()
+        " ".join(text for text, _ in written(picture(scenario, several, at=[1.0]))).split()
     )
     assert f"{noisy[0].planner}, ou-high, seed 0:" in words
     assert f"{noisy[0].planner}, ou-high, seed 2:" in words
@@ -76,10 +77,10 @@ def test_a_still_of_several_seeds_names_them(scenario, shown):
 
 def test_no_words_of_a_picture_cover_others_or_are_cut_off(scenario, shown):
     for figure in (
-        still(scenario, shown, at=1.0),
-        still(scenario, shown[:1], at=0.0),
-        still(scenario, [replace(shown[1], planner="my_package.my_module:MyPlanner")], at=0.0),
-        grid(scenario, shown[:2], at=[0.0, 1.0, 2.0]),
+        picture(scenario, shown, at=[1.0]),
+        picture(scenario, shown[:1], at=[0.0]),
+        picture(scenario, [replace(shown[1], planner="my_package.my_module:MyPlanner")], at=[0.0]),
+        picture(scenario, shown[:2], at=[0.0, 1.0, 2.0]),
         overview(scenario),
         overview(scenario.map),
     ):
@@ -88,7 +89,7 @@ def test_no_words_of_a_picture_cover_others_or_are_cut_off(scenario, shown):
 
 
 def test_the_scene_fills_most_of_a_still(scenario, shown):
-    figure = still(scenario, shown[:2], at=1.0)
+    figure = picture(scenario, shown[:2], at=[1.0])
     figure.draw_without_rendering()
     (axes,) = figure.axes
     frame = axes.get_window_extent()
@@ -97,7 +98,7 @@ def test_the_scene_fills_most_of_a_still(scenario, shown):
 
 def test_noise_and_the_recorded_driver_look_the_same_in_every_picture(scenario, shown):
     colour = planner_styles(item.planner for item in shown)["idm"].colour
-    for figure in (still(scenario, shown, at=1.0), grid(scenario, shown, at=[1.0, 2.0])):
+    for figure in (picture(scenario, shown, at=[1.0]), picture(scenario, shown, at=[1.0, 2.0])):
         lines = [line for axes in figure.axes for line in axes.lines]
         mine = {
             (x.get_linestyle(), x.get_markerfacecolor()) for x in lines if x.get_color() == colour
@@ -113,7 +114,7 @@ def test_the_ego_under_noise_is_hollow(scenario, shown):
     colour = planner_styles(["idm"])["idm"].colour
     faces = []
     for item in shown[-2:]:
-        (axes,) = still(scenario, [item], at=1.0).axes
+        (axes,) = picture(scenario, [item], at=[1.0]).axes
         faces.append({to_hex(box.get_facecolor()[0]) for box in axes.collections[1:]})
     assert colour in faces[0]
     assert colour not in faces[1]
@@ -155,7 +156,7 @@ def test_words_do_not_cover_those_of_the_scale(scenario):
         ShownRollout(name, "none", 0, log, 0.0, [{**hit, "first_violation_s": 0.1 * number}])
         for number, name in enumerate(("idm", "log-future", "plantf", "pluto", "carl", "simple"))
     ]
-    assert overlaps(still(scenario, several, at=1.0)) == []
+    assert overlaps(picture(scenario, several, at=[1.0])) == []
 
 
 def test_the_picture_of_tracks_says_where_it_draws_one_row_in_several(tmp_path, monkeypatch):
@@ -173,7 +174,105 @@ def test_the_picture_of_tracks_says_where_it_draws_one_row_in_several(tmp_path, 
 
 
 def test_in_a_grid_words_stand_for_abbreviations_and_a_line_explains_marks(scenario, shown):
-    words = [text for text, _ in written(grid(scenario, shown[:2], at=[0.0, 1.0, 2.0]))]
-    assert words.count("at-fault collision") == 3
+    words = [text for text, _ in written(picture(scenario, shown[:2], at=[0.0, 1.0, 2.0]))]
+    assert words.count("at-fault collision") == 1  # from its moment on
     assert "NCR" not in words
     assert any("dotted: the recorded driver" in text for text in words)
+
+
+@pytest.mark.parametrize("width", ["3.5in", "7in", "89mm"])
+@pytest.mark.parametrize("at", [[1.0], [0.0, 1.0, 3.0]])
+def test_a_picture_of_a_paper_has_its_width_and_letters_that_can_be_read(
+    scenario, shown, tmp_path, width, at
+):
+    form = FigureFormat.of(width, serif=True, plain=True)
+
+    save_figure(tmp_path / "a.pdf", scenario, shown[:4], at=at, form=form)
+    drawn = picture(scenario, shown[:4], at=at, form=form)
+
+    sizes, found = sizes_in_pdf(tmp_path / "a.pdf")
+    assert found == pytest.approx(form.width, abs=0.01)
+    assert min(sizes) >= 7.0
+    assert smallest(drawn) >= 7.0
+    assert b"STIXGeneral" in (tmp_path / "a.pdf").read_bytes()
+    assert overlaps(drawn) == []
+    assert cut_off(drawn) == []
+
+
+def test_a_plain_picture_has_neither_title_nor_notes(scenario, shown):
+    for at in ([1.0], [0.0, 3.0]):
+        full = [
+            text
+            for text, _ in written(
+                picture(scenario, shown[:2], at=at, form=FigureFormat(note="so"))
+            )
+        ]
+        plain = [
+            text
+            for text, _ in written(
+                picture(scenario, shown[:2], at=at, form=FigureFormat(plain=True, note="so"))
+            )
+        ]
+        assert any(scenario.token in text for text in full)
+        assert not any(scenario.token in text for text in plain)
+        assert "so" not in " ".join(plain).split()
+
+
+def test_a_grid_of_four_planners_fits_a_page(scenario, shown):
+    width, height = picture(scenario, shown[:4], at=[0.0, 2.0, 3.0]).get_size_inches()
+    assert width == 7.0
+    assert height <= 9.0
+
+
+def test_a_grid_shows_what_is_around_an_ego_that_drives_to_the_right(scenario, shown):
+    times = [0.0, 2.0, 3.0]
+    for axes, time in zip(picture(scenario, shown[:1], at=times).axes, times, strict=True):
+        assert axes.get_xlim() == (-25.0, 25.0)
+        path = next(line for line in axes.lines if line.get_linestyle() == "-")
+        assert path.get_xydata()[-1] == pytest.approx([0.0, 0.0], abs=1e-6)
+        assert (path.get_xdata() <= 1e-6).all()
+        assert len(path.get_xdata()) == round(time * 10) + 1
+
+
+def test_a_film_follows_the_ego_and_its_path_grows(scenario, shown, tmp_path, monkeypatch):
+    from matplotlib.animation import PillowWriter
+
+    seen, steps = [], []
+
+    def look(writer, **settings):
+        (axes,) = writer.fig.axes
+        path = next(x for x in axes.lines if x.get_linestyle() == "-")
+        seen.append((len(path.get_xdata()), np.mean(axes.get_xlim()) - path.get_xdata()[-1]))
+
+    monkeypatch.setattr(PillowWriter, "grab_frame", look)
+    monkeypatch.setattr(PillowWriter, "finish", lambda writer: steps.append(writer.fps))
+    reports = []
+    save_figure(
+        tmp_path / "a.gif",
+        scenario,
+        shown[:1],
+        speed=4.0,
+        on_progress=lambda done, total: reports.append((done, total)),
+    )
+    lengths, away = zip(*seen, strict=True)
+    assert lengths == tuple(range(1, 41, 2))  # every other sample
+    assert steps == [20.0]  # of them per second: four times as fast
+    assert np.abs(away).max() < 1e-6
+    assert reports[-1] == (40, 40)
+
+
+@pytest.mark.parametrize(("width", "inches"), [("3.5in", 3.5), (7, 7.0), ("253pt", 3.5007)])
+def test_a_width_is_a_length(width, inches):
+    assert FigureFormat.of(width).width == pytest.approx(inches, abs=1e-3)
+
+
+@pytest.mark.parametrize("width", ["wide", "3.5 miles", "0.1in", "99in", "1.2.3in", 0])
+def test_what_is_no_width_is_refused(width):
+    with pytest.raises(ConfigError, match="no width") as caught:
+        FigureFormat.of(width)
+    assert "3.5in" in caught.value.hint
+
+
+def test_a_speed_that_is_none_is_refused(scenario, shown, tmp_path):
+    with pytest.raises(ConfigError, match="speed"):
+        save_figure(tmp_path / "a.gif", scenario, shown[:1], speed=0.0)

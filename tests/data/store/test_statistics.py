@@ -15,11 +15,11 @@ from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.statistics import PUBLISHED_SETS, scenario_stats, store_stats
 from shiftsim.errors import ConfigError
 from shiftsim.report.dataset import (
-    draw_stats,
     stats_dict,
     stats_figure,
     stats_table,
 )
+from shiftsim.report.palette import save_picture
 from shiftsim.world.state import AgentKind
 
 
@@ -122,11 +122,11 @@ def test_the_picture_is_drawn_the_same_again(store, tmp_path):
     found = store_stats(store)
     found = replace(found, cities=dict(zip(found.rows, ["Berlin", "a", "a", "MUC"], strict=True)))
     for name in ("one.png", "two.png"):
-        draw_stats(found, tmp_path / name, published(), title="toy")
+        save_picture(stats_figure(found, published(), title="toy"), tmp_path / name)
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
     assert (tmp_path / "one.png").read_bytes()[:4] == b"\x89PNG"
-    with pytest.raises(ConfigError, match="not supported"):
-        draw_stats(found, tmp_path / "one.bmpx", published(), title="toy")
+    with pytest.raises(ConfigError, match="no picture ends in"):
+        save_picture(stats_figure(found, published(), title="toy"), tmp_path / "one.bmpx")
 
 
 def test_the_picture_shows_published_sets_beside_ours_and_labels_all_axes(store):
