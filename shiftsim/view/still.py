@@ -163,7 +163,8 @@ def _cells(
     figure, y, rows = palette.new_figure(None, figsize=(width, height)), height - top, []
     for strip in strips:
         y -= strip + tall
-        lefts = [0.04 + (side + 0.04) * column for column in range(columns)]
+        first = (width - (side + 0.04) * columns + 0.04) / 2.0
+        lefts = [first + (side + 0.04) * column for column in range(columns)]
         places = [(x / width, y / height, side / width, tall / height) for x in lefts]
         rows.append([figure.add_axes(place) for place in places])
     figure.text(0.5, 1.0 - 0.03 / height, above, fontsize=TEXT, ha="center", va="top")

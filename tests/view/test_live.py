@@ -212,5 +212,5 @@ def test_the_command_says_where_the_page_is(store, tmp_path, capsys, monkeypatch
     printed = capsys.readouterr()
     assert left.value.code in (0, None)
     json.loads(printed.out)
-    assert opened == [line.split()[1] for line in printed.err.splitlines() if "live" in line]
+    assert opened == [line for line in printed.err.splitlines() if line.startswith("http")]
     assert opened[0].startswith("http://127.0.0.1:")
