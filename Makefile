@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: install demo test test-fast test-thorough test-long test-docs test-kill test-browser lint types docs api-diff lowest bench bench-smoke verify dist clean-cache
+.PHONY: install demo test test-fast test-thorough test-long test-docs test-kill test-browser lint types docs pictures api-diff lowest bench bench-smoke verify dist clean-cache
 
 install: .venv/installed
 
@@ -26,7 +26,11 @@ test-thorough: install
 test-long: install
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m long
 
-test-docs: install
+test-# the pictures of the documentation, made anew; needs a browser
+pictures: install
+	PICTURES=docs/images $(BIN)/python -m pytest tests/browser/test_pictures.py -k made
+
+docs: install
 	$(BIN)/python -m pytest -n 2 --dist loadfile tests/docs
 
 test-kill: install
@@ -40,6 +44,10 @@ lint: install
 
 types: install
 	$(BIN)/mypy
+
+# the pictures of the documentation, made anew; needs a browser
+pictures: install
+	PICTURES=docs/images $(BIN)/python -m pytest tests/browser/test_pictures.py -k made
 
 docs: install
 	$(BIN)/python tools/build_site.py build/docs

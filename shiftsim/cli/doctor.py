@@ -30,7 +30,7 @@ def verify(
         False, "--require-all", help="Exit with 3 if anything is not covered."
     ),
 ) -> None:
-    """Compare results of your own from nuPlan with what shiftsim computes.
+    """Compare your nuPlan results with what shiftsim computes.
 
     Exit codes: 0 all covered cases equal, 1 a mismatch, 2 nothing covered or not recognised,
     3 not all covered (with --require-all).

@@ -395,7 +395,7 @@ def demo(
     seed: int | None = Option(None, min=0, help="Of the random towns; same seed, same bytes. [0]"),
     quiet: Quiet = False,
 ) -> None:
-    """Generate small recordings, convert them, run three planners clean and disturbed.
+    """Generate small recordings, convert them, run three planners with and without noise.
 
     With --towns, generate, convert and filter random towns to train in, and run nothing.
     """

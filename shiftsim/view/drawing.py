@@ -62,7 +62,7 @@ def draw_paths(
 ) -> list[Any]:
     """The paths of the recorded driver and of the rollouts, these up to a sample; their lines."""
     dotted = {"color": RECORDED, "linewidth": 1.1, "linestyle": ":", "zorder": 6.5}
-    axes.plot(*view.place(scenario.expert[:, :2]).T, label="recorded driver", **dotted)
+    axes.plot(*view.place(scenario.expert[:, :2]).T, label="recorded path", **dotted)
     lines = []
     for number, item in enumerate(shown):
         ego, style = item.log.ego, styles[item.planner]

@@ -177,7 +177,7 @@ def test_in_a_grid_words_stand_for_abbreviations_and_a_line_explains_marks(scena
     words = [text for text, _ in written(picture(scenario, shown[:2], at=[0.0, 1.0, 2.0]))]
     assert words.count("at-fault collision") == 1  # from its moment on
     assert "NCR" not in words
-    assert any("dotted: the recorded driver" in text for text in words)
+    assert any("dotted: the recorded path" in text for text in words)
 
 
 @pytest.mark.parametrize("width", ["3.5in", "7in", "89mm"])
