@@ -274,15 +274,28 @@ def _with_methods(found: Any) -> "Run":
     return Run(found.path, found.manifest)
 
 
-def _plot(thing: Scenario | VectorMap) -> Any:
+def _plot(
+    thing: Scenario | VectorMap,
+    *,
+    width: float | str | None = None,
+    serif: bool = False,
+    plain: bool = False,
+) -> Any:
     """A matplotlib figure of a scenario at its first iteration, or of a whole map.
 
+    It is as wide as a column of a paper, in inches or as `3.5in`, and `plain` without its title.
+
     Raises:
+        ConfigError: The width is none.
         MissingExtraError: matplotlib is missing.
     """
-    from shiftsim.view.still import overview
+    from shiftsim.report.palette import FigureFormat
+    from shiftsim.view.still import map_picture, picture
 
-    return overview(thing)
+    form = FigureFormat.of(width, serif=serif, plain=plain)
+    return (
+        picture(thing, form=form) if isinstance(thing, Scenario) else map_picture(thing, form=form)
+    )
 
 
 def _picture_of(thing: Scenario | VectorMap) -> str:

@@ -20,7 +20,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout
 from dataclasses import MISSING, fields
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
@@ -70,16 +70,11 @@ def _fitted(line: str, width: int) -> list[str]:
     return wrap(line, width, subsequent_indent=indent or "  ", **whole)
 
 
-def paint(text: str, colour: str, *, err: bool = False) -> str:
-    """A text in a colour where there is a terminal, and nobody objects by NO_COLOR."""
+def paint(text: str, colour: str = "green", *, err: bool = False) -> str:
+    """A text in a colour, that of the best, on a terminal where NO_COLOR does not forbid it."""
     stream = sys.stderr if err else sys.stdout
     has_colour = stream.isatty() and not os.environ.get("NO_COLOR")
     return typer.style(text, fg=colour, bold=True) if has_colour else text
-
-
-def paint_best(text: str) -> str:
-    """The best number of a table."""
-    return paint(text, "green")
 
 
 def print_json(value: Any) -> None:
@@ -148,22 +143,13 @@ def progress_bar(*, quiet: bool) -> AbstractContextManager[Advance]:
 @contextmanager
 def waiting(words: str, *, quiet: bool) -> Iterator[Callable[[str], None]]:
     """Yields what says what is waited for: on a terminal in a line that goes away at the end."""
-    is_line = sys.stderr.isatty() and not quiet
-    piped = _lines(quiet)
+    if quiet or not sys.stderr.isatty():
+        yield partial(_lines(quiet), 0, 0)
+        return
+    from rich.console import Console
 
-    def note(text: str) -> None:
-        if is_line:
-            typer.echo(f"\r\x1b[2K{text} …", err=True, nl=False)
-        else:
-            piped(0, 0, text)
-
-    if is_line:
-        note(words)
-    try:
-        yield note
-    finally:
-        if is_line:
-            typer.echo("\r\x1b[2K", err=True, nl=False)
+    with Console(stderr=True).status(words) as status:
+        yield status.update
 
 
 @contextmanager

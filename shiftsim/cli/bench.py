@@ -143,7 +143,7 @@ def _report(plan: "Plan", *, published: bool, allow_partial: bool, as_json: bool
     shown = ("coverage", _MAIN_TABLE[plan.track.name], "planner-comparison")
     for table in tables:
         if table.name.partition("_")[0] in shown:
-            look: dict[str, Any] = {"width": cli.terminal_width(), "mark": cli.paint_best}
+            look: dict[str, Any] = {"width": cli.terminal_width(), "mark": cli.paint}
             echo("\n" + render(table, "text", **look))
     echo(f"\n report: {plan.folder / 'report'} ({plural(len(files), 'file')})")
 

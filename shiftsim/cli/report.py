@@ -103,7 +103,7 @@ def report(
     options = Options(tuple(table or default), by, published)
     whole = not table and kind != "csv"
     tables = opened.tables(options, with_coverage=whole, allow_partial=allow_partial)
-    look: dict[str, Any] = {"width": cli.terminal_width(), "mark": cli.paint_best}
+    look: dict[str, Any] = {"width": cli.terminal_width(), "mark": cli.paint}
     words = "\n\n".join(render(one, kind, **look) for one in tables)
     (echo if kind == "text" else typer.echo)(words)  # files are not broken into lines
     for name in table:

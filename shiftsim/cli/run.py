@@ -286,7 +286,7 @@ def _print_results(finished: "Run", *, allow_partial: bool) -> None:
 
     counts = finished.manifest["counts"]
     echo()
-    look = {"width": cli.terminal_width(), "mark": cli.paint_best}
+    look = {"width": cli.terminal_width(), "mark": cli.paint}
     echo(score_table([finished], allow_partial=allow_partial, **look))
     print_worst([finished], _WORST)
     lost = failures(finished)

@@ -177,27 +177,9 @@ def _height(text: str, size: float) -> float:
     return len(text.splitlines()) * 1.25 * size / 72.0 + 0.06
 
 
-def overview(
-    thing: Scenario | VectorMap,
-    *,
-    width: float | str | None = None,
-    serif: bool = False,
-    plain: bool = False,
-) -> Any:
-    """A matplotlib figure of a scenario at its first iteration, or of a whole map.
-
-    It is as wide as a column of a paper, in inches or as `3.5in`, and `plain` without its title.
-
-    Raises:
-        ConfigError: The width is none.
-        MissingExtraError: matplotlib is missing.
-    """
-    form = FigureFormat.of(width, serif=serif, plain=plain)
-    return picture(thing, form=form) if isinstance(thing, Scenario) else _map(thing, form=form)
-
-
 @palette.in_format
-def _map(thing: VectorMap, *, form: FigureFormat) -> Any:
+def map_picture(thing: VectorMap, *, form: FigureFormat = DEFAULT_FORM) -> Any:
+    """A matplotlib figure of a whole map."""
     bounds = thing.edges.polygons.bounds
     view = View(np.zeros(3), _extent([bounds[:, :2], bounds[:, 2:]]))
     figure, (axes,) = _panels(1, view, form)

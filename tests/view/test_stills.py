@@ -15,7 +15,7 @@ from shiftsim.planners.registry import load_planner
 from shiftsim.report.palette import ALARM, RECORDED, FigureFormat, planner_styles
 from shiftsim.sim.loop import simulate
 from shiftsim.view.scene import ShownRollout
-from shiftsim.view.still import overview, picture, save_figure
+from shiftsim.view.still import map_picture, picture, save_figure
 from shiftsim.view.tracks import save_tracks_picture
 from shiftsim.world.state import AgentKind
 
@@ -81,8 +81,8 @@ def test_no_words_of_a_picture_cover_others_or_are_cut_off(scenario, shown):
         picture(scenario, shown[:1], at=[0.0]),
         picture(scenario, [replace(shown[1], planner="my_package.my_module:MyPlanner")], at=[0.0]),
         picture(scenario, shown[:2], at=[0.0, 1.0, 2.0]),
-        overview(scenario),
-        overview(scenario.map),
+        picture(scenario),
+        map_picture(scenario.map),
     ):
         assert overlaps(figure) == []
         assert cut_off(figure) == []
