@@ -5,6 +5,7 @@ terms, each of weight 1. Then the groups of parameters, the learning rates by ep
 values of a network. B scenes, A agents of which the first is the ego, T = 80 steps of 0.1 s.
 """
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -13,6 +14,7 @@ from torch.nn import functional
 
 from shiftsim.planners.learned.network import Attention
 from shiftsim.planners.learned.pluto.network import NEVER
+from shiftsim.world.state import PACIFICA
 
 if TYPE_CHECKING:
     from shiftsim.planners.learned.plantf.network import Outputs as PlanTfOutputs
@@ -20,12 +22,14 @@ if TYPE_CHECKING:
 
 Losses = dict[str, Tensor]  # terms by name, and `loss`, their sum
 
-# PLUTO: of the lines on which its modes are spread, and of its three circles along the ego
-MODE_LENGTH = 10.0  # m
-CIRCLES = (-0.264, 1.461, 3.186)  # m ahead of the rear axle
-CIRCLE_RADIUS = 1.2363804  # m, half the diagonal of a third of the ego, less 0.2
+MODE_LENGTH = 10.0  # m of a reference line for each of PLUTO's modes
+# three circles of PLUTO along the ego: places ahead of the rear axle, and their radius [m]
+_THIRD = PACIFICA.length / 3.0
+CIRCLES = [PACIFICA.rear_axle_to_center + place * _THIRD for place in (-1.0, 0.0, 1.0)]
+CIRCLE_RADIUS = 0.5 * math.hypot(PACIFICA.width, _THIRD) - 0.2
 PIXEL, INSIDE = 0.2, 0.95  # m; share of the raster in which a point counts
 TEMPERATURE = 0.1  # of the contrastive loss
+CLIP = 5.0  # of the norm of all gradients
 
 
 def _sum(**terms: Tensor) -> Losses:
@@ -90,9 +94,9 @@ def road_loss(trajectory: Tensor, signed: Tensor) -> Tensor:
             row -y / 0.2 + H / 2. It is read half a pixel behind and to the left, as the authors do.
     """
     height, width = signed.shape[-2:]
-    ahead = torch.tensor(CIRCLES, device=signed.device)[:, None]
+    ahead = signed.new_tensor(CIRCLES)[:, None]
     places = trajectory[:, :, None, :2] + ahead * trajectory[:, :, None, 2:4]
-    scale = torch.tensor([2.0 / width, -2.0 / height], device=signed.device) / PIXEL
+    scale = signed.new_tensor([2.0 / width, -2.0 / height]) / PIXEL
     grid = places * scale
     read = functional.grid_sample(signed[:, None], grid, align_corners=False)[:, 0]
     depth = CIRCLE_RADIUS - read
@@ -187,8 +191,8 @@ def rate_of_epoch(epoch: float, epochs: int = 25, warm_up: float = 3, rate: floa
     """Learning rate of PlanTF and PLUTO: rises by epochs, then falls with a cosine to 1e-6."""
     if epoch < warm_up:
         return rate * (epoch + 1) / warm_up
-    along = torch.tensor((epoch - warm_up) / (epochs - warm_up), dtype=torch.float64)
-    return 1e-6 + 0.5 * (rate - 1e-6) * (1.0 + float(torch.cos(torch.pi * along)))
+    along = (epoch - warm_up) / (epochs - warm_up)
+    return 1e-6 + 0.5 * (rate - 1e-6) * (1.0 + math.cos(math.pi * along))
 
 
 def diffusion_rate_of_epoch(epoch: int, rate: float = 5e-4) -> float:

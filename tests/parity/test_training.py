@@ -125,3 +125,110 @@ def test_plantf_losses_and_gradients(dropped: Any) -> None:
         after = below(stored, f"bn/map_encoder.polygon_encoder.{layer}/")
         np.testing.assert_allclose(norm.running_mean, after["after_mean"], atol=2e-5)
         np.testing.assert_allclose(norm.running_var, after["after_var"], rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["nocil_official", "nocil_correctmask", "cil"])
+def test_pluto_losses_and_gradients(name: str, dropped: Any) -> None:
+    stored = load(f"pluto/train_{name}")
+    dropped(stored["draw/state_dropout_u"])
+    network = network_of("pluto", str(stored["meta/variant"]))
+    network.planning_decoder.misordered_masks = name != "nocil_correctmask"
+    given = below(stored if name == "cil" else load("pluto/train_nocil_official"), "in/")
+    out = network(inputs_of("pluto", given))
+    hidden = network.hidden_proj(out.ego)
+    target = torch.cat(
+        [
+            imitation.motion(tensor(given["agent.target"])),
+            tensor(given["agent.velocity"][:, :, FUTURE]),
+        ],
+        dim=-1,
+    )
+    contrast = (hidden, tensor(given["data_n_valid_mask"])) if name == "cil" else None
+    losses = imitation.pluto_loss(
+        out,
+        target,
+        tensor(given["agent.valid_mask"][..., FUTURE]),
+        tensor(given["reference_line.future_projection"]),
+        signed=tensor(given["cost_maps"][..., 0]),
+        contrast=contrast,
+    )
+    known = below(stored, "f64/loss/")
+    for term, value in losses.items():
+        assert value.item() == pytest.approx(float(known[term].reshape(())), rel=LOSS), term
+    losses["loss"].backward()
+    compare_gradients(network, stored)
+
+
+def test_pluto_lines_modes_and_contrast() -> None:
+    stored = {k: v for k, v in load("pluto/assignment_contrast").items()}
+    valid = torch.arange(80) < tensor(stored["n_valid"])[:, None]
+    lines = tensor(stored["line_valid"])
+    line, mode = imitation.pluto_assignment(tensor(stored["future_projection"]), lines, valid)
+    assert line.tolist() == stored["r_star"].tolist()
+    assert mode.tolist() == stored["m_star"].tolist()
+    hidden = tensor(stored["contrast/hidden"]).requires_grad_()
+    there = tensor(stored["contrast/valid"])
+    loss = imitation.contrastive_loss(hidden, there)
+    assert loss.item() == pytest.approx(float(stored["contrast/loss"]), rel=LOSS)
+    loss.backward()
+    np.testing.assert_allclose(hidden.grad, stored["contrast/grad_hidden"], atol=1e-6)
+    assert imitation.contrastive_loss(hidden, ~there & there).item() == 0.0
+
+
+@pytest.mark.parametrize("shape", ["square", "wide"])
+def test_pluto_road_loss(shape: str) -> None:
+    stored = below(load("pluto/esdf_loss"), f"{shape}/")
+    trajectory = tensor(stored["trajectory"]).requires_grad_()
+    loss = imitation.road_loss(trajectory, tensor(stored["sdf"]))
+    assert loss.item() == pytest.approx(float(stored["loss"]), rel=LOSS)
+    loss.backward()
+    np.testing.assert_allclose(trajectory.grad, stored["grad_trajectory"], atol=1e-6)
+
+
+def test_diffusion_loss() -> None:
+    stored = load("diffusion_planner/train_aug")
+    score = tensor(stored["mid/score"]).requires_grad_()
+    there = ~tensor(stored["mask/neighbor_future_mask"])
+    losses = imitation.diffusion_loss(score[:, :, 1:], tensor(stored["derived/x0"]), there)
+    for name, value in below(stored, "loss/").items():
+        assert losses[name].item() == pytest.approx(float(value), rel=LOSS), name
+    losses["loss"].backward()
+    np.testing.assert_allclose(score.grad, stored["grad_out/score"], rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("planner", ["plantf", "pluto"])
+def test_groups_and_rates(planner: str) -> None:
+    stored, network = load(f"{planner}/optim"), network_module(planner).build_network()
+    groups = imitation.parameter_groups(network)
+    names = {id(value): name for name, value in network.named_parameters()}
+    for group, known, decay in zip(
+        groups, ("decay", "no_decay"), stored["weight_decay"], strict=True
+    ):
+        assert sorted(names[id(v)] for v in group["params"]) == sorted(stored[known].tolist())
+        assert group["weight_decay"] == decay
+    rates = [imitation.rate_of_epoch(epoch) for epoch in range(25)]
+    np.testing.assert_allclose(rates, stored["lr_per_epoch"], rtol=1e-9)
+
+
+def test_rates_of_diffusion_planner() -> None:
+    rates = load("diffusion_planner/optim_ema")["lr_per_epoch"]
+    ours = [imitation.diffusion_rate_of_epoch(epoch) for epoch in range(len(rates))]
+    np.testing.assert_allclose(ours, rates, rtol=1e-9)
+
+
+def test_a_step_of_the_optimiser(dropped: Any) -> None:
+    stored = load("plantf/train_base_sde")
+    dropped(stored["draw/state_dropout_u"])
+    network, given = network_of("plantf", "base"), below(stored, "in/")
+    out = network(inputs_of("plantf", given))
+    valid = tensor(given["agent.valid_mask"][..., FUTURE])
+    imitation.plantf_loss(out, tensor(given["agent.target"]), valid)["loss"].backward()
+    norm = torch.nn.utils.clip_grad_norm_(network.parameters(), imitation.CLIP)
+    assert norm.item() == pytest.approx(float(stored["f64/step/grad_norm_before_clip"]), rel=1e-6)
+    optimiser = torch.optim.AdamW(
+        imitation.parameter_groups(network), lr=imitation.rate_of_epoch(0)
+    )
+    optimiser.step()
+    own = dict(network.named_parameters())
+    for name, after in below(stored, "step/after/").items():
+        np.testing.assert_allclose(own[name].detach(), after, atol=2e-6, err_msg=name)
