@@ -16,7 +16,10 @@ torch = pytest.importorskip("torch")
 
 from shiftsim.planners.learned.checkpoint import network_module  # noqa: E402
 from shiftsim.planners.learned.deterministic import keyed_normals, network_weights  # noqa: E402
-from shiftsim.train import imitation  # noqa: E402
+from shiftsim.planners.learned.features import agent_features  # noqa: E402
+from shiftsim.sim.planner import History  # noqa: E402
+from shiftsim.train import imitation, samples  # noqa: E402
+from shiftsim.world.state import Tracks, center_poses  # noqa: E402
 
 FOLDER = places.REPOSITORY.parent / "shared" / "reference" / "training"
 pytestmark = [
@@ -232,3 +235,66 @@ def test_a_step_of_the_optimiser(dropped: Any) -> None:
     own = dict(network.named_parameters())
     for name, after in below(stored, "step/after/").items():
         np.testing.assert_allclose(own[name].detach(), after, atol=2e-6, err_msg=name)
+
+
+AUGMENTED = ["free", "not_drawn", "speed_clip", "collision", "collision_free_other_side"]
+AUGMENTED += ["eleventh_row_ignored"]
+
+
+def history_of(poses: Any, velocities: Any, sizes: Any, valid: Any, ego: Any) -> Any:
+    """The past of rows of agents (A, 21, ...), of which the ego (21, 11) is not one."""
+    count = len(poses)
+    tracks = Tracks(
+        valid=valid.T,
+        poses=np.where(valid[..., None], poses, np.nan).swapaxes(0, 1),
+        velocities=velocities.swapaxes(0, 1),
+        sizes=sizes.swapaxes(0, 1),
+        kinds=np.zeros(count, np.int64),
+        tokens=tuple(map(str, range(count))),
+    )
+    return History(100_000 * np.arange(21), ego, tracks)
+
+
+@pytest.mark.parametrize("case", AUGMENTED)
+def test_plantf_augmentation(case: str) -> None:
+    stored = below(load("plantf/augmentation"), f"{case}/")
+    given, made = below(stored, "in/"), below(stored, "out/")
+    state = samples.perturbed_state(given["current_state"], stored["noise"].astype(np.float64))
+    poses = np.dstack([given["agent.position"], given["agent.heading"]])
+    sizes = given["agent.shape"][..., ::-1]
+    safe = samples.is_free(state[:3], poses[1:11, 20], sizes[1:11, 20])
+    if stored["rand"] >= samples.PERTURBED:
+        assert not stored["applied"]
+        return
+    np.testing.assert_allclose(state, stored["new_state"], atol=1e-9)
+    assert safe == bool(stored["safe"]) == bool(stored["applied"])
+    if not made:
+        return
+    if "current_state" in made:
+        np.testing.assert_allclose(state[3:], made["current_state"][3:], atol=1e-9)
+    ours = samples.targets(np.vstack([state[None, :3], poses[1:, 20]]), poses[:, 21:], state[:3])
+    there = given["agent.valid_mask"][:, 21:]
+    np.testing.assert_allclose(ours[there], made["agent.target"][there], atol=2e-6)
+    valid, ego = given["agent.valid_mask"][:, :21], np.zeros((21, 11))
+    ego[:, :3] = poses[0, :21]
+    ego[-1, :3] = state[:3]
+    velocities = given["agent.velocity"][1:, :21]
+    past = history_of(poses[1:, :21], velocities, sizes[1:, :21], valid[1:], ego)
+    read = agent_features(past, center_poses(poses[0, 20]), 64)
+    order = [0, *(1 + read.tracks)]
+    for name in ("position", "heading", "velocity"):
+        theirs = made[f"agent.{name}"][order, :21]
+        both = read.valid.copy()
+        both[0] &= name != "velocity"  # of the ego; it is not read
+        found = getattr(read, name)[both]
+        np.testing.assert_allclose(found, theirs[both], atol=2e-6, err_msg=name)
+
+
+def test_boxes_of_the_augmentation() -> None:
+    stored = below(load("plantf/augmentation"), "boxes/")
+    for ego, position, heading, shape, safe in zip(
+        *(stored[name] for name in ("ego_pose", "position", "heading", "shape_wl", "safe")),
+        strict=True,
+    ):
+        box = np.array([[*position, heading]])
+        assert samples.is_free(ego, box, shape[None, ::-1].astype(np.float64)) == safe
