@@ -20,7 +20,7 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from shiftsim.data import open_store
 from shiftsim.errors import ShiftsimError
-from shiftsim.geometry.boxes import boxes_to_corners, boxes_touch, to_frame
+from shiftsim.geometry.boxes import boxes_to_corners, boxes_touch
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.planners.learned import features
 from shiftsim.planners.learned.plantf import planner as plantf
@@ -30,8 +30,8 @@ from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import PACIFICA, center_poses
 
 STEPS = features.PLAN_POSES  # of a target
-BATCH, PER_BLOCK, PER_SCENARIO = 32, 16, 8  # samples; scenarios; samples of each of these
-SPARE = 1  # more of each scenario, for samples that cannot be made
+BATCH, PER_BLOCK, PER_SCENARIO = 32, 16, 16  # samples; scenarios; samples of each of these
+SPARE = 2  # more of each scenario, for samples that cannot be made
 STRIDE = 5  # iterations between two samples
 PERTURBED = 0.5  # share of samples
 # most that x, y [m], heading [rad], speed [m/s], acceleration [m/s^2], steering angle [rad] and
@@ -87,11 +87,13 @@ def targets(present: FloatArray, future: FloatArray, frame: FloatArray) -> np.nd
         future: (A, 80, 3) poses after it.
         frame: (3,) rear axle of the ego, whose frame the changes are in.
     """
-    moved = to_frame(future, frame)
-    moved[..., :2] -= to_frame(present, frame)[:, None, :2]
-    # not wrapped, as cosine and sine are what is learnt
-    moved[..., 2] = future[..., 2] - present[:, None, 2]
-    return np.nan_to_num(moved).astype(np.float32)
+    cos, sin = np.cos(frame[2]), np.sin(frame[2])
+    x, y, turn = (future[..., axis] - present[:, None, axis] for axis in range(3))
+    changes = np.empty(future.shape, np.float32)
+    # not wrapped: cosine and sine of the heading are what is learnt
+    changes[..., 0], changes[..., 1], changes[..., 2] = cos * x + sin * y, cos * y - sin * x, turn
+    changes[np.isnan(x)] = 0.0
+    return changes
 
 
 def make_sample(
@@ -116,13 +118,12 @@ def make_sample(
         return _NO_ROAD
     if state is not None:  # the steering angle that follows from a jump would be wrong
         read.current_state[3:] = state[3:]
-    ego_pose, tracks = observation.history.ego[-1, :3], scenario.tracks
-    nearest = read.agents.tracks
-    present = np.concatenate([ego_pose[None], tracks.poses[row, nearest]])
-    future = np.concatenate([scenario.ego[rows, None, :3], tracks.poses[rows][:, nearest]], axis=1)
-    valid = np.ones((len(present), STEPS), np.bool_)
-    valid[1:] = tracks.valid[rows][:, nearest].T
-    return Sample(read, targets(present, future.swapaxes(0, 1), ego_pose), valid)
+    ego, tracks, near = observation.history.ego[-1, :3], scenario.tracks, read.agents.tracks
+    future, valid = np.empty((len(near) + 1, STEPS, 3)), np.ones((len(near) + 1, STEPS), np.bool_)
+    future[0], valid[1:] = scenario.ego[rows, :3], tracks.valid[rows[:, None], near].T
+    future[1:] = tracks.poses[rows, near[:, None]]
+    present = np.concatenate([ego[None], tracks.poses[row, near]])
+    return Sample(read, targets(present, future, ego), valid)
 
 
 def _perturb(history: History, noise: FloatArray) -> FloatArray | None:
