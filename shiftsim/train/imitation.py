@@ -6,19 +6,22 @@ values of a network. B scenes, A agents of which the first is the ego, T = 80 st
 """
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from shiftsim.planners.learned.network import Attention
+from shiftsim.planners.learned.plantf.network import Outputs as PlanTfOutputs
+from shiftsim.planners.learned.plantf.network import PlanTfNetwork
 from shiftsim.planners.learned.pluto.network import NEVER
+from shiftsim.planners.learned.pluto.network import Outputs as PlutoOutputs
+from shiftsim.train.folder import Preset
+from shiftsim.train.learning import StepResult, TrainedNetwork, schedule
+from shiftsim.train.samples import Batch
 from shiftsim.world.state import PACIFICA
-
-if TYPE_CHECKING:
-    from shiftsim.planners.learned.plantf.network import Outputs as PlanTfOutputs
-    from shiftsim.planners.learned.pluto.network import Outputs as PlutoOutputs
 
 Losses = dict[str, Tensor]  # terms by name, and `loss`, their sum
 
@@ -30,6 +33,8 @@ CIRCLE_RADIUS = 0.5 * math.hypot(PACIFICA.width, _THIRD) - 0.2
 PIXEL, INSIDE = 0.2, 0.95  # m; share of the raster in which a point counts
 TEMPERATURE = 0.1  # of the contrastive loss
 CLIP = 5.0  # of the norm of all gradients
+WARM_UP, FLOOR = 0.05, 2e-3  # of PlanTF here: share of rising, end of the learning rate as a share
+THREADS = 2
 
 
 def _sum(**terms: Tensor) -> Losses:
@@ -47,7 +52,7 @@ def motion(target: Tensor) -> Tensor:
     return torch.cat([target[..., :2], angle.cos(), angle.sin()], dim=-1)
 
 
-def plantf_loss(out: "PlanTfOutputs", target: Tensor, valid: Tensor) -> Losses:
+def plantf_loss(out: PlanTfOutputs, target: Tensor, valid: Tensor) -> Losses:
     """Of PlanTF: `reg_loss`, `cls_loss` of the mode nearest to the target, `prediction_loss`.
 
     Args:
@@ -117,7 +122,7 @@ def contrastive_loss(hidden: Tensor, valid: Tensor) -> Tensor:
 
 
 def pluto_loss(
-    out: "PlutoOutputs",
+    out: PlutoOutputs,
     target: Tensor,
     valid: Tensor,
     projection: Tensor,
@@ -210,3 +215,43 @@ def begin(network: nn.Module, seed: int) -> None:
                 nn.init.zeros_(module.bias)
         elif isinstance(module, nn.Embedding):
             nn.init.normal_(module.weight, 0.0, 0.02, generator=random)
+
+
+class PlanTfLearner(TrainedNetwork):
+    """PlanTF's network, trained on samples of a store."""
+
+    def __init__(self, device: str, preset: Preset, total: int, seed: int) -> None:
+        """`total` steps are to be done; the learning rate falls towards their end."""
+        torch.set_num_threads(THREADS)  # sums depend on it, and must not on the number of cores
+        torch.manual_seed(seed)
+        network = PlanTfNetwork()
+        begin(network, seed)
+        network.to(device).train()
+        super().__init__(network, parameter_groups(network), total, betas=(0.9, 0.999))
+        self.batch, self._rate, self._device, self._seed = preset.batch, preset.rate, device, seed
+        self.place = (0, 0)  # of the next batch: the block of the stream, and the batch in it
+
+    def learn(self, batch: Batch) -> StepResult:
+        """Do one step."""
+        key = np.random.SeedSequence([self._seed, 4, self.step]).generate_state(1, np.uint64)
+        torch.manual_seed(int(key[0]))  # of the state dropout
+        inputs, target, valid = batch.on(self._device)
+        losses = plantf_loss(self.network(inputs), target, valid)
+        self.optimiser.zero_grad()
+        losses["loss"].backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self.network.parameters(), CLIP)
+        for group in self.optimiser.param_groups:
+            group["lr"] = self._rate * schedule(self.step / self.total, WARM_UP, FLOOR)
+        self.optimiser.step()
+        self.count_step()
+        terms = {name: float(value.detach()) for name, value in losses.items()}
+        return StepResult(terms.pop("loss"), terms)
+
+    def state(self) -> dict[str, Any]:
+        """All that is needed to go on."""
+        return {**super().state(), "place": list(self.place)}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from `state`."""
+        super().restore(state)
+        self.place = tuple(state["place"])

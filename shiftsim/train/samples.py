@@ -11,7 +11,8 @@ their order whoever makes them.
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from itertools import count
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,6 +58,12 @@ class Batch(NamedTuple):
     inputs: Inputs
     target: Tensor  # (B, A, 80, 3)
     valid: Tensor  # (B, A, 80)
+
+    def on(self, device: str) -> "Batch":
+        """The same on a device."""
+        parts = {item.name: getattr(self.inputs, item.name) for item in fields(self.inputs)}
+        moved = {n: v.to(device) if isinstance(v, Tensor) else v for n, v in parts.items()}
+        return Batch(Inputs(**moved), self.target.to(device), self.valid.to(device))
 
 
 class Block(NamedTuple):
@@ -220,21 +227,21 @@ def _draw(scenario: Scenario, stride: int, key: list[int]) -> IntArray:
 
 
 class Blocks(IterableDataset[Block]):
-    """Blocks of a stream, from `first` up to `stop`, which may lie beyond an epoch."""
+    """Blocks of a stream from `first` on, without end."""
 
-    def __init__(self, stream: Stream, first: int, stop: int) -> None:
-        self.stream, self.first, self.stop = stream, first, stop
+    def __init__(self, stream: Stream, first: int) -> None:
+        self.stream, self.first = stream, first
 
     def __iter__(self) -> Iterator[Block]:
         """The blocks of this worker, which are every so manyth."""
         info = get_worker_info()
         make, start = BlockMaker(self.stream), self.first + (info.id if info else 0)
-        for block in range(start, self.stop, info.num_workers if info else 1):
+        for block in count(start, info.num_workers if info else 1):
             yield make(block)
 
 
-def load_blocks(stream: Stream, first: int, stop: int, workers: int) -> Iterator[Block]:
-    """Blocks in their order, made by so many processes, or by this one for 0."""
+def load_blocks(stream: Stream, first: int, workers: int) -> Iterator[Block]:
+    """Blocks from `first` on in their order, made by so many processes, or by this one for 0."""
     options: dict[str, Any] = {"prefetch_factor": 2} if workers else {}
-    blocks = Blocks(stream, first, stop)
+    blocks = Blocks(stream, first)
     return iter(DataLoader(blocks, batch_size=None, num_workers=workers, **options))
