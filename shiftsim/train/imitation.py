@@ -34,7 +34,6 @@ PIXEL, INSIDE = 0.2, 0.95  # m; share of the raster in which a point counts
 TEMPERATURE = 0.1  # of the contrastive loss
 CLIP = 5.0  # of the norm of all gradients
 WARM_UP, FLOOR = 0.05, 2e-3  # of PlanTF here: share of rising, end of the learning rate as a share
-THREADS = 2
 
 
 def _sum(**terms: Tensor) -> Losses:
@@ -222,7 +221,7 @@ class PlanTfLearner(TrainedNetwork):
 
     def __init__(self, device: str, preset: Preset, total: int, seed: int) -> None:
         """`total` steps are to be done; the learning rate falls towards their end."""
-        torch.set_num_threads(THREADS)  # sums depend on it, and must not on the number of cores
+        torch.set_num_threads(1)  # sums must not depend on the number of cores
         torch.manual_seed(seed)
         network = PlanTfNetwork()
         begin(network, seed)
