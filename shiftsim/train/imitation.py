@@ -182,7 +182,8 @@ def diffusion_loss(said: Tensor, clean: Tensor, valid: Tensor) -> Losses:
 
 def parameter_groups(network: nn.Module, decay: float = 1e-4) -> list[dict[str, Any]]:
     """Groups of an optimiser: weights of products decay, all else does not."""
-    decayed, plain = [], []
+    decayed: list[Tensor] = []
+    plain: list[Tensor] = []
     for module in network.modules():
         products = isinstance(module, nn.Linear | nn.Conv1d | Attention)
         for name, value in module.named_parameters(recurse=False):

@@ -344,7 +344,10 @@ class PlanTfTraining(Recipe):
         write_text(split, "\n".join(tested_tokens(self.towns, settings.tests)) + "\n")
         run_folder = settings.out / "runs" / f"round-{self.progress.round:02d}"
         shutil.rmtree(run_folder, ignore_errors=True)  # of a training that was ended in it
-        values = {"planners": [self.planner], "checkpoints": [f"{self.planner}={network}"]}
+        values: dict[str, Any] = {
+            "planners": [self.planner],
+            "checkpoints": [f"{self.planner}={network}"],
+        }
         values |= {"store": settings.store, "split": str(split), "out": str(run_folder)}
         values |= {"noise": list(TESTED), "workers": settings.workers, "batch_size": TOGETHER}
         self._on_message(f"{where} testing")

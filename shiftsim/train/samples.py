@@ -61,8 +61,12 @@ class Batch(NamedTuple):
 
     def on(self, device: str) -> "Batch":
         """The same on a device."""
-        parts = {item.name: getattr(self.inputs, item.name) for item in fields(self.inputs)}
-        moved = {n: v.to(device) if isinstance(v, Tensor) else v for n, v in parts.items()}
+        parts: dict[str, Any] = {
+            item.name: getattr(self.inputs, item.name) for item in fields(self.inputs)
+        }
+        moved: dict[str, Any] = {
+            n: v.to(device) if isinstance(v, Tensor) else v for n, v in parts.items()
+        }
         return Batch(Inputs(**moved), self.target.to(device), self.valid.to(device))
 
 
