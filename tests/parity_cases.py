@@ -55,11 +55,9 @@ KINDS = {
 # folders without a kind: where they are compared instead
 COMPARED_ELSEWHERE = {
     "open_data": "compared by tests/data/readers/open_data/test_samples.py",
+    "training": "compared by tests/parity/test_training.py, beside the repository only",
     "paper": "published figures, compared by tests/benchmarks/test_tracks.py",
 }
-
-# of a known kind, but their files are not compared yet; --reference names them as not covered
-NOT_COMPARED_YET = {"training"}
 
 
 @dataclass

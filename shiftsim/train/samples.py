@@ -162,7 +162,6 @@ class Stream:
     tokens: tuple[str, ...]  # scenarios, sorted
     seed: int
     batch: int = BATCH
-    stride: int = STRIDE
 
     @property
     def blocks(self) -> int:
@@ -207,7 +206,7 @@ class BlockMaker:
         except ShiftsimError as error:
             failed[type(error).__name__] += PER_SCENARIO
             return made
-        for iteration in _draw(scenario, self._stream.stride, key).tolist():
+        for iteration in _draw(scenario, key).tolist():
             if len(made) == PER_SCENARIO:
                 break
             random = np.random.default_rng([*key, iteration + 1])
@@ -222,10 +221,10 @@ class BlockMaker:
         return made
 
 
-def _draw(scenario: Scenario, stride: int, key: list[int]) -> IntArray:
+def _draw(scenario: Scenario, key: list[int]) -> IntArray:
     """Iterations of a scenario, some more than are wanted, of those that have a future."""
     last = scenario.iteration_rows + STEPS * scenario.row_step < len(scenario.time_us)
-    usable = np.flatnonzero(last)[::stride]
+    usable = np.flatnonzero(last)[::STRIDE]
     drawn: IntArray = np.random.default_rng([*key, 0]).permutation(usable)
     return drawn[: PER_SCENARIO + SPARE]
 

@@ -1,7 +1,7 @@
 """Losses, gradients, one step and schedules of the authors' trainings, against their own code.
 
-What the folder of references has is compared where it lies beside the repository. It is too large
-to be kept here; `tests/train/test_imitation_losses.py` has small cases.
+Most of the references are too large to be kept here: they are compared where their folder lies
+beside the repository.
 """
 
 from collections.abc import Mapping
@@ -21,13 +21,9 @@ from shiftsim.sim.planner import History  # noqa: E402
 from shiftsim.train import imitation, samples  # noqa: E402
 from shiftsim.world.state import Tracks, center_poses  # noqa: E402
 
-FOLDER = places.REPOSITORY.parent / "shared" / "reference" / "training"
-pytestmark = [
-    pytest.mark.golden,
-    pytest.mark.learned,
-    pytest.mark.slow,
-    pytest.mark.skipif(not FOLDER.is_dir(), reason="the references are not beside the repository"),
-]
+SHARED = places.REPOSITORY.parent / "shared" / "reference" / "training"
+KEPT = places.GOLDEN / "training"
+pytestmark = [pytest.mark.golden, pytest.mark.learned, pytest.mark.slow]
 LOSS, GRADIENT = 1e-6, 1e-4  # relative
 NOISE = 1e-6  # of the norm of all gradients; what is smaller is rounding
 WIDE = {"plantf": INPUTS, "pluto": PLUTO_INPUTS}
@@ -35,7 +31,11 @@ FUTURE = slice(-80, None)
 
 
 def load(name: str) -> dict[str, Any]:
-    with np.load(FOLDER / f"{name}.npz", allow_pickle=False) as file:
+    path = SHARED / f"{name}.npz"
+    path = path if path.exists() else KEPT / f"{name.replace('/', '_')}.npz"
+    if not path.exists():
+        pytest.skip(f"{name} is not kept in the repository")
+    with np.load(path, allow_pickle=False) as file:
         return dict(file)
 
 
@@ -163,7 +163,7 @@ def test_pluto_losses_and_gradients(name: str, dropped: Any) -> None:
 
 
 def test_pluto_lines_modes_and_contrast() -> None:
-    stored = {k: v for k, v in load("pluto/assignment_contrast").items()}
+    stored = load("pluto/assignment_contrast")
     valid = torch.arange(80) < tensor(stored["n_valid"])[:, None]
     lines = tensor(stored["line_valid"])
     line, mode = imitation.pluto_assignment(tensor(stored["future_projection"]), lines, valid)
