@@ -55,9 +55,12 @@ KINDS = {
 # folders without a kind: where they are compared instead
 COMPARED_ELSEWHERE = {
     "open_data": "compared by tests/data/readers/open_data/test_samples.py",
-    "training": "compared by tests/parity/test_training.py, beside the repository only",
     "paper": "published figures, compared by tests/benchmarks/test_tracks.py",
 }
+
+
+# folders that look like those of `nets`, but are compared by tests/parity/test_training.py
+COMPARED_APART = {"training"}
 
 
 @dataclass
