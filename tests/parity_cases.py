@@ -58,8 +58,9 @@ COMPARED_ELSEWHERE = {
     "paper": "published figures, compared by tests/benchmarks/test_tracks.py",
 }
 
-# of a known kind, but their files are not compared yet; --reference names them as not covered
-NOT_COMPARED_YET = {"training"}
+
+# folders that look like those of `nets`, but are compared by tests/parity/test_training.py
+COMPARED_APART = {"training"}
 
 
 @dataclass

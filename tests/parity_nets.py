@@ -34,6 +34,35 @@ FILE_COLUMNS = (*state.STATE_COLUMNS[:9], "angular_velocity", "angular_accelerat
 FAILURE = "ValueError: zero-size array to reduction operation maximum which has no identity"
 ANY = "*"  # ends a text of a manifest that may go on in any way
 PREFIXES = {"plantf": "model.", "pluto": "model.", "carl": ""}  # of names in published checkpoints
+CODES = ("category", "kind", "on_route", "light", "object_category")  # integers, stored as floats
+# which array of the files is which field of the inputs of a network
+INPUTS: dict[str, str | list[str]] = {
+    **{name: f"agent.{name}" for name in ("position", "heading", "velocity", "shape", "category")},
+    "valid": "agent.valid_mask",
+    "current_state": "current_state[:, :6]",  # the yaw rate behind them is not read
+    "points": "map.point_position[:, :, 0]",  # of the centre line
+    "vectors": "map.point_vector[:, :, 0]",
+    "orientations": "map.point_orientation[:, :, 0]",
+    "centers": "map.polygon_center",
+    "kind": "map.polygon_type",
+    "on_route": "map.polygon_on_route",
+    "light": "map.polygon_tl_status",
+    "has_limit": "map.polygon_has_speed_limit",
+    "limit": "map.polygon_speed_limit",
+    "point_valid": "map.valid_mask",
+}
+PLUTO_INPUTS: dict[str, str | list[str]] = {
+    **INPUTS,
+    "points": "map.point_position",  # of the boundaries, too
+    "object_pose": ["static_objects.position", "static_objects.heading"],
+    "object_shape": "static_objects.shape",
+    "object_category": "static_objects.category",
+    "object_valid": "static_objects.valid_mask",
+    "line_points": "reference_line.position",
+    "line_vectors": "reference_line.vector",
+    "line_orientations": "reference_line.orientation",
+    "line_valid": "reference_line.valid_mask",
+}
 _PERCEPTION = {
     "dim": 128,
     "state_channel": 6,

@@ -47,7 +47,7 @@ def agent_features(history: History, center: FloatArray, max_agents: int) -> Age
     A history shorter than 2 s leaves its oldest samples invalid, the ego's included.
     """
     tracks, ego = history.tracks, history.ego[-SAMPLES:]
-    nearest = _nearest_agents(tracks, center, max_agents)
+    nearest = nearest_agents(tracks, center, max_agents)
     cos, sin, vx, vy = np.cos(ego[:, 2]), np.sin(ego[:, 2]), ego[:, 3], ego[:, 4]
     own = (
         ego[:, :3],
@@ -81,7 +81,7 @@ def agent_features(history: History, center: FloatArray, max_agents: int) -> Age
     )
 
 
-def _nearest_agents(tracks: state.Tracks, center: FloatArray, count: int) -> IntArray:
+def nearest_agents(tracks: state.Tracks, center: FloatArray, count: int) -> IntArray:
     """Present agents, nearest first."""
     # nuPlan rule 300: sorted from a list by kind, by a method that does not keep the order of ties
     present = np.flatnonzero(tracks.valid[-1] & (tracks.kinds <= state.LAST_AGENT_KIND))

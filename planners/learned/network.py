@@ -177,6 +177,7 @@ class Attention(nn.Module):
         q, k, v = (
             x.reshape(*x.shape[:2], self.num_heads, self.width).transpose(1, 2) for x in (q, k, v)
         )
+        mask = None if mask is None else mask.to(q.dtype)
         out = functional.scaled_dot_product_attention(q, k, v, attn_mask=mask)
         return out.transpose(1, 2).flatten(2)
 

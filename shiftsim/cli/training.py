@@ -9,7 +9,7 @@ from typer import Argument, Option
 
 from shiftsim import cli
 from shiftsim.cli import Json, Quiet, echo, new_app, print_result
-from shiftsim.train.folder import BEST, Settings, TrafficSettings
+from shiftsim.train.folder import BEST, ImitationSettings, Settings, TrafficSettings
 
 app = new_app("Train networks.", no_args_is_help=True)
 
@@ -32,6 +32,26 @@ def carl(
     best = chosen.out / BEST
     echo(f"best network: {best}")
     echo(f"drive with it: shiftsim run -p carl --checkpoint carl={best}")
+
+
+@app.command()
+@cli.with_settings(of=ImitationSettings)
+def plantf(
+    settings: cli.Settings,
+    resume: bool = Option(False, "--resume", help="Go on where it was ended."),
+    quiet: Quiet = False,
+) -> None:
+    """Train PlanTF from recordings."""
+    from shiftsim.planners.learned.checkpoint import require_torch
+
+    require_torch("training")
+    from shiftsim.train.recipe import PlanTfTraining
+
+    chosen = ImitationSettings(**settings)
+    PlanTfTraining(chosen, _on_message(quiet), resume=resume).run()
+    best = chosen.out / BEST
+    echo(f"best network: {best}")
+    echo(f"drive with it: shiftsim run -p plantf --checkpoint plantf={best}")
 
 
 @app.command()

@@ -257,12 +257,17 @@ def divide(store: ScenarioStore, tokens: Iterable[str], seed: int) -> Towns:
     return Towns({n: groups[n] for n in names[count:]}, {n: groups[n] for n in names[:count]})
 
 
-def test_jobs(towns: Towns, count: int, noise: str, tau: float, *, by_expert: bool) -> list[Job]:
-    """Drive scenarios of the towns that are left out, `count` at most, to their end."""
+def tested_tokens(towns: Towns, count: int) -> list[str]:
+    """Scenarios of the towns that are left out, `count` at most, as many of each as can be."""
     lists = [sorted(tokens) for tokens in towns.tested.values()]
     longest = max(len(tokens) for tokens in lists)
-    tokens = [found[i] for i in range(longest) for found in lists if i < len(found)][:count]
-    starts = [Start(token, noise, 0, -1 if by_expert else 0) for token in sorted(tokens)]
+    return sorted([found[i] for i in range(longest) for found in lists if i < len(found)][:count])
+
+
+def test_jobs(towns: Towns, count: int, noise: str, tau: float, *, by_expert: bool) -> list[Job]:
+    """Drive scenarios of the towns that are left out, `count` at most, to their end."""
+    tokens = tested_tokens(towns, count)
+    starts = [Start(token, noise, 0, -1 if by_expert else 0) for token in tokens]
     return [
         Job(tuple(starts[first : first + TOGETHER]), True, tau)
         for first in range(0, len(starts), TOGETHER)

@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from shiftsim.errors import CheckpointError, ConfigError, MissingExtraError
 from shiftsim.files import atomic_write, write_text
@@ -62,6 +62,59 @@ class Settings:
         return self.out / "states" / f"round-{number:02d}"
 
 
+class Preset(NamedTuple):
+    """How much is learnt, and how fast."""
+
+    samples: int
+    rounds: int
+    batch: int
+    rate: float  # highest learning rate
+
+
+PRESETS = {
+    # two cores for 90 minutes; the rate is that of the authors for this batch, by the square root
+    "laptop": Preset(90_000, 3, 32, 5e-4),
+    "workstation": Preset(5_000_000, 10, 128, 1e-3),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImitationSettings:
+    """What a training of PlanTF depends on, and where and how it is done."""
+
+    out: Path = field(metadata={"option": Option("Folder for networks and curves.")})
+    store: str = setting("demo", "Store by name, path or URL.")
+    split: str = setting("", "Split of the store; all its scenarios if empty.")
+    preset: str = setting("laptop", "laptop or workstation.", choices=tuple(PRESETS))
+    device: str = setting("cpu", "cpu, cuda, cuda:N or auto.")
+    seed: int = setting(0, "Of everything that is random.")
+    workers: int = setting(2, "Processes that make samples, and that drive.")
+    rounds: int = setting(0, "Of training and testing. [of the preset]")
+    samples: int = setting(0, "To train on, each time counted. [of the preset]")
+    tests: int = setting(40, "Scenarios that each round is tested on.")
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no training."""
+        _require_positive(self, "tests", "workers")
+        if self.preset not in PRESETS:
+            raise ConfigError(f"preset {self.preset!r} unknown", hint=" or ".join(PRESETS))
+        for name in ("rounds", "samples", "seed"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"{name} is negative", hint="give 0 or more")
+
+    @property
+    def recipe(self) -> Preset:
+        """The preset, with what is given in its place."""
+        given = {name: getattr(self, name) for name in ("rounds", "samples")}
+        return PRESETS[self.preset]._replace(**{n: v for n, v in given.items() if v})
+
+    @property
+    def determining(self) -> dict[str, object]:
+        """What the result depends on; not where it is written, nor by how many processes."""
+        left_out = ("out", "workers")
+        return {name: value for name, value in asdict(self).items() if name not in left_out}
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrafficSettings:
     """What a training of traffic depends on, and where it is written."""
@@ -88,7 +141,7 @@ def _require_positive(settings: object, *names: str) -> None:
             raise ConfigError(f"{name} is {value!r}", hint="give a number above 0")
 
 
-def prepare_folder(settings: Settings, store: str, *, resume: bool) -> None:
+def prepare_folder(settings: Settings | ImitationSettings, store: str, *, resume: bool) -> None:
     """Make the folder of a training on a store of this hash, or check that it is the same one.
 
     Raises:
@@ -151,13 +204,13 @@ def write_state(path: Path, state: dict[str, Any]) -> None:
         torch.save(state, partial)
 
 
-def write_network(path: Path, weights: Weights) -> None:
-    """Write a network as `--checkpoint carl=PATH` reads it."""
+def write_network(path: Path, weights: Weights, planner: str = "carl") -> None:
+    """Write a network as `--checkpoint PLANNER=PATH` reads it."""
     from safetensors.torch import save_file
 
     tensors = {name: value.detach().cpu().contiguous() for name, value in weights.items()}
     with atomic_write(path) as partial:
-        save_file(tensors, partial, {"planner": "carl"})
+        save_file(tensors, partial, {"planner": planner})
 
 
 def write_table(path: Path, rows: list[dict[str, Any]]) -> None:
@@ -169,7 +222,15 @@ def write_table(path: Path, rows: list[dict[str, Any]]) -> None:
         pq.write_table(pa.Table.from_pylist(rows), partial)
 
 
-def draw_curves(path: Path, curve: list[dict[str, Any]], scores: list[dict[str, Any]]) -> None:
+ERRORS = {  # by planner: what is drawn of its curve, and times what
+    "carl": {"acceleration_error": 1.0, "steering_error": 10.0},
+    "plantf": {"reg_loss": 1.0, "prediction_loss": 1.0, "cls_loss": 1.0},
+}
+
+
+def draw_curves(
+    path: Path, curve: list[dict[str, Any]], scores: list[dict[str, Any]], planner: str = "carl"
+) -> None:
     """Draw errors while training, and scores after each round; nothing without matplotlib."""
     from shiftsim.report.palette import dashes, new_figure, planner_styles, save_picture
 
@@ -179,14 +240,17 @@ def draw_curves(path: Path, curve: list[dict[str, Any]], scores: list[dict[str, 
         return
     left, right = figure.subplots(1, 2)
     samples = [row["samples"] / 1e6 for row in curve]
-    for name, factor, colour in (("acceleration", 1.0, "0.15"), ("steering", 10.0, "0.6")):
-        values = [factor * row[f"{name}_error"] for row in curve]
-        label = f"{name} error" + (f" × {factor:g}" if factor != 1.0 else "")
+    for (name, factor), colour in zip(
+        ERRORS[planner].items(), ("0.15", "0.6", "0.8"), strict=False
+    ):
+        label = name.replace("_", " ") + (f" × {factor:g}" if factor != 1.0 else "")
+        values = [factor * row[name] for row in curve]
         left.plot(samples, values, label=label, color=colour, linewidth=0.9)
-    left.set(xlabel="samples [million]", ylabel="mean absolute error", yscale="log")
+    what = "mean absolute error" if planner == "carl" else "loss"
+    left.set(xlabel="samples [million]", ylabel=what, yscale="log")
     left.legend(frameon=False, ncols=2, loc="lower center", bbox_to_anchor=(0.5, 1.0))
     at = [row["samples"] / 1e6 for row in scores]
-    style = planner_styles(["carl"])["carl"]
+    style = planner_styles([planner])[planner]
     for noise in ("none", "ou-high"):
         look = {"label": f"noise {noise}", "linestyle": dashes(noise), **style.marks(noise)}
         right.plot(at, [100.0 * row[noise] for row in scores], **look)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from shiftsim.kernels import BoolArray, IntArray
@@ -171,63 +171,35 @@ def log_density(alpha: Tensor, beta: Tensor, x: Tensor) -> Tensor:
 
 @dataclass
 class StepResult:
-    """What a step came to."""
+    """What a step came to: means over the batch."""
 
-    loss: float  # mean over the batch
-    errors: tuple[float, float]  # mean absolute errors of acceleration and steering
+    loss: float
+    terms: dict[str, float]  # by name in the table of the curve
 
 
-class Learner:
+class TrainedNetwork:
     """A network, its optimiser, and the running mean of its weights, which is what drives."""
 
-    def __init__(
-        self, device: str, threads: int, total: int, seed: int, begin: Weights | None = None
-    ) -> None:
-        """`total` steps are to be done; the learning rate falls towards their end.
+    batch: int  # samples of a step
 
-        `begin` are weights to begin with.
-        """
-        torch.manual_seed(seed)
-        self.network, self.total, self.step = CarlNetwork(), total, 0
-        self._rate = RATE * BEGUN if begin else RATE
-        if begin:
-            self.network.load_state_dict(begin)
-        self.network.to(device)
+    def __init__(
+        self, network: nn.Module, groups: list[dict[str, Any]], total: int, *, betas: Any
+    ) -> None:
+        """`total` steps are to be done; `groups` of parameters are those of the optimiser."""
+        self.network, self.total, self.step = network, total, 0
+        self.optimiser = torch.optim.AdamW(groups, lr=RATE, betas=betas, fused=True)
         self.mean = {name: value.detach().clone() for name, value in self._parameters.items()}
-        trained = self._parameters.items()
-        self._trained = [v for name, v in trained if not name.startswith("value_head")]
-        plain = [value for value in self._trained if value.dim() not in (2, 4)]
-        decayed = [value for value in self._trained if value.dim() in (2, 4)]
-        groups = [
-            {"params": decayed, "weight_decay": DECAY},
-            {"params": plain, "weight_decay": 0.0},
-        ]
-        self.optimiser = torch.optim.AdamW(groups, lr=RATE, betas=(0.9, 0.99), fused=True)
-        self._device, self._pool = device, GradientPool(device, threads)
 
     @property
     def _parameters(self) -> dict[str, Tensor]:
         return dict(self.network.named_parameters())
 
-    def learn(self, states: States, batch: Batch) -> StepResult:
-        """Do one step."""
-        count = len(batch.indices)
-
-        def loss_of_rows(rows: IntArray) -> tuple[Tensor, Tensor]:
-            rasters = states.rasters(batch.indices[rows], batch.mirrored[rows].tolist())
-            arrays = (rasters, batch.measurements[rows] / UNITS, batch.actions[rows])
-            pictures, measured, label = (torch.from_numpy(a).to(self._device) for a in arrays)
-            return loss_of(self.network(pictures, measured), label)
-
-        found = self._pool.compute(self._trained, count, loss_of_rows)
-        rate = self._rate * schedule(self.step / self.total)
-        apply_gradient(self.optimiser, self._trained, found, count, clip=CLIP, rate=rate)
+    def count_step(self) -> None:
+        """Take the weights after one more step into the mean."""
         self.step += 1
         drift = 1.0 - min(AVERAGED, (1.0 + self.step) / (10.0 + self.step))
         for name, value in self._parameters.items():
             self.mean[name].lerp_(value.detach(), drift)
-        means = (found.numbers / count).tolist()
-        return StepResult(found.loss / count, (means[0], means[1]))
 
     def driving(self) -> Weights:
         """The network with the mean weights, which drives."""
@@ -248,9 +220,57 @@ class Learner:
         self.step = state["step"]
 
 
-def schedule(done: float) -> float:
+class Learner(TrainedNetwork):
+    """CaRL's network, trained by imitation."""
+
+    batch = BATCH
+
+    def __init__(
+        self, device: str, threads: int, total: int, seed: int, begin: Weights | None = None
+    ) -> None:
+        """`total` steps are to be done; the learning rate falls towards their end.
+
+        `begin` are weights to begin with.
+        """
+        torch.manual_seed(seed)
+        network = CarlNetwork()
+        self._rate = RATE * BEGUN if begin else RATE
+        if begin:
+            network.load_state_dict(begin)
+        network.to(device)
+        trained = network.named_parameters()
+        self._trained: list[Tensor] = [v for n, v in trained if not n.startswith("value_head")]
+        plain = [value for value in self._trained if value.dim() not in (2, 4)]
+        decayed = [value for value in self._trained if value.dim() in (2, 4)]
+        groups = [
+            {"params": decayed, "weight_decay": DECAY},
+            {"params": plain, "weight_decay": 0.0},
+        ]
+        super().__init__(network, groups, total, betas=(0.9, 0.99))
+        self._device, self._pool = device, GradientPool(device, threads)
+
+    def learn(self, states: States, batch: Batch) -> StepResult:
+        """Do one step."""
+        count = len(batch.indices)
+
+        def loss_of_rows(rows: IntArray) -> tuple[Tensor, Tensor]:
+            rasters = states.rasters(batch.indices[rows], batch.mirrored[rows].tolist())
+            arrays = (rasters, batch.measurements[rows] / UNITS, batch.actions[rows])
+            pictures, measured, label = (torch.from_numpy(a).to(self._device) for a in arrays)
+            return loss_of(self.network(pictures, measured), label)
+
+        found = self._pool.compute(self._trained, count, loss_of_rows)
+        rate = self._rate * schedule(self.step / self.total)
+        apply_gradient(self.optimiser, self._trained, found, count, clip=CLIP, rate=rate)
+        self.count_step()
+        means = (found.numbers / count).tolist()
+        names = ("acceleration_error", "steering_error")
+        return StepResult(found.loss / count, dict(zip(names, means, strict=True)))
+
+
+def schedule(done: float, warm_up: float = WARM_UP, floor: float = FLOOR) -> float:
     """Learning rate as a share of the highest, after a share of all steps: up, then a cosine."""
-    if done < WARM_UP:
-        return (done + 1e-4) / (WARM_UP + 1e-4)
-    along = min((done - WARM_UP) / (1.0 - WARM_UP), 1.0)
-    return float(FLOOR + (1.0 - FLOOR) * 0.5 * (1.0 + np.cos(np.pi * along)))
+    if done < warm_up:
+        return (done + 1e-4) / (warm_up + 1e-4)
+    along = min((done - warm_up) / (1.0 - warm_up), 1.0)
+    return float(floor + (1.0 - floor) * 0.5 * (1.0 + np.cos(np.pi * along)))

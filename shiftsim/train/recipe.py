@@ -1,11 +1,16 @@
-"""Training CaRL's network by imitation of PDM-Closed, in rounds (DAgger).
+"""Training networks in rounds: collect, learn, and drive in towns that are left out.
 
-A round collects states, first those that PDM-Closed meets under noise, then those that the network
-meets, at once where it has weights to begin with; PDM-Closed labels all of them. It trains on the
-states of all rounds so far, and drives in towns that are left out. What was done is kept at least
-every two minutes.
+CaRL's imitates PDM-Closed (DAgger). A round collects states, first those that PDM-Closed meets
+under noise, then those that the network meets, at once where it has weights to begin with;
+PDM-Closed labels all of them. It trains on the states of all rounds so far. PlanTF's learns from
+recordings: samples are made when they are needed, and nothing is collected. What was done is kept
+at least every two minutes.
 """
 
+import shutil
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -13,12 +18,34 @@ from time import monotonic
 from typing import Any
 
 from shiftsim.data import open_store
+from shiftsim.errors import DataError
+from shiftsim.files import write_text
 from shiftsim.planners.learned.checkpoint import resolve_device
+from shiftsim.runs.config import make_config
+from shiftsim.runs.execute import execute
 from shiftsim.runs.filter import read_filter_results
+from shiftsim.runs.prepare import prepare
 from shiftsim.runs.scenarios import find_split
 from shiftsim.train import folder, learning
-from shiftsim.train.driving import RunJobs, Towns, collect, divide, mean_scores, run_jobs
-from shiftsim.train.folder import BEST, LATEST, OnMessage, Settings, Weights
+from shiftsim.train.driving import (
+    TESTED,
+    TOGETHER,
+    RunJobs,
+    Towns,
+    collect,
+    divide,
+    mean_scores,
+    run_jobs,
+    tested_tokens,
+)
+from shiftsim.train.folder import (
+    BEST,
+    LATEST,
+    ImitationSettings,
+    OnMessage,
+    Settings,
+    Weights,
+)
 from shiftsim.train.states import States, write_part
 
 _WRITE_EVERY, _REPORT_EVERY = 120.0, 10.0  # s
@@ -39,17 +66,22 @@ class Progress:
     seconds: float = 0.0  # that it took so far
 
 
-class Training:
-    """One training in its folder."""
+class Recipe(ABC):
+    """One training in its folder, of whatever planner."""
 
-    def __init__(self, settings: Settings, on_message: OnMessage, *, resume: bool = False) -> None:
+    planner: str
+    learner: learning.TrainedNetwork
+
+    def __init__(
+        self, settings: Any, rounds: int, on_message: OnMessage, *, resume: bool = False
+    ) -> None:
         """Begin, or go on where it was kept last.
 
         Raises:
             ConfigError: The folder holds another training, or there is no such device.
             DataError: The store is not there.
         """
-        self._settings, self._on_message = settings, on_message
+        self._settings, self._on_message, self._rounds = settings, on_message, rounds
         self.device = resolve_device(settings.device)
         store = open_store(settings.store)
         filtered = read_filter_results(store.path, store.hash)
@@ -57,16 +89,120 @@ class Training:
         tokens = find_split(settings.split, store.path, usable).tokens
         self.towns: Towns = divide(store, tokens, settings.seed)
         folder.prepare_folder(settings, store.hash, resume=resume)
-        self.steps = max(1, settings.samples // settings.rounds // learning.BATCH)
-        total = self.steps * settings.rounds
-        begin = learning.from_official(self._begin()) if settings.checkpoint else None
-        self.learner = learning.Learner(self.device, settings.workers, total, settings.seed, begin)
         self.progress = Progress()
+        self.steps = self._make_learner()
         if (settings.out / folder.STATE).exists():
             state = folder.read_state(settings.out / folder.STATE)
             self.progress = Progress(**state["progress"])
             self.learner.restore(state["learner"])
         self._began = monotonic() - self.progress.seconds
+
+    @abstractmethod
+    def _make_learner(self) -> int:
+        """Make the learner; the steps of a round."""
+
+    @abstractmethod
+    def _collect(self) -> None:
+        """Collect what the round needs, where it is not there."""
+
+    @abstractmethod
+    def _results(self) -> Iterator[learning.StepResult]:
+        """Do step after step, from where the round is."""
+
+    @abstractmethod
+    def _official(self) -> Weights:
+        """What drives, as files have it."""
+
+    @abstractmethod
+    def _scores(self, network: Path, where: str) -> dict[str, float]:
+        """Mean closed-loop scores by noise, in towns that are left out."""
+
+    def run(self) -> None:
+        """Do all rounds that are not done yet."""
+        progress = self.progress
+        while progress.round < self._rounds:
+            self._collect()
+            self._train()
+            self._test()
+            progress.round, progress.done = progress.round + 1, 0
+            self._write_state()
+
+    def _train(self) -> None:
+        progress, learner = self.progress, self.learner
+        reported = written = monotonic()
+        before, results = progress.done, list[learning.StepResult]()
+        steps = self._results() if progress.done < self.steps else iter(())
+        for result in steps:
+            results.append(result)
+            progress.done += 1
+            if progress.done % _CURVE_EVERY == 0 or progress.done == self.steps:
+                samples = learner.step * learner.batch
+                progress.curve.append(_curve_row(progress.round, samples, results))
+                results = []
+                if monotonic() - written > _WRITE_EVERY:
+                    self._write_state()
+                    written = monotonic()
+            if monotonic() - reported > _REPORT_EVERY:
+                rate = (progress.done - before) * learner.batch / (monotonic() - reported)
+                reported, before = monotonic(), progress.done
+                self._report(rate)
+            if progress.done == self.steps:
+                break
+
+    def _report(self, rate: float) -> None:
+        done, total = (n * self.learner.batch for n in (self.learner.step, self.learner.total))
+        left = (total - done) / rate
+        curve = self.progress.curve
+        loss = f"loss {curve[-1]['loss']:.3f}  " if curve else ""
+        self._on_message(
+            f"{self._where} {done} of {total} samples  {rate:.0f} samples/s  "
+            f"{loss}{left / 60.0:.0f} min of training left"
+        )
+
+    def _test(self) -> None:
+        settings, progress = self._settings, self.progress
+        state = self._official()
+        folder.write_network(settings.out / LATEST, state, self.planner)
+        found = self._scores(settings.out / LATEST, self._where)
+        seconds = monotonic() - self._began
+        samples = self.learner.step * self.learner.batch
+        row = {"round": progress.round, "samples": samples, **found, "seconds": seconds}
+        before = max((sum_of(row) for row in progress.scores), default=-1.0)
+        progress.scores.append(row)
+        if sum_of(row) > before:
+            folder.write_network(settings.out / BEST, state, self.planner)
+        self._on_message(f"{self._where} {_in_words(found)}  after {seconds / 60.0:.0f} min")
+        folder.write_table(settings.out / "scores.parquet", progress.scores)
+        folder.write_table(settings.out / "curve.parquet", progress.curve)
+        picture = settings.out / "curves.png"
+        folder.draw_curves(picture, progress.curve, progress.scores, self.planner)
+
+    def _write_state(self) -> None:
+        self.progress.seconds = monotonic() - self._began
+        state = {"progress": vars(self.progress), "learner": self.learner.state()}
+        folder.write_state(self._settings.out / folder.STATE, state)
+
+    @property
+    def _where(self) -> str:
+        return f"round {self.progress.round + 1} of {self._rounds}:"
+
+
+class Training(Recipe):
+    """Of CaRL's network."""
+
+    planner = "carl"
+    learner: learning.Learner
+
+    def __init__(self, settings: Settings, on_message: OnMessage, *, resume: bool = False) -> None:
+        super().__init__(settings, settings.rounds, on_message, resume=resume)
+
+    def _make_learner(self) -> int:
+        settings = self._settings
+        steps = max(1, settings.samples // settings.rounds // learning.BATCH)
+        total = steps * settings.rounds
+        begin = learning.from_official(self._begin()) if settings.checkpoint else None
+        self.learner = learning.Learner(self.device, settings.workers, total, settings.seed, begin)
+        return steps
 
     def _begin(self) -> Weights:
         """The weights to begin with, which are the network that drives first."""
@@ -80,21 +216,12 @@ class Training:
 
     def run(self) -> None:
         """Do all rounds that are not done yet, and PPO if it is asked for."""
-        self._imitate()
+        if not self.progress.tau:
+            self.progress.tau = self._settings.tau or self._choose_tau()
+            self._write_state()
+        super().run()
         if self._settings.ppo_samples:
             self._reinforce()
-
-    def _imitate(self) -> None:
-        settings, progress = self._settings, self.progress
-        if not progress.tau:
-            progress.tau = settings.tau or self._choose_tau()
-            self._write_state()
-        while progress.round < settings.rounds:
-            self._collect()
-            self._train()
-            self._test()
-            progress.round, progress.done = progress.round + 1, 0
-            self._write_state()
 
     def _reinforce(self) -> None:
         """Go on with PPO from the best network, and test what comes out."""
@@ -133,65 +260,20 @@ class Training:
         write_part(part, collect(settings, self.towns, number, tau, run, self._on_message))
         self._write_state()
 
-    def _train(self) -> None:
+    def _results(self) -> Iterator[learning.StepResult]:
         settings, progress, learner = self._settings, self.progress, self.learner
         states = States([settings.part(number) for number in range(progress.round + 1)])
         self._on_message(f"{self._where} training on {len(states)} states")
-        reported = written = monotonic()
-        before, results = progress.done, list[learning.StepResult]()
-        while progress.done < self.steps:
+        while True:
             key = (settings.seed, 3, progress.round, progress.done)
-            results.append(learner.learn(states, learning.draw_batch(states, key)))
-            progress.done += 1
-            if progress.done % _CURVE_EVERY == 0 or progress.done == self.steps:
-                progress.curve.append(_curve_row(progress.round, learner.step, results))
-                results = []
-                if monotonic() - written > _WRITE_EVERY:
-                    self._write_state()
-                    written = monotonic()
-            if monotonic() - reported > _REPORT_EVERY:
-                rate = (progress.done - before) * learning.BATCH / (monotonic() - reported)
-                reported, before = monotonic(), progress.done
-                self._report(rate)
+            yield learner.learn(states, learning.draw_batch(states, key))
 
-    def _report(self, rate: float) -> None:
-        done, total = (n * learning.BATCH for n in (self.learner.step, self.learner.total))
-        left = (total - done) / rate
-        row = self.progress.curve[-1] if self.progress.curve else {"loss": float("nan")}
-        self._on_message(
-            f"{self._where} {done} of {total} samples  {rate:.0f} samples/s  "
-            f"loss {row['loss']:.3f}  {left / 60.0:.0f} min of training left"
-        )
-
-    def _test(self) -> None:
-        settings, progress = self._settings, self.progress
-        state = learning.to_official(self.learner.driving())
-        folder.write_network(settings.out / LATEST, state)
-        found = self._scores(settings.out / LATEST, self._where)
-        seconds = monotonic() - self._began
-        samples = self.learner.step * learning.BATCH
-        row = {"round": progress.round, "samples": samples, **found, "seconds": seconds}
-        before = max((sum_of(row) for row in progress.scores), default=-1.0)
-        progress.scores.append(row)
-        if sum_of(row) > before:
-            folder.write_network(settings.out / BEST, state)
-        self._on_message(f"{self._where} {_in_words(found)}  after {seconds / 60.0:.0f} min")
-        folder.write_table(settings.out / "scores.parquet", progress.scores)
-        folder.write_table(settings.out / "curve.parquet", progress.curve)
-        folder.draw_curves(settings.out / "curves.png", progress.curve, progress.scores)
+    def _official(self) -> Weights:
+        return learning.to_official(self.learner.driving())
 
     def _scores(self, network: Path, where: str) -> dict[str, float]:
         run, count = self._run_jobs(str(network), f"{where} testing"), self._settings.tests
         return mean_scores(self.towns, count, self.progress.tau, run, by_expert=False)
-
-    def _write_state(self) -> None:
-        self.progress.seconds = monotonic() - self._began
-        state = {"progress": vars(self.progress), "learner": self.learner.state()}
-        folder.write_state(self._settings.out / folder.STATE, state)
-
-    @property
-    def _where(self) -> str:
-        return f"round {self.progress.round + 1} of {self._settings.rounds}:"
 
     def _run_jobs(self, checkpoint: str, what: str) -> RunJobs:
         """What drives jobs with some weights and says how far it is, now and then."""
@@ -205,20 +287,91 @@ class Training:
         return partial(run_jobs, self._settings, checkpoint, on_progress)
 
 
+class PlanTfTraining(Recipe):
+    """Of PlanTF's network."""
+
+    planner = "plantf"
+
+    def __init__(
+        self, settings: ImitationSettings, on_message: OnMessage, *, resume: bool = False
+    ) -> None:
+        super().__init__(settings, settings.recipe.rounds, on_message, resume=resume)
+
+    def _make_learner(self) -> int:
+        from shiftsim.train.imitation import PlanTfLearner
+
+        preset, seed = self._settings.recipe, self._settings.seed
+        steps = max(1, preset.samples // preset.rounds // preset.batch)
+        self._learner = PlanTfLearner(self.device, preset, steps * preset.rounds, seed)
+        self.learner = self._learner
+        return int(steps)
+
+    def _collect(self) -> None:
+        """Nothing: samples are made when they are needed."""
+
+    def _results(self) -> Iterator[learning.StepResult]:
+        from shiftsim.train.samples import Stream, load_blocks
+
+        settings, learner = self._settings, self._learner
+        tokens = tuple(sorted(token for town in self.towns.trained.values() for token in town))
+        stream = Stream(settings.store, tokens, settings.seed, settings.recipe.batch)
+        self._on_message(f"{self._where} training on {len(tokens)} scenarios")
+        block, done = learner.place
+        failed, unused = Counter[str](), 0
+        for found in load_blocks(stream, block, settings.workers):
+            failed.update(found.failed)
+            unused += 1
+            for batch in found.batches[done:]:
+                done += 1
+                if 2 * len(batch.target) >= stream.batch:  # fewer give poor statistics
+                    unused, learner.place = 0, (block, done)
+                    yield learner.learn(batch)
+            if unused > stream.blocks:
+                raise DataError(
+                    f"no batch of {stream.batch} samples could be made: {_counted(failed)}",
+                    hint="training needs more scenarios with a future of 8 s",
+                )
+            if found.failed:
+                self._on_message(f"{self._where} samples left out: {_counted(failed)}")
+            block, done = block + 1, 0
+
+    def _official(self) -> Weights:
+        return self.learner.driving()
+
+    def _scores(self, network: Path, where: str) -> dict[str, float]:
+        settings = self._settings
+        split = settings.out / "tests.txt"
+        write_text(split, "\n".join(tested_tokens(self.towns, settings.tests)) + "\n")
+        run_folder = settings.out / "runs" / f"round-{self.progress.round:02d}"
+        shutil.rmtree(run_folder, ignore_errors=True)  # of a training that was ended in it
+        values: dict[str, Any] = {
+            "planners": [self.planner],
+            "checkpoints": [f"{self.planner}={network}"],
+        }
+        values |= {"store": settings.store, "split": str(split), "out": str(run_folder)}
+        values |= {"noise": list(TESTED), "workers": settings.workers, "batch_size": TOGETHER}
+        self._on_message(f"{where} testing")
+        rows = execute(prepare(make_config(values))).scores.to_pylist()
+        if not rows:
+            raise DataError(f"no scenario could be driven to its end, see {str(run_folder)!r}")
+        found = {noise: [row["cls"] for row in rows if row["noise"] == noise] for noise in TESTED}
+        return {noise: sum(scores) / max(len(scores), 1) for noise, scores in found.items()}
+
+
+def _counted(failed: Counter[str]) -> str:
+    return ", ".join(f"{count} {reason}" for reason, count in failed.most_common()) or "none"
+
+
 def sum_of(row: dict[str, Any]) -> float:
     """What the best network has most of: scores with and without noise."""
     return float(row["none"] + row["ou-high"])
 
 
-def _curve_row(number: int, step: int, results: list[learning.StepResult]) -> dict[str, Any]:
+def _curve_row(number: int, samples: int, results: list[learning.StepResult]) -> dict[str, Any]:
     count = len(results)
-    return {
-        "round": number,
-        "samples": step * learning.BATCH,
-        "loss": sum(one.loss for one in results) / count,
-        "acceleration_error": sum(one.errors[0] for one in results) / count,
-        "steering_error": sum(one.errors[1] for one in results) / count,
-    }
+    terms = {n: sum(one.terms[n] for one in results) / count for n in results[0].terms}
+    loss = sum(one.loss for one in results) / count
+    return {"round": number, "samples": samples, "loss": loss, **terms}
 
 
 def _in_words(found: dict[str, float]) -> str:

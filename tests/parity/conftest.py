@@ -15,10 +15,10 @@ from typing import Any
 import places
 import pytest
 from parity_cases import (
+    COMPARED_APART,
     COMPARED_ELSEWHERE,
     KINDS,
     NETS,
-    NOT_COMPARED_YET,
     Cases,
     open_scenes,
     recognise,
@@ -63,7 +63,7 @@ def references(config: pytest.Config) -> list[tuple[str, Path, bool]]:
     small += [pair for path in golden if path.is_dir() for pair in recognise(path)]
     large = SHARED / "reference"
     paths = sorted(large.iterdir()) if large.is_dir() else []
-    paths = [path for path in paths if path.is_dir() and path.name not in NOT_COMPARED_YET]
+    paths = [path for path in paths if path.is_dir() and path.name not in COMPARED_APART]
     found = [pair for path in paths for pair in recognise(path)]
     return [*((*pair, False) for pair in small), *((*pair, True) for pair in found)]
 

@@ -23,8 +23,11 @@ from parity_cases import (
     read_file,
 )
 from parity_nets import (
+    CODES,
     FILE_COLUMNS,
+    INPUTS,
     PLAN,
+    PLUTO_INPUTS,
     STATE,
     Loop,
     compare_manifest,
@@ -62,37 +65,7 @@ SCORED = 1e-8  # what follows from stored proposals and scores
 ROLLOUT = [2e-3, 2e-3, 2e-4, *[2e-3] * 8]
 POSES = [2e-3, 2e-3, 2e-4]  # m, m, rad
 
-CODES = ("category", "kind", "on_route", "light", "object_category")  # integers, stored as floats
 Outputs = Callable[[Any, Any], dict[str, Any]]  # of a network, from its inputs
-
-# which array of the files is which field of the inputs of a network
-INPUTS: dict[str, str | list[str]] = {
-    **{name: f"agent.{name}" for name in ("position", "heading", "velocity", "shape", "category")},
-    "valid": "agent.valid_mask",
-    "current_state": "current_state[:, :6]",  # the yaw rate behind them is not read
-    "points": "map.point_position[:, :, 0]",  # of the centre line
-    "vectors": "map.point_vector[:, :, 0]",
-    "orientations": "map.point_orientation[:, :, 0]",
-    "centers": "map.polygon_center",
-    "kind": "map.polygon_type",
-    "on_route": "map.polygon_on_route",
-    "light": "map.polygon_tl_status",
-    "has_limit": "map.polygon_has_speed_limit",
-    "limit": "map.polygon_speed_limit",
-    "point_valid": "map.valid_mask",
-}
-PLUTO_INPUTS: dict[str, str | list[str]] = {
-    **INPUTS,
-    "points": "map.point_position",  # of the boundaries, too
-    "object_pose": ["static_objects.position", "static_objects.heading"],
-    "object_shape": "static_objects.shape",
-    "object_category": "static_objects.category",
-    "object_valid": "static_objects.valid_mask",
-    "line_points": "reference_line.position",
-    "line_vectors": "reference_line.vector",
-    "line_orientations": "reference_line.orientation",
-    "line_valid": "reference_line.valid_mask",
-}
 
 
 def likeliest(trajectory: Any, probability: Any) -> Any:

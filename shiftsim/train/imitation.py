@@ -1,0 +1,257 @@
+"""What the authors' trainings of PlanTF, PLUTO and Diffusion Planner minimise, and how.
+
+Losses are plain functions of a network's outputs and of what was recorded; a loss is the sum of its
+terms, each of weight 1. Then the groups of parameters, the learning rates by epoch, and the first
+values of a network. B scenes, A agents of which the first is the ego, T = 80 steps of 0.1 s.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from shiftsim.planners.learned.network import Attention
+from shiftsim.planners.learned.plantf.network import Outputs as PlanTfOutputs
+from shiftsim.planners.learned.plantf.network import PlanTfNetwork
+from shiftsim.planners.learned.pluto.network import NEVER
+from shiftsim.planners.learned.pluto.network import Outputs as PlutoOutputs
+from shiftsim.train.folder import Preset
+from shiftsim.train.learning import StepResult, TrainedNetwork, schedule
+from shiftsim.train.samples import Batch
+from shiftsim.world.state import PACIFICA
+
+Losses = dict[str, Tensor]  # terms by name, and `loss`, their sum
+
+MODE_LENGTH = 10.0  # m of a reference line for each of PLUTO's modes
+# three circles of PLUTO along the ego: places ahead of the rear axle, and their radius [m]
+_THIRD = PACIFICA.length / 3.0
+CIRCLES = [PACIFICA.rear_axle_to_center + place * _THIRD for place in (-1.0, 0.0, 1.0)]
+CIRCLE_RADIUS = 0.5 * math.hypot(PACIFICA.width, _THIRD) - 0.2
+PIXEL, INSIDE = 0.2, 0.95  # m; share of the raster in which a point counts
+TEMPERATURE = 0.1  # of the contrastive loss
+CLIP = 5.0  # of the norm of all gradients
+WARM_UP, FLOOR = 0.05, 2e-3  # of PlanTF here: share of rising, end of the learning rate as a share
+
+
+def _sum(**terms: Tensor) -> Losses:
+    return {"loss": torch.stack([term.reshape(()) for term in terms.values()]).sum(), **terms}
+
+
+def _mean_of(values: Tensor, valid: Tensor) -> Tensor:
+    """Sum of the values (...) that are valid (...) over their number; 0 where none is."""
+    return values[valid].sum() / valid.sum().clamp(min=1)
+
+
+def motion(target: Tensor) -> Tensor:
+    """(..., 4) x, y, cosine and sine of the heading of (..., 3) x, y, heading."""
+    angle = target[..., 2:]
+    return torch.cat([target[..., :2], angle.cos(), angle.sin()], dim=-1)
+
+
+def plantf_loss(out: PlanTfOutputs, target: Tensor, valid: Tensor) -> Losses:
+    """Of PlanTF: `reg_loss`, `cls_loss` of the mode nearest to the target, `prediction_loss`.
+
+    Args:
+        out: What the network says.
+        target: (B, A, 80, 3) change of x [m], y [m] and heading [rad] since the present, in the
+            frame of the ego; 0 where not recorded.
+        valid: (B, A, 80) whether it was recorded. The terms of the ego take all of it.
+    """
+    ego = motion(target[:, 0])
+    away = torch.linalg.vector_norm(out.trajectory[..., :2].detach() - ego[:, None, :, :2], dim=-1)
+    best = away.sum(dim=-1).argmin(dim=-1)
+    chosen = out.trajectory[torch.arange(len(best), device=best.device), best]
+    others = functional.smooth_l1_loss(out.prediction, target[:, 1:, :, :2], reduction="none")
+    return _sum(
+        reg_loss=functional.smooth_l1_loss(chosen, ego),
+        cls_loss=functional.cross_entropy(out.probability, best),
+        prediction_loss=_mean_of(others.mean(dim=-1), valid[:, 1:]),
+    )
+
+
+def pluto_assignment(projection: Tensor, lines: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """(B,) reference line and mode that PLUTO has to choose.
+
+    Args:
+        projection: (B, R, 8, 2) arc length and distance [m] of the ego on every line at 1 to 8 s.
+        lines: (B, R) whether a line has points.
+        valid: (B, 80) steps of the ego that count.
+    """
+    # their index is a second late, unless all steps count
+    at = (valid.sum(dim=-1) // 10).clamp(0, projection.shape[2] - 1)
+    scene = torch.arange(len(at), device=at.device)
+    length, distance = projection[scene, :, at].unbind(dim=-1)
+    line = (distance + 1e6 * ~lines).argmin(dim=-1)
+    mode = (length[scene, line] / MODE_LENGTH).floor().long()
+    return line, mode.clamp(0, 11)
+
+
+def road_loss(trajectory: Tensor, signed: Tensor) -> Tensor:
+    """How deep the ego is beyond the edge of the road, mean over circles and steps that are.
+
+    Args:
+        trajectory: (B, 80, 4) x, y [m], cosine and sine of the heading.
+        signed: (B, H, W) distance [m] to the edge, positive on the road: column x / 0.2 + W / 2,
+            row -y / 0.2 + H / 2. It is read half a pixel behind and to the left, as the authors do.
+    """
+    height, width = signed.shape[-2:]
+    ahead = signed.new_tensor(CIRCLES)[:, None]
+    places = trajectory[:, :, None, :2] + ahead * trajectory[:, :, None, 2:4]
+    scale = signed.new_tensor([2.0 / width, -2.0 / height]) / PIXEL
+    grid = places * scale
+    read = functional.grid_sample(signed[:, None], grid, align_corners=False)[:, 0]
+    depth = CIRCLE_RADIUS - read
+    begins = signed[:, height // 2, width // 2] > 0.0
+    counted = (depth > 0.0) & (grid.abs() < INSIDE).all(dim=-1) & begins[:, None, None]
+    return depth[counted].sum() / (counted.sum() + 1e-6)
+
+
+def contrastive_loss(hidden: Tensor, valid: Tensor) -> Tensor:
+    """How much nearer anchors are to positives than to negatives; (3B, C), in this order.
+
+    `valid` (B,) says which negatives there are; without any the loss is 0.
+    """
+    anchor, positive, negative = functional.normalize(hidden, dim=-1).chunk(3)
+    near = [(anchor * other).sum(dim=-1) / TEMPERATURE for other in (positive, negative)]
+    logits = torch.stack(near, dim=-1)
+    return _mean_of(torch.logsumexp(logits, dim=-1) - logits[:, 0], valid)
+
+
+def pluto_loss(
+    out: PlutoOutputs,
+    target: Tensor,
+    valid: Tensor,
+    projection: Tensor,
+    *,
+    signed: Tensor | None = None,
+    contrast: tuple[Tensor, Tensor] | None = None,
+) -> Losses:
+    """Of PLUTO.
+
+    Args:
+        out: What the network says.
+        target: (B, A, 80, 6) change of x, y [m], cosine and sine of that of the heading, velocity
+            [m/s], in the frame of the ego.
+        valid: (B, A, 80) steps that count.
+        projection: (B, R, 8, 2) of `pluto_assignment`.
+        signed: (B, H, W) of `road_loss`, or None for no such term.
+        contrast: Arguments of `contrastive_loss`. The batch is then anchors, positives, negatives,
+            of which the last third counts in no other term.
+    """
+    count = len(target) * 2 // 3 if contrast else len(target)
+    target, valid, scene = target[:count], valid[:count], torch.arange(count, device=target.device)
+    trajectory, logits = out.trajectory[:count], out.probability[:count]
+    lines = logits[..., 0] > NEVER
+    line, mode = pluto_assignment(projection[:count], lines, valid[:, 0])
+    chosen, ego = trajectory[scene, line, mode], target[:, 0]
+
+    def error(said: Tensor, recorded: Tensor, counted: Tensor) -> Tensor:
+        each = functional.smooth_l1_loss(said, recorded, reduction="none").sum(dim=-1)
+        return _mean_of(each, counted)
+
+    terms = {
+        "reg_loss": error(chosen, ego, valid[:, 0]),
+        "cls_loss": functional.cross_entropy(logits.flatten(1), line * logits.shape[-1] + mode),
+        "ref_free_reg_loss": error(out.ref_free_trajectory[:count], ego[..., :4], valid[:, 0]),
+        "prediction_loss": error(out.prediction[:count], target[:, 1:], valid[:, 1:]),
+    }
+    if signed is not None:
+        terms["collision_loss"] = road_loss(chosen, signed[:count])
+    if contrast:
+        terms["contrastive_loss"] = contrastive_loss(*contrast)
+    return _sum(**terms)
+
+
+def diffusion_loss(said: Tensor, clean: Tensor, valid: Tensor) -> Losses:
+    """Of Diffusion Planner: how well trajectories are restored to which noise was added.
+
+    Args:
+        said: (B, A, 80, 4) normalised x, y, cosine and sine of the heading, by the network.
+        clean: (B, A, 80, 4) the same as recorded, 0 where not; the ego and its neighbours.
+        valid: (B, A - 1, 80) recorded steps of the neighbours.
+    """
+    error = (said - clean).square().sum(dim=-1)
+    return _sum(
+        neighbor_prediction_loss=_mean_of(error[:, 1:], valid),
+        ego_planning_loss=error[:, 0].mean(),
+    )
+
+
+def parameter_groups(network: nn.Module, decay: float = 1e-4) -> list[dict[str, Any]]:
+    """Groups of an optimiser: weights of products decay, all else does not."""
+    decayed: list[Tensor] = []
+    plain: list[Tensor] = []
+    for module in network.modules():
+        products = isinstance(module, nn.Linear | nn.Conv1d | Attention)
+        for name, value in module.named_parameters(recurse=False):
+            is_weight = products and "weight" in name
+            (decayed if is_weight else plain).append(value)
+    return [{"params": decayed, "weight_decay": decay}, {"params": plain, "weight_decay": 0.0}]
+
+
+def rate_of_epoch(epoch: float, epochs: int = 25, warm_up: float = 3, rate: float = 1e-3) -> float:
+    """Learning rate of PlanTF and PLUTO: rises by epochs, then falls with a cosine to 1e-6."""
+    if epoch < warm_up:
+        return rate * (epoch + 1) / warm_up
+    along = (epoch - warm_up) / (epochs - warm_up)
+    return 1e-6 + 0.5 * (rate - 1e-6) * (1.0 + math.cos(math.pi * along))
+
+
+def diffusion_rate_of_epoch(epoch: int, rate: float = 5e-4) -> float:
+    """Learning rate of Diffusion Planner: rises over five epochs, then stays."""
+    return rate * min(1.0, 0.1 + 0.9 * epoch / 4)
+
+
+def begin(network: nn.Module, seed: int) -> None:
+    """First values as of the authors of PlanTF and PLUTO, from a seed."""
+    random = torch.Generator().manual_seed(seed)
+    for module in network.modules():
+        if isinstance(module, nn.Linear):
+            nn.init.xavier_uniform_(module.weight, generator=random)
+            if module.bias is not None:
+                nn.init.zeros_(module.bias)
+        elif isinstance(module, nn.Embedding):
+            nn.init.normal_(module.weight, 0.0, 0.02, generator=random)
+
+
+class PlanTfLearner(TrainedNetwork):
+    """PlanTF's network, trained on samples of a store."""
+
+    def __init__(self, device: str, preset: Preset, total: int, seed: int) -> None:
+        """`total` steps are to be done; the learning rate falls towards their end."""
+        torch.set_num_threads(1)  # sums must not depend on the number of cores
+        torch.manual_seed(seed)
+        network = PlanTfNetwork()
+        begin(network, seed)
+        network.to(device).train()
+        super().__init__(network, parameter_groups(network), total, betas=(0.9, 0.999))
+        self.batch, self._rate, self._device, self._seed = preset.batch, preset.rate, device, seed
+        self.place = (0, 0)  # of the next batch: the block of the stream, and the batch in it
+
+    def learn(self, batch: Batch) -> StepResult:
+        """Do one step."""
+        key = np.random.SeedSequence([self._seed, 4, self.step]).generate_state(1, np.uint64)
+        torch.manual_seed(int(key[0]))  # of the state dropout
+        inputs, target, valid = batch.on(self._device)
+        losses = plantf_loss(self.network(inputs), target, valid)
+        self.optimiser.zero_grad()
+        losses["loss"].backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self.network.parameters(), CLIP)
+        for group in self.optimiser.param_groups:
+            group["lr"] = self._rate * schedule(self.step / self.total, WARM_UP, FLOOR)
+        self.optimiser.step()
+        self.count_step()
+        terms = {name: float(value.detach()) for name, value in losses.items()}
+        return StepResult(terms.pop("loss"), terms)
+
+    def state(self) -> dict[str, Any]:
+        """All that is needed to go on."""
+        return {**super().state(), "place": list(self.place)}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from `state`."""
+        super().restore(state)
+        self.place = tuple(state["place"])

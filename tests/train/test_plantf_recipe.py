@@ -1,0 +1,114 @@
+"""PlanTF learns from a store: the same again, after an interruption as well, and drivable."""
+
+import pyarrow.parquet as pq
+import pytest
+from stores import write_toy_store
+
+import shiftsim
+from shiftsim.errors import ConfigError, DataError
+from shiftsim.train import folder, recipe
+from shiftsim.train.folder import BEST, LATEST, ImitationSettings, Preset
+from shiftsim.train.imitation import PlanTfLearner
+from shiftsim.train.recipe import PlanTfTraining
+from shiftsim.train.samples import Stream, load_blocks
+
+pytestmark = [pytest.mark.learned, pytest.mark.thorough]
+STEPS, BATCH = 6, 8
+
+
+@pytest.fixture(scope="module")
+def road(tmp_path_factory):
+    """A store of ten scenarios of 12 s, one of which is left out."""
+    return write_toy_store(tmp_path_factory.mktemp("stores") / "road", count=10, iterations=121)
+
+
+@pytest.fixture
+def small(road, tmp_path, monkeypatch):
+    """Makes the settings of a training that takes seconds."""
+    preset = Preset(samples=STEPS * BATCH, rounds=2, batch=BATCH, rate=5e-4)
+    monkeypatch.setitem(folder.PRESETS, "laptop", preset)
+
+    def make(name, **changes):
+        return ImitationSettings(
+            **{"store": str(road), "out": tmp_path / name, "tests": 1, "workers": 1, **changes}
+        )
+
+    return make
+
+
+def train(settings, **options):
+    lines = []
+    PlanTfTraining(settings, lines.append, **options).run()
+    return lines
+
+
+def test_the_same_seed_gives_the_same_network_for_any_number_of_workers(small):
+    one, two, other = small("one"), small("two", workers=2), small("other", seed=1)
+    for settings in (one, two, other):
+        train(settings)
+    networks = [(settings.out / LATEST).read_bytes() for settings in (one, two, other)]
+    assert networks[0] == networks[1] != networks[2]
+
+
+def test_a_training_that_was_ended_goes_on_as_if_it_had_not(small, monkeypatch):
+    whole, ended = small("whole"), small("ended")
+    monkeypatch.setattr(recipe, "_WRITE_EVERY", 0.0)
+    monkeypatch.setattr(recipe, "_CURVE_EVERY", 1)
+    train(whole)
+    learn, steps = PlanTfLearner.learn, []
+
+    def stopping(learner, batch):
+        steps.append(1)
+        if len(steps) == 5:
+            raise KeyboardInterrupt
+        return learn(learner, batch)
+
+    monkeypatch.setattr(PlanTfLearner, "learn", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        train(ended)
+    train(ended, resume=True)
+    assert len(steps) == STEPS + 1  # the interrupted one was begun twice
+    assert (ended.out / LATEST).read_bytes() == (whole.out / LATEST).read_bytes()
+
+
+def test_what_comes_out_drives_and_says_how_it_came(small, road, tmp_path):
+    settings = small("out")
+    lines = train(settings)
+    assert not [line for line in lines if "nan" in line]
+    for name in ("curves.png", "curve.parquet", "settings.json", "runs/round-01/scores.parquet"):
+        assert (settings.out / name).stat().st_size > 0
+    rows = pq.read_table(settings.out / "scores.parquet").to_pylist()
+    assert [row["samples"] for row in rows] == [24, 48]
+    assert all(0.0 <= row[noise] <= 1.0 for row in rows for noise in ("none", "ou-high"))
+    done = shiftsim.run(
+        "plantf",
+        checkpoints=[f"plantf={settings.out / BEST}"],
+        store=str(road),
+        limit=1,
+        workers=1,
+        out=str(tmp_path / "run"),
+    )
+    assert done.is_complete
+
+
+def test_the_loss_of_one_batch_falls(small, road):
+    tokens = tuple(sorted(shiftsim.open_store(road).tokens))
+    learner = PlanTfLearner("cpu", Preset(0, 1, BATCH, 3e-3), total=200, seed=0)
+    batch = next(load_blocks(Stream(str(road), tokens, seed=0, batch=BATCH), 0, 0)).batches[0]
+    losses = [learner.learn(batch).loss for _ in range(100)]
+    assert losses[-1] < 0.6 * losses[0]
+
+
+def test_too_few_scenarios_are_refused(small, tmp_path):
+    store = write_toy_store(tmp_path / "two", count=2, iterations=121)
+    settings = small("few", store=str(store))
+    preset = Preset(samples=4_000, rounds=1, batch=400, rate=1e-3)
+    folder.PRESETS["laptop"] = preset
+    with pytest.raises(DataError, match="no batch of 400 samples"):
+        train(settings)
+
+
+@pytest.mark.parametrize("changes", [{"preset": "phone"}, {"tests": 0}, {"seed": -1}])
+def test_settings_that_make_no_training_are_refused(small, changes):
+    with pytest.raises(ConfigError):
+        small("wrong", **changes)

@@ -1,0 +1,163 @@
+"""Samples of PlanTF: right by hand, and the same whoever makes them."""
+
+import hashlib
+from dataclasses import astuple, replace
+from itertools import islice
+
+import numpy as np
+import pytest
+import torch
+from stores import write_toy_store
+
+from shiftsim.data import open_store
+from shiftsim.errors import PlannerError
+from shiftsim.geometry.boxes import from_frame
+from shiftsim.planners.learned import features
+from shiftsim.planners.learned.plantf.planner import PlanTF
+from shiftsim.sim.planner import scene_info
+from shiftsim.train import samples
+from shiftsim.train.samples import Stream, load_blocks, make_sample, targets
+
+pytestmark = [pytest.mark.learned, pytest.mark.slow]
+
+
+@pytest.fixture(scope="module")
+def road(tmp_path_factory):
+    """A store of 24 scenarios of which 12 s were recorded."""
+    folder = tmp_path_factory.mktemp("stores") / "road"
+    return write_toy_store(folder, count=24, iterations=121)
+
+
+@pytest.fixture
+def stream(road):
+    return Stream(str(road), tuple(sorted(open_store(road).tokens)), seed=3, batch=4)
+
+
+@pytest.fixture
+def asked(road):
+    """A scenario and a planner that was reset to it."""
+    scenario, planner = open_store(road).read("0000cafe"), PlanTF.asking(lambda scenes: ())
+    planner.reset(scene_info(scenario))
+    return scenario, planner
+
+
+class Draws:
+    """Random numbers that are known: perturbed or not, and by how much."""
+
+    def __init__(self, first, noise=None):
+        self._first, self._noise = first, noise
+
+    def random(self):
+        return self._first
+
+    def uniform(self, low, high):
+        return np.array(self._noise)
+
+
+def arrays_of(batch):
+    inputs = [value for value in astuple(replace(batch.inputs, counts=None)) if value is not None]
+    return [*inputs, batch.target, batch.valid]
+
+
+def digest(stream, workers, count=50):
+    """SHA-256 of the first batches of a stream, and which samples failed."""
+    total, seen, failed = hashlib.sha256(), 0, []
+    for block in load_blocks(stream, 0, workers):
+        failed.append(block.failed)
+        for batch in block.batches:
+            for tensor in arrays_of(batch):
+                total.update(tensor.numpy().tobytes())
+            seen += 1
+            if seen == count:
+                return total.hexdigest(), failed
+    raise AssertionError(f"only {seen} batches")
+
+
+def test_the_target_of_a_straight_drive_is_its_speed(asked):
+    scenario, planner = asked
+    one = make_sample(planner, scenario, 10, Draws(0.9))
+    np.testing.assert_allclose(one.target[0, :, 0], 0.6 * np.arange(1, 81), atol=1e-5)
+    np.testing.assert_allclose(one.target[0, :, 1:], 0.0, atol=1e-6)
+    np.testing.assert_array_equal(one.target[1:], 0.0)  # it is parked
+    assert one.valid.all()
+
+
+def test_targets_are_as_recorded_and_0_where_nothing_was():
+    future = np.array([[[3.0, 4.0, 0.5], [np.nan] * 3]])
+    frame = np.array([0.0, 0.0, np.pi / 2.0])
+    made = targets(np.array([[1.0, 1.0, 0.25]]), future, frame)
+    np.testing.assert_allclose(made, [[[3.0, -2.0, 0.25], [0.0, 0.0, 0.0]]], atol=1e-6)
+
+
+def test_a_perturbed_target_leads_back_to_the_recording(asked):
+    scenario, planner = asked
+    noise = [0.5, -0.4, 0.2, 1.0, 0.3, 0.1, 0.05]
+    plain, moved = (make_sample(planner, scenario, 10, Draws(d, noise)) for d in (0.9, 0.1))
+    ego = scenario.expert[10, :3]
+    frame = features.map_poses(np.array(noise[:3]), ego)
+    for sample, origin in ((plain, ego), (moved, frame)):
+        back = from_frame(sample.target[0].astype(np.float64), origin)
+        recorded = scenario.expert[11:91, :3]
+        np.testing.assert_allclose(back, recorded, atol=1e-4)
+    state = moved.features.current_state - plain.features.current_state
+    np.testing.assert_allclose(state[3:], noise[3:], atol=1e-6)
+    np.testing.assert_array_equal(moved.features.current_state[:3], 0.0)
+
+
+def test_the_ego_is_not_moved_into_another(asked):
+    scenario, planner = asked
+    beside = [0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0]  # beyond what is drawn: the car parks beside
+    there = int(np.argmin(np.abs(scenario.expert[:, 0] - 30.0)))
+    assert not make_sample(planner, scenario, min(there, 40), Draws(0.1, beside)) == ""
+    pose, size = np.array([0.0, 0.0, 0.0]), np.array([[5.0, 2.0]])
+    assert not samples.is_free(pose, np.array([[3.0, 0.0, 0.0]]), size)
+    assert samples.is_free(pose, np.array([[3.0, 3.0, 0.0]]), size)
+
+
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")
+def test_batches_are_the_same_for_any_number_of_workers(stream):
+    alone = digest(stream, 0)
+    for workers in range(1, 5):
+        assert digest(stream, workers) == alone
+    assert digest(replace(stream, seed=4), 0) != alone
+
+
+def test_a_stream_goes_on_where_it_ended(stream):
+    whole = [
+        arrays_of(batch)
+        for block in islice(load_blocks(stream, 0, 0), 4)
+        for batch in block.batches
+    ]
+    ends = (islice(load_blocks(stream, first, 0), 2) for first in (0, 2))
+    parts = [arrays_of(batch) for part in ends for block in part for batch in block.batches]
+    assert len(whole) == len(parts)
+    for one, other in zip(whole, parts, strict=True):
+        assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+def test_an_epoch_has_every_scenario_once(stream):
+    tokens = [token for block in range(stream.blocks) for token in stream.tokens_of(block)]
+    assert sorted(tokens) == list(stream.tokens)
+    assert stream.tokens_of(stream.blocks) != stream.tokens_of(0)
+
+
+def test_samples_that_cannot_be_made_are_counted(stream, monkeypatch):
+    read, asked = PlanTF.features, []
+
+    def sometimes(planner, observation):
+        asked.append(1)
+        if len(asked) % 4 == 1:
+            raise PlannerError("no route")
+        return read(planner, observation)
+
+    monkeypatch.setattr(PlanTF, "features", sometimes)
+    block = next(load_blocks(stream, 0, 0))
+    made = sum(len(batch.target) for batch in block.batches)
+    assert block.failed == {"PlannerError": -(-len(asked) // 4)}
+    assert made == len(asked) - block.failed["PlannerError"]
+
+
+def test_an_iteration_without_8_s_after_it_is_no_sample(asked):
+    scenario, planner = asked
+    short = replace(scenario, iteration_rows=scenario.iteration_rows[-1:] + 2 * 79)
+    assert "8 s" in make_sample(planner, short, 0, Draws(0.9))
