@@ -233,7 +233,6 @@ class Counting(LearnedTraffic):
         super().step_batch(models, moves)
 
 
-@pytest.mark.thorough
 def test_traffic_networks_move_several_rollouts_with_one_pass():
     scenes = [scene(2 * number, iterations=12 + 2 * number) for number in range(3)]
     alone = [simulate(one, ConstantVelocity(), traffic=LearnedTraffic()) for one in scenes]

@@ -61,7 +61,6 @@ AV2_FAULTS = {
 }
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize("message", AV2_FAULTS)
 def test_a_fault_of_argoverse_is_named(tmp_path, message):
     path = write_av2(tmp_path)

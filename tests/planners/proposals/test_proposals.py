@@ -48,7 +48,6 @@ def test_on_one_area_is_not_on_several_even_if_others_are_touched(place):
     assert not places.flags[..., OFF_ROUTE].any()
 
 
-@pytest.mark.thorough
 @settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1))
 def test_an_area_holds_the_points_that_shapely_says(seed):

@@ -63,7 +63,6 @@ def _samples(columns, **changed):
     )
 
 
-@pytest.mark.thorough
 def test_a_table_gives_the_scenarios_of_the_same_recording_in_dsc3d(towns, town, tmp_path):
     table = write_tracks(tmp_path / "t.csv", town[0])
     report = convert_tracks(TracksReader(table, town[1], city=TOWN), tmp_path / "own")
@@ -260,7 +259,6 @@ def test_files_of_levelxdata_need_nothing_said(town, tmp_path):
     assert sorted(set(names.tolist())) == sorted(set(c["kind"].tolist()))
 
 
-@pytest.mark.thorough
 def test_a_recording_that_is_converted_again_takes_the_place_of_the_old_one(town, tmp_path):
     inspection = TracksReader(write_tracks(tmp_path / "t.csv", town[0]), town[1])
     before = convert_tracks(inspection, tmp_path / "s")
@@ -287,7 +285,6 @@ def _convert(folder, capsys, *words):
     return end.value.code, *capsys.readouterr()
 
 
-@pytest.mark.thorough
 def test_the_command_converts_and_draws_what_is_right_and_what_is_wrong(town, tmp_path, capsys):
     right = write_tracks(tmp_path / "right.csv", town[0])
     wrong = write_tracks(tmp_path / "wrong.csv", town[0], y_m=-town[0]["y_m"])
