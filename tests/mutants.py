@@ -185,6 +185,8 @@ def run_tests(tests: list[str], quiet: bool = True) -> str:
         "-q",
         "--tb=no",
         "--disable-warnings",
+        "-W",
+        "ignore::pytest.PytestAssertRewriteWarning",  # of a process that has run tests before
         "-p",
         "no:cacheprovider",
         "-m",
