@@ -146,3 +146,11 @@ def test_a_changed_public_signature_is_noticed(api_diff, tmp_path):
     assert list(api_diff.changes(found["old"], found["more"])) == []
     (change,) = api_diff.changes(found["old"], less)
     assert "noise" in change
+
+
+def test_every_change_has_a_kind_that_the_changelog_knows():
+    tool = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["towncrier"]
+    names = {path.name for path in (REPOSITORY / "changes").iterdir()} - set(tool["ignore"])
+    kinds = "|".join(tool["fragment"])
+    assert [name for name in names if not re.fullmatch(rf"\+[\w-]+\.({kinds})\.md", name)] == []
+    assert "<!-- towncrier release notes start -->" in (REPOSITORY / tool["filename"]).read_text()

@@ -1,6 +1,6 @@
 """Changes of the public API since a git revision that may break callers.
 
-`python tools/api_diff.py REVISION` prints them; exit code 1 where there are any and CHANGELOG.md
+`python tools/api_diff.py REVISION` prints them; exit code 1 where there are any and changes/
 is as it was.
 """
 
@@ -49,9 +49,9 @@ def main(revision: str) -> int:
         subprocess.run(["tar", "-x", "-C", str(tree)], input=archive.stdout, check=True)
         found = list(changes(load(tree, folder / "old"), load(ROOT, folder / "new")))
     print("\n".join(found) or "no public signature has changed")
-    told = subprocess.run([*git, "diff", "--quiet", revision, "--", "CHANGELOG.md"], check=False)
+    told = subprocess.run([*git, "diff", "--quiet", revision, "--", "changes"], check=False)
     if found and not told.returncode:
-        print("error: name these changes in CHANGELOG.md")
+        print("error: name these changes in changes/")
         return 1
     return 0
 
