@@ -74,7 +74,7 @@ def bench(
         print_result(costs_of.as_json(plan, costs, shards=shards), lines, as_json=as_json)
         return
     plans = list(plan.runs.values())
-    words = () if quiet else _plan_lines(plan)
+    words = () if quiet and not dry_run else _plan_lines(plan)
     announce(plans, words, dry_run=dry_run, as_json=as_json)
     if dry_run:
         return

@@ -82,7 +82,7 @@ def run_settings(
 
         with _compiling_shown(note):
             plan = prepare(make_config(values, where=where))
-    lines = () if quiet else _plan_lines(plan)
+    lines = () if quiet and not dry_run else _plan_lines(plan)
     announce([plan], lines, dry_run=dry_run, as_json=as_json)
     if dry_run:
         return
