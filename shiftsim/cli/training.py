@@ -29,9 +29,7 @@ def carl(
 
     chosen = Settings(**settings)
     Training(chosen, _on_message(quiet), resume=resume).run()
-    best = chosen.out / BEST
-    echo(f"best network: {best}")
-    echo(f"drive with it: shiftsim run -p carl --checkpoint carl={best}")
+    _say_best("carl", chosen.out)
 
 
 @app.command()
@@ -49,9 +47,7 @@ def plantf(
 
     chosen = ImitationSettings(**settings)
     PlanTfTraining(chosen, _on_message(quiet), resume=resume).run()
-    best = chosen.out / BEST
-    echo(f"best network: {best}")
-    echo(f"drive with it: shiftsim run -p plantf --checkpoint plantf={best}")
+    _say_best("plantf", chosen.out)
 
 
 @app.command()
@@ -67,6 +63,11 @@ def traffic(settings: cli.Settings, quiet: Quiet = False) -> None:
     weights = train_traffic(chosen, _on_message(quiet))
     echo(f"weights: {weights}")
     echo(f"how real it is: shiftsim realism {chosen.store} --weights {weights}")
+
+
+def _say_best(planner: str, folder: Path) -> None:
+    echo(f"best network: {folder / BEST}")
+    echo(f"drive with it: shiftsim run -p {planner} --checkpoint {planner}={folder / BEST}")
 
 
 def _on_message(quiet: bool) -> Callable[[str], None]:

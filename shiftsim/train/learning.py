@@ -183,7 +183,12 @@ class TrainedNetwork:
     batch: int  # samples of a step
 
     def __init__(
-        self, network: nn.Module, groups: list[dict[str, Any]], total: int, *, betas: Any
+        self,
+        network: nn.Module,
+        groups: list[dict[str, Any]],
+        total: int,
+        *,
+        betas: tuple[float, float],
     ) -> None:
         """`total` steps are to be done; `groups` of parameters are those of the optimiser."""
         self.network, self.total, self.step = network, total, 0

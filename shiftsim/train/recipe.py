@@ -43,9 +43,12 @@ from shiftsim.train.folder import (
     LATEST,
     ImitationSettings,
     OnMessage,
+    Preset,
     Settings,
     Weights,
 )
+from shiftsim.train.imitation import PlanTfLearner
+from shiftsim.train.samples import Stream, load_blocks
 from shiftsim.train.states import States, write_part
 
 _WRITE_EVERY, _REPORT_EVERY = 120.0, 10.0  # s
@@ -291,35 +294,34 @@ class PlanTfTraining(Recipe):
     """Of PlanTF's network."""
 
     planner = "plantf"
+    learner: PlanTfLearner
 
     def __init__(
         self, settings: ImitationSettings, on_message: OnMessage, *, resume: bool = False
     ) -> None:
+        self._left_out = Counter[str]()  # samples that could not be made, by reason
         super().__init__(settings, settings.recipe.rounds, on_message, resume=resume)
 
     def _make_learner(self) -> int:
-        from shiftsim.train.imitation import PlanTfLearner
-
-        preset, seed = self._settings.recipe, self._settings.seed
+        preset: Preset = self._settings.recipe
         steps = max(1, preset.samples // preset.rounds // preset.batch)
-        self._learner = PlanTfLearner(self.device, preset, steps * preset.rounds, seed)
-        self.learner = self._learner
-        return int(steps)
+        total, seed = steps * preset.rounds, self._settings.seed
+        self.learner = PlanTfLearner(self.device, preset, total, seed)
+        return steps
 
     def _collect(self) -> None:
         """Nothing: samples are made when they are needed."""
 
     def _results(self) -> Iterator[learning.StepResult]:
-        from shiftsim.train.samples import Stream, load_blocks
-
-        settings, learner = self._settings, self._learner
+        settings, learner = self._settings, self.learner
         tokens = tuple(sorted(token for town in self.towns.trained.values() for token in town))
         stream = Stream(settings.store, tokens, settings.seed, settings.recipe.batch)
         self._on_message(f"{self._where} training on {len(tokens)} scenarios")
         block, done = learner.place
-        failed, unused = Counter[str](), 0
+        unused = 0
         for found in load_blocks(stream, block, settings.workers):
-            failed.update(found.failed)
+            if not done:  # else the block was begun, and counted, in the round before
+                self._left_out.update(found.failed)
             unused += 1
             for batch in found.batches[done:]:
                 done += 1
@@ -328,11 +330,9 @@ class PlanTfTraining(Recipe):
                     yield learner.learn(batch)
             if unused > stream.blocks:
                 raise DataError(
-                    f"no batch of {stream.batch} samples could be made: {_counted(failed)}",
+                    f"no batch of {stream.batch} samples could be made: {self._reasons}",
                     hint="training needs more scenarios with a future of 8 s",
                 )
-            if found.failed:
-                self._on_message(f"{self._where} samples left out: {_counted(failed)}")
             block, done = block + 1, 0
 
     def _official(self) -> Weights:
@@ -340,8 +340,8 @@ class PlanTfTraining(Recipe):
 
     def _scores(self, network: Path, where: str) -> dict[str, float]:
         settings = self._settings
-        split = settings.out / "tests.txt"
-        write_text(split, "\n".join(tested_tokens(self.towns, settings.tests)) + "\n")
+        split, tokens = settings.out / "tests.txt", tested_tokens(self.towns, settings.tests)
+        write_text(split, "\n".join(tokens) + "\n")
         run_folder = settings.out / "runs" / f"round-{self.progress.round:02d}"
         shutil.rmtree(run_folder, ignore_errors=True)  # of a training that was ended in it
         values: dict[str, Any] = {
@@ -350,16 +350,17 @@ class PlanTfTraining(Recipe):
         }
         values |= {"store": settings.store, "split": str(split), "out": str(run_folder)}
         values |= {"noise": list(TESTED), "workers": settings.workers, "batch_size": TOGETHER}
-        self._on_message(f"{where} testing")
+        self._on_message(f"{where} testing; samples that could not be made: {self._reasons}")
         rows = execute(prepare(make_config(values))).scores.to_pylist()
         if not rows:
             raise DataError(f"no scenario could be driven to its end, see {str(run_folder)!r}")
-        found = {noise: [row["cls"] for row in rows if row["noise"] == noise] for noise in TESTED}
-        return {noise: sum(scores) / max(len(scores), 1) for noise, scores in found.items()}
+        sums = {noise: sum(r["cls"] for r in rows if r["noise"] == noise) for noise in TESTED}
+        return {noise: found / len(tokens) for noise, found in sums.items()}  # failures score 0
 
-
-def _counted(failed: Counter[str]) -> str:
-    return ", ".join(f"{count} {reason}" for reason, count in failed.most_common()) or "none"
+    @property
+    def _reasons(self) -> str:
+        counts = self._left_out.most_common()
+        return ", ".join(f"{count} {reason}" for reason, count in counts) or "none"
 
 
 def sum_of(row: dict[str, Any]) -> float:

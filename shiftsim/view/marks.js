@@ -1,7 +1,7 @@
 "use strict";
-// What the list, live and review pages share: planners with their markers, as in all figures, and
-// thumbnails of scenarios.
+// What all pages share: planners with their markers, as in all figures, and thumbnails of scenarios.
 
+// markers of about 9 units around their middle
 const SHAPES = {
   o: "M-8 0a8 8 0 1 0 16 0a8 8 0 1 0-16 0z",
   s: "M-7-7h14v14h-14z",
@@ -17,6 +17,7 @@ const SHAPES = {
   H: "M-5-8.6H5L10 0L5 8.6H-5L-10 0z",
   d: "M0-11L6 0L0 11L-6 0z",
   "*": "M0-10L2.6-3.1L10-3.1L4 1.6L6.2 9L0 4.6L-6.2 9L-4 1.6L-10-3.1L-2.6-3.1z",
+  burst: "M0-10L1.7-4.2L7.1-7.1L4.2-1.7L10 0L4.2 1.7L7.1 7.1L1.7 4.2L0 10L-1.7 4.2L-7.1 7.1L-4.2 1.7L-10 0L-4.2-1.7L-7.1-7.1L-1.7-4.2z", // where something went wrong; of no planner
 };
 
 // the address that names SVG, of what the parser makes

@@ -16,11 +16,12 @@ from shiftsim.world.scenario import Scenario, require_scenario
 
 MAX_ROLLOUTS = 6  # of a replay
 _HERE = Path(__file__).parent
+_SCENE = ("marks.js", "world.js")
 _FILES = {  # style and script of each page; its body is the file of its name
     "list": (["list.css"], ["marks.js", "list.js"]),
     "live": (["list.css", "live.css"], ["marks.js", "live.js"]),
-    "replay": (["replay.css"], ["codec.js", "world.js", "strips.js", "waterfall.js", "replay.js"]),
-    "review": (["replay.css", "review.css"], ["codec.js", "world.js", "marks.js", "review.js"]),
+    "replay": (["replay.css"], ["codec.js", *_SCENE, "strips.js", "waterfall.js", "replay.js"]),
+    "review": (["replay.css", "review.css"], ["codec.js", *_SCENE, "review.js"]),
 }
 # of pages that are files; those of a server come with a header
 _POLICY = (

@@ -6,13 +6,6 @@ const FALL_TOP = 18; // below the words
 const FALL_HEIGHT = 36; // of a score of 100
 const FALL_WIDTH = 8; // of a loss
 
-function svgElement(name, attributes, ...children) {
-  const element = document.createElementNS(byId("waterfall").namespaceURI, name);
-  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
-  element.append(...children);
-  return element;
-}
-
 class Waterfall {
   // `choose` is called with a loss
   constructor(element, choose) {
@@ -37,14 +30,14 @@ class Waterfall {
     }
     corners.push([x(duration), y(score)], [x(duration), y(0)]);
     const result = cls === null ? "no score" : `score ${Number((100 * cls).toFixed(2))}`;
-    const words = svgElement("text", { class: "name", x: x(0) + 4, y: 11 }, `${result} of ${name}`);
+    const words = svgOf("text", { class: "name", x: x(0) + 4, y: 11 }, `${result} of ${name}`);
     const axis = [100, 0].map((value) =>
-      svgElement("text", { x: x(0) - 5, y: y(value) + 4, "text-anchor": "end" }, `${value}`),
+      svgOf("text", { x: x(0) - 5, y: y(value) + 4, "text-anchor": "end" }, `${value}`),
     );
     const path = corners.map((corner) => corner.join(" ")).join(" L ");
-    const area = svgElement("path", { class: "left", d: `M ${path} Z`, fill: colour, stroke: colour });
+    const area = svgOf("path", { class: "left", d: `M ${path} Z`, fill: colour, stroke: colour });
     this.element.setAttribute("aria-label", `${words.textContent}, and what it lost`);
-    this.cursor = svgElement("line", { y1: 0, y2: "100%", stroke: "var(--ink)", "stroke-width": 1.5 });
+    this.cursor = svgOf("line", { y1: 0, y2: "100%", stroke: "var(--ink)", "stroke-width": 1.5 });
     const shown = cls === null ? [] : [...axis, area, ...parts.map((part) => this.part(part))];
     this.element.replaceChildren(words, this.cursor, ...shown);
     this.label(cls === null ? [] : parts, x(duration));
@@ -63,11 +56,11 @@ class Waterfall {
     const height = Math.max(bottom - top, 3);
     const box = { x: at - FALL_WIDTH / 2, y: bottom - height, width: FALL_WIDTH, height };
     const around = { x: at - reach, y: 0, width: 2 * reach, height: FALL_TOP + FALL_HEIGHT + 4 };
-    one.element = svgElement(
+    one.element = svgOf(
       "g", { class: "loss", role: "button", tabindex: 0, "aria-label": words },
-      svgElement("title", {}, words),
-      svgElement("rect", { ...around, class: "reach" }),
-      svgElement("rect", box),
+      svgOf("title", {}, words),
+      svgOf("rect", { ...around, class: "reach" }),
+      svgOf("rect", box),
     );
     one.element.addEventListener("click", () => this.choose(loss));
     one.element.addEventListener("keydown", (event) => {
@@ -84,7 +77,7 @@ class Waterfall {
     const taken = parts.map(({ at, top, bottom }) => [at - 5, Math.min(top, bottom - 3), at + 5, bottom]);
     for (const { loss, at, top, bottom, element } of parts) {
       const y = Math.min(Math.max((top + bottom) / 2 + 4, FALL_TOP + 10), FALL_TOP + FALL_HEIGHT - 4);
-      const text = svgElement("text", { y }, `${loss.told} ${loss.reason}`);
+      const text = svgOf("text", { y }, `${loss.told} ${loss.reason}`);
       element.append(text);
       const width = text.getComputedTextLength();
       const boxAt = (left) => [left, y - 9, left + width, y + 2];

@@ -340,49 +340,7 @@ function drawEgo(context, pose, vehicle, panel, colour, filled, dash = []) {
   context.stroke();
 }
 
-const MARKERS = {
-  o: (c, r) => c.arc(0, 0, r, 0, 2 * Math.PI),
-  s: (c, r) => c.rect(-r, -r, 2 * r, 2 * r),
-  "^": (c, r) => polygon(c, [[0, -r], [r, r], [-r, r]]),
-  v: (c, r) => polygon(c, [[0, r], [r, -r], [-r, -r]]),
-  D: (c, r) => polygon(c, [[0, -r], [r, 0], [0, r], [-r, 0]]),
-  P: (c, r) => polygon(c, cross(r, 0)),
-  X: (c, r) => polygon(c, cross(r, Math.PI / 4)),
-  "*": (c, r) => polygon(c, star(r)),
-  "<": (c, r) => polygon(c, [[-r, 0], [r, -r], [r, r]]),
-  ">": (c, r) => polygon(c, [[r, 0], [-r, -r], [-r, r]]),
-  p: (c, r) => polygon(c, regular(r, 5)),
-  h: (c, r) => polygon(c, regular(r, 6)),
-  H: (c, r) => polygon(c, regular(r, 6, Math.PI / 6)),
-  d: (c, r) => polygon(c, [[0, -1.2 * r], [0.65 * r, 0], [0, 1.2 * r], [-0.65 * r, 0]]),
-  burst: (c, r) => polygon(c, star(r, 8)), // where something went wrong; of no planner
-};
-
-function polygon(context, points) {
-  points.forEach(([x, y], i) => (i ? context.lineTo(x, y) : context.moveTo(x, y)));
-  context.closePath();
-}
-
-function cross(r, angle) {
-  const arm = r * 0.4;
-  const quarter = [[arm, -r], [arm, -arm], [r, -arm]];
-  const turn = ([x, y], by) => [
-    x * Math.cos(by) - y * Math.sin(by), x * Math.sin(by) + y * Math.cos(by),
-  ];
-  return [0, 1, 2, 3].flatMap((k) => quarter.map((p) => turn(p, angle + (k * Math.PI) / 2)));
-}
-
-function regular(r, corners, turn = 0) {
-  const angles = [...Array(corners).keys()].map((k) => turn + (2 * Math.PI * k) / corners);
-  return angles.map((angle) => [1.1 * r * Math.sin(angle), -1.1 * r * Math.cos(angle)]);
-}
-
-function star(r, points = 5) {
-  return [...Array(2 * points).keys()].map((k) => {
-    const reach = k % 2 ? r * 0.45 : r;
-    return [reach * Math.sin((k * Math.PI) / points), -reach * Math.cos((k * Math.PI) / points)];
-  });
-}
+const MARKER = 8; // of the shapes, drawn as large as a radius
 
 function drawDisc(context, x, y, radius) {
   context.beginPath();
@@ -395,12 +353,12 @@ function drawDisc(context, x, y, radius) {
 function drawMarker(context, marker, x, y, radius, colour, hollow = false) {
   context.save();
   context.translate(x, y);
-  context.beginPath();
-  (MARKERS[marker] || MARKERS.o)(context, radius);
+  context.scale(radius / MARKER, radius / MARKER);
+  const path = new Path2D(SHAPES[marker] || SHAPES.o);
   context.fillStyle = hollow ? COLOURS.paper : colour;
-  context.fill();
-  context.lineWidth = 1.2;
+  context.fill(path);
+  context.lineWidth = (1.2 * MARKER) / radius;
   context.strokeStyle = hollow ? colour : COLOURS.paper;
-  context.stroke();
+  context.stroke(path);
   context.restore();
 }
