@@ -340,7 +340,7 @@ function drawEgo(context, pose, vehicle, panel, colour, filled, dash = []) {
   context.stroke();
 }
 
-const MARKER = 8; // of the shapes, drawn as large as a radius
+const MARKER = 7; // of the shapes, drawn as large as a radius
 
 function drawDisc(context, x, y, radius) {
   context.beginPath();
