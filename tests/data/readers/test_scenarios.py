@@ -160,7 +160,10 @@ def test_slope_is_the_one_of_savitzky_and_golay(rng):
     np.testing.assert_allclose(slope(values, 0.05), expected, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize(("rows", "spans"), [(45, []), (46, [Span(5.0, 2.3, 2.0, 3)])])
+@pytest.mark.parametrize(
+    ("rows", "spans"),
+    [(45, []), (46, [Span(5.0, 2.3, 2.0, 3)]), (47, [Span(5.0, 2.35, 2.0, 3)])],
+)
 def test_where_no_window_fits_a_short_one_does_from_two_seconds_on(rows, spans):
     assert list(_spans(100, rows, 3, CONFIG)) == spans
 
