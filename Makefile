@@ -26,11 +26,7 @@ test-thorough: install
 test-long: install
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m long
 
-test-# the pictures of the documentation, made anew; needs a browser
-pictures: install
-	PICTURES=docs/images $(BIN)/python -m pytest tests/browser/test_pictures.py -k made
-
-docs: install
+test-docs: install
 	$(BIN)/python -m pytest -n 2 --dist loadfile tests/docs
 
 test-kill: install

@@ -49,6 +49,12 @@ def test_scripts_and_targets_of_other_files_exist():
         assert (REPOSITORY / name).exists(), name
 
 
+def test_make_reads_every_target():
+    command = ["make", "--dry-run", "--warn-undefined-variables", *sorted(TARGETS - {".venv"})]
+    answer = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
+    assert (answer.returncode, answer.stderr) == (0, "")
+
+
 @by_workflow
 def test_every_action_is_pinned_by_the_hash_of_a_commit(path):
     used = [step["uses"] for step in steps(path) if "uses" in step]
