@@ -330,6 +330,7 @@ class EgoStateEncoder(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.state_dropout = 0.75  # share of scalars that are not shown in training
+        self.random: torch.Generator | None = None  # draws them; None for torch's own
         self.linears = nn.ModuleList(Linear(1, DIM) for _ in range(STATE_CHANNELS))
         self.attn = Attention(DIM, 4)
         self.pos_embed = nn.Parameter(0.02 * torch.randn(1, STATE_CHANNELS, DIM))
@@ -342,7 +343,8 @@ class EgoStateEncoder(nn.Module):
         mask = None
         if self.training:
             shape = len(state), STATE_CHANNELS - _KNOWN_STATES
-            shown = torch.rand(shape, device=state.device) >= self.state_dropout
+            drawn = torch.rand(shape, device=state.device, generator=self.random)
+            shown = drawn >= self.state_dropout
             mask = key_mask(functional.pad(shown, (_KNOWN_STATES, 0), value=True))
         query = self.query.expand(len(state), -1, -1)
         return self.attn(query, tokens, tokens, mask)[:, 0]

@@ -5,6 +5,7 @@ terms, each of weight 1. Then the groups of parameters, the learning rates by ep
 values of a network. B scenes, A agents of which the first is the ego, T = 80 steps of 0.1 s.
 """
 
+import copy
 import math
 from typing import Any
 
@@ -19,7 +20,15 @@ from shiftsim.planners.learned.plantf.network import PlanTfNetwork
 from shiftsim.planners.learned.pluto.network import NEVER
 from shiftsim.planners.learned.pluto.network import Outputs as PlutoOutputs
 from shiftsim.train.folder import Preset
-from shiftsim.train.learning import StepResult, TrainedNetwork, schedule
+from shiftsim.train.learning import (
+    BatchGradient,
+    GradientPool,
+    StepResult,
+    TrainedNetwork,
+    apply_gradient,
+    keep_memory,
+    schedule,
+)
 from shiftsim.train.samples import Batch
 from shiftsim.world.state import PACIFICA
 
@@ -34,6 +43,8 @@ PIXEL, INSIDE = 0.2, 0.95  # m; share of the raster in which a point counts
 TEMPERATURE = 0.1  # of the contrastive loss
 CLIP = 5.0  # of the norm of all gradients
 WARM_UP, FLOOR = 0.05, 2e-3  # of PlanTF here: share of rising, end of the learning rate as a share
+LANES = 2  # parts of a batch that a CPU computes side by side
+TERMS = ("reg_loss", "cls_loss", "prediction_loss")  # of PlanTF's loss
 
 
 def _sum(**terms: Tensor) -> Losses:
@@ -218,11 +229,14 @@ def begin(network: nn.Module, seed: int) -> None:
 
 
 class PlanTfLearner(TrainedNetwork):
-    """PlanTF's network, trained on samples of a store."""
+    """PlanTF's network, trained on samples of a store.
+
+    A CPU computes the parts of a batch side by side, each with statistics of its own, as the
+    authors' processes do without synchronisation; those of the first part are kept.
+    """
 
     def __init__(self, device: str, preset: Preset, total: int, seed: int) -> None:
         """`total` steps are to be done; the learning rate falls towards their end."""
-        torch.set_num_threads(1)  # sums must not depend on the number of cores
         torch.manual_seed(seed)
         network = PlanTfNetwork()
         begin(network, seed)
@@ -230,22 +244,37 @@ class PlanTfLearner(TrainedNetwork):
         super().__init__(network, parameter_groups(network), total, betas=(0.9, 0.999))
         self.batch, self._rate, self._device, self._seed = preset.batch, preset.rate, device, seed
         self.place = (0, 0)  # of the next batch: the block of the stream, and the batch in it
+        count = LANES if device == "cpu" else 1
+        self._pool = GradientPool(device, count)
+        self._trained: list[Tensor] = list(network.parameters())
+        shared = {id(value): value for value in self._trained}  # the rest is copied
+        others = [copy.deepcopy(network, dict(shared)) for _ in range(count - 1)]
+        self._lanes = [network, *others]
+        for lane in self._lanes:
+            lane.agent_encoder.ego_state_emb.random = torch.Generator(device)
+        keep_memory()
 
     def learn(self, batch: Batch) -> StepResult:
         """Do one step."""
-        key = np.random.SeedSequence([self._seed, 4, self.step]).generate_state(1, np.uint64)
-        torch.manual_seed(int(key[0]))  # of the state dropout
-        inputs, target, valid = batch.on(self._device)
-        losses = plantf_loss(self.network(inputs), target, valid)
-        self.optimiser.zero_grad()
-        losses["loss"].backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(self.network.parameters(), CLIP)
-        for group in self.optimiser.param_groups:
-            group["lr"] = self._rate * schedule(self.step / self.total, WARM_UP, FLOOR)
-        self.optimiser.step()
+        parts = batch.on(self._device).split(len(self._lanes))
+        found = self._pool.sum(self._gradient, self._lanes, parts, range(len(parts)))
+        count = len(parts)
+        rate = self._rate * schedule(self.step / self.total, WARM_UP, FLOOR)
+        apply_gradient(self.optimiser, self._trained, found, count, clip=CLIP, rate=rate)
         self.count_step()
-        terms = {name: float(value.detach()) for name, value in losses.items()}
-        return StepResult(terms.pop("loss"), terms)
+        terms = dict(zip(TERMS, (found.numbers / count).tolist(), strict=True))
+        return StepResult(found.loss / count, terms)
+
+    def _gradient(self, network: PlanTfNetwork, batch: Batch, number: int) -> BatchGradient:
+        """Of one part of a batch."""
+        key = np.random.SeedSequence([self._seed, 4, self.step, number])
+        drawn = network.agent_encoder.ego_state_emb.random
+        assert drawn is not None
+        drawn.manual_seed(int(key.generate_state(1, np.uint64)[0] >> np.uint64(1)))
+        losses = plantf_loss(network(batch.inputs), batch.target, batch.valid)
+        gradients = torch.autograd.grad(losses["loss"], self._trained)
+        numbers = torch.stack([losses[name].detach() for name in TERMS]).cpu()
+        return BatchGradient(list(gradients), float(losses["loss"].detach()), numbers)
 
     def state(self) -> dict[str, Any]:
         """All that is needed to go on."""

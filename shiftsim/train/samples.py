@@ -10,9 +10,10 @@ their order whoever makes them.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from itertools import count
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,13 +62,21 @@ class Batch(NamedTuple):
 
     def on(self, device: str) -> "Batch":
         """The same on a device."""
-        parts: dict[str, Any] = {
-            item.name: getattr(self.inputs, item.name) for item in fields(self.inputs)
-        }
-        moved: dict[str, Any] = {
-            n: v.to(device) if isinstance(v, Tensor) else v for n, v in parts.items()
-        }
-        return Batch(Inputs(**moved), self.target.to(device), self.valid.to(device))
+        return self._map(lambda value: value.to(device) if isinstance(value, Tensor) else value)
+
+    def split(self, count: int) -> "list[Batch]":
+        """The same in up to `count` parts."""
+        size = -(-len(self.target) // count)
+        starts = range(0, len(self.target), size)
+        return [self._map(itemgetter(slice(start, start + size))) for start in starts]
+
+    def _map(self, change: Callable[[Any], Any]) -> "Batch":
+        """The same with all changed that goes by scenes: tensors, and lists of counts."""
+        parts = {item.name: getattr(self.inputs, item.name) for item in fields(self.inputs)}
+        counts = parts.pop("counts")
+        moved = {name: change(value) for name, value in parts.items()}
+        moved["counts"] = [change(by_scene) for by_scene in counts]
+        return Batch(Inputs(**moved), change(self.target), change(self.valid))
 
 
 class Block(NamedTuple):

@@ -97,7 +97,7 @@ def prepared(planner, file, monkeypatch):
     """The network in training; the official draw decides which states it is shown."""
     network = load_network("deterministic:base", planner).train()
     drawn = torch.from_numpy(file["draw/state_dropout_u"])
-    monkeypatch.setattr(torch, "rand", lambda shape, device=None: drawn)
+    monkeypatch.setattr(torch, "rand", lambda shape, **options: drawn)
     return network
 
 
