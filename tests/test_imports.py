@@ -106,6 +106,7 @@ def test_heavy_libraries_are_imported_where_they_are_used(path):
     assert found & LAZY == set()
 
 
+@pytest.mark.thorough
 def test_no_module_needs_itself():
     graph = {name: set(ours(path)) for name, path in MODULES.items()}
     try:

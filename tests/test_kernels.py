@@ -278,6 +278,7 @@ def test_a_cache_is_where_others_cannot_exchange_its_folder(
     assert _is_trusted(folder) == is_trusted
 
 
+@pytest.mark.thorough
 def test_a_process_that_is_started_does_not_say_it_again(tmp_path: Path) -> None:
     (tmp_path / "cache").mkdir(mode=0o700)
     (tmp_path / "cache").chmod(0o777)

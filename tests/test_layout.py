@@ -58,6 +58,7 @@ def test_a_folder_is_the_sub_package_of_its_name(folder):
 
 
 @pytest.mark.parametrize("folder", FOLDERS)
+@pytest.mark.thorough
 def test_a_folder_refuses_to_be_imported_at_the_top_level(folder):
     done = subprocess.run(
         [sys.executable, "-c", f"import {folder}"], cwd=REPOSITORY, capture_output=True, text=True

@@ -30,6 +30,7 @@ def test_a_module_that_moved_is_found(old, new):
 
 
 @pytest.mark.parametrize("line", PRINTED)
+@pytest.mark.thorough
 def test_what_was_printed_can_be_imported(line):
     words = [sys.executable, "-W", "always", "-c", line]
     done = subprocess.run(words, capture_output=True, text=True, check=True)

@@ -114,6 +114,7 @@ def test_a_url_that_the_user_types_is_opened(clean_run, toy, tmp_path, monkeypat
 
 
 @pytest.mark.parametrize("link", ["view", "view/replay"])
+@pytest.mark.thorough
 def test_pages_are_not_written_through_a_link(theirs, home, link, toy):
     (theirs / link).parent.mkdir(exist_ok=True)
     (theirs / link).symlink_to(home)

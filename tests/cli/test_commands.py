@@ -62,6 +62,7 @@ def call(folder, *words):
     )
 
 
+@pytest.mark.thorough
 def test_a_run_prints_every_setting_and_the_table(place):
     done = call(place, "run", "-p", "constant-velocity", "-s", "toy", "--workers", "1")
     assert done.returncode == 0
@@ -108,6 +109,7 @@ def test_flags_win_over_the_settings_file(place):
         (("jump",), 1, "No such command", "--help"),
     ],
 )
+@pytest.mark.thorough
 def test_errors_are_a_fact_and_a_hint_without_a_traceback(place, words, code, fact, hint):
     done = call(place, *words)
     lines = done.stderr.splitlines()
@@ -123,6 +125,7 @@ def test_debug_shows_the_traceback(place):
     assert "Traceback" in done.stderr
 
 
+@pytest.mark.thorough
 def test_failed_tasks_withhold_the_score_and_are_explained(place):
     words = ("run", "-p", "mine:Failing", "-s", "toy", "--out", "runs/bad", "--workers", "1")
     done = call(place, *words)
@@ -144,6 +147,7 @@ def test_a_score_is_explained_metric_by_metric(place):
         assert short in done.stdout
 
 
+@pytest.mark.thorough
 def test_reading_commands_speak_json(place):
     report = json.loads(call(place, "report", "runs/good", "--json").stdout)
     assert report[0]["counts"]["ok"] == 4
@@ -197,6 +201,7 @@ def test_an_interrupt_ends_with_130_and_says_what_is_kept(place):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_the_demo_runs_from_recordings_to_the_table(tmp_path):
     done = call(tmp_path, "demo", "--limit", "2")
     assert done.returncode in (0, 3), done.stderr

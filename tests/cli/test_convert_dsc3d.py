@@ -124,6 +124,7 @@ def test_a_killed_conversion_goes_on_and_ends_with_the_same_bytes(place, capsys)
 
 
 @pytest.mark.parametrize("calls", range(0, 40, 3))
+@pytest.mark.thorough
 def test_a_conversion_stopped_anywhere_goes_on_to_the_same_bytes(place, monkeypatch, calls):
     """Every file of a store appears by a rename; the process ends right before one of them."""
     store = place / f"stopped-{calls}"

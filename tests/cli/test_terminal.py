@@ -122,6 +122,7 @@ def ran(tmp_path_factory):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_run_says_something_at_once_and_fits_the_terminal(ran):
     folder, words, _ = ran
     text, first = in_terminal(*words, "--out", "two", "--live", folder=folder)
@@ -136,6 +137,7 @@ def test_a_run_says_something_at_once_and_fits_the_terminal(ran):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_quiet_run_prints_its_results_only(ran):
     folder, words, _ = ran
     done = subprocess.run(

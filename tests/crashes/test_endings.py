@@ -267,10 +267,12 @@ def some(first: int, step: int):
 @pytest.mark.parametrize(
     ("name", "mode"), [("run", "before"), ("run", "full"), ("merge", "eio"), ("filter", "after")]
 )
+@pytest.mark.thorough
 def test_a_job_that_ends_at_some_calls_can_be_finished(place, name, mode):
     try_calls(place, name, mode, some(3, 13))
 
 
+@pytest.mark.thorough
 def test_a_run_that_is_killed_in_its_first_moments_can_be_finished(place):
     try_calls(place, "run", "before", lambda calls: range(1, 8))
 

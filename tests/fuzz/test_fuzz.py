@@ -102,6 +102,7 @@ def _deep_args(path, _):
         ),
     ],
 )
+@pytest.mark.thorough
 def test_what_was_once_a_traceback_is_refused(target, seed, file, change):
     with seeds_of(target) as (seeds, place):
         folder = next(found for found in seeds if found.name == seed)

@@ -199,6 +199,7 @@ def test_every_file_is_known(folder: Path, cases: Cases) -> None:
         ),
     ],
 )
+@pytest.mark.thorough
 def test_a_changed_value_is_noticed(
     test: Any, file: str, name: str, index: int, tmp_path: Path, nuplan_reference: Path
 ) -> None:

@@ -41,6 +41,7 @@ def test_a_folder_is_compared_and_its_last_line_sums_up(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_nothing_to_compare_is_a_failure(tmp_path):
     (tmp_path / "novelty").mkdir()
     assert run(tmp_path) == (1, "0 cases covered, 0 mismatches, 1 not covered")

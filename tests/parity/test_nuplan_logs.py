@@ -425,6 +425,7 @@ def copy(nuplan_reference: Path, tmp_path: Path) -> Path:
         *(("meta", name) for name in ("route_from_expert", "duration_s", "expert_goal_state")),
     ],
 )
+@pytest.mark.thorough
 def test_a_changed_value_is_noticed(copy: Path, table: str, column: str) -> None:
     cases, expected = Cases(), copy / "expected"
     if table == "scenes.json":

@@ -303,6 +303,7 @@ def one_run(source: Path, target: Path, scene: str, challenge: str) -> Path:
         *((compare_recorded_plans, "trajectories", name) for name in ("index", "iteration")),
     ],
 )
+@pytest.mark.thorough
 def test_a_changed_value_is_noticed(
     compare: Any,
     table: str,

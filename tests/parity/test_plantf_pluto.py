@@ -547,6 +547,7 @@ def test_a_changed_value_is_noticed(
         *(("selfcheck", "norm.bias", 1), ("feature_builder", "radius"), ("checkpoint", "prefix")),
     ],
 )
+@pytest.mark.thorough
 def test_a_changed_manifest_is_noticed(part: str, test: Any, keys: Any, tmp_path: Path) -> None:
     cases = Cases()
     change_json(GOLDEN / part / "state_dict.json", tmp_path / "state_dict.json", *keys)

@@ -148,6 +148,7 @@ def test_a_report_in_latex_holds_the_pictures_as_pdf(groups, tmp_path):
         assert (tmp_path / f"{figure.name}.pdf").read_bytes().startswith(b"%PDF")
 
 
+@pytest.mark.thorough
 def test_fonts_of_a_pdf_are_truetype_as_papers_ask_for(groups, tmp_path):
     content = drawn(groups)["metrics_made-up"].save(tmp_path, "pdf").read_bytes()
     assert b"/Type3" not in content
@@ -168,6 +169,7 @@ def test_the_curve_of_a_training_is_drawn_in_the_colours_of_all_pictures(tmp_pat
 
 
 @pytest.mark.parametrize("width", ["3.5in", "7in"])
+@pytest.mark.thorough
 def test_letters_can_be_read_at_the_width_of_a_paper(tmp_path, width):
     groups = read_groups([write_run(tmp_path / "run", planners=PAPER, noise=ALL)])
     for name, figure in drawn(groups, width=width, serif=True, plain=True).items():

@@ -39,6 +39,7 @@ def one_by_one(toy, tmp_path_factory):
 
 
 @pytest.mark.parametrize(("size", "workers"), [(2, 1), (5, 1), (5, 2), (64, 1)])
+@pytest.mark.thorough
 def test_batches_give_the_rows_of_single_scenarios(toy, tmp_path, one_by_one, size, workers):
     together = run(toy, tmp_path / "run", batch_size=size, workers=workers)
     assert content(together) == content(one_by_one)

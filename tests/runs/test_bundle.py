@@ -81,6 +81,7 @@ def finished(toy, tmp_path):
     return shiftsim.run("constant-velocity", **settings), settings
 
 
+@pytest.mark.thorough
 def test_any_finished_run_is_bundled_later(finished, toy, tmp_path):
     run, _ = finished
     done = call(tmp_path, "bundle", run.path)

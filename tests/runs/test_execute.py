@@ -32,6 +32,7 @@ def same_results(left, right):
     return [(left.path / n).read_bytes() == (right.path / n).read_bytes() for n in RESULTS]
 
 
+@pytest.mark.thorough
 def test_two_workers_give_the_same_bytes_as_one(clean_run, toy, tmp_path):
     other = shiftsim.run(
         ["constant-velocity", "log-future"],
@@ -120,6 +121,7 @@ def test_a_failing_task_is_a_row_and_withholds_the_score(toy, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_dying_worker_costs_one_task(toy, tmp_path):
     config = settings(toy, tmp_path / "run", planners=["drivers:Dying"], workers=2)
     run = execute(prepare(config))

@@ -28,6 +28,7 @@ def same_results(left, right):
 
 
 @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.thorough)])
+@pytest.mark.thorough
 def test_isolated_planners_give_the_same_bytes(workers, toy, tmp_path):
     planners = ["constant-velocity", "simple", "log-future", "drivers:Remembers"]
     settings = {"noise": ["none", "ou-high"]}
@@ -43,6 +44,7 @@ def test_isolated_planners_give_the_same_bytes(workers, toy, tmp_path):
     "planner",
     ["drivers:FollowsItsRoute", "idm", pytest.param("pdm-closed", marks=pytest.mark.thorough)],
 )
+@pytest.mark.thorough
 def test_planners_that_read_the_map_give_the_same_bytes(planner, toy, tmp_path):
     settings = {"noise": ["none", "ou-high"], "limit": 2}
     plain = drive(toy, tmp_path / "plain", planner, **settings)

@@ -172,6 +172,7 @@ def test_files_of_an_earlier_attempt_stay_as_they_are(tmp_path):
 
 
 @pytest.mark.parametrize("moment", ["replace", "unlink"])
+@pytest.mark.thorough
 def test_ending_is_begun_anew_after_a_kill_at_any_step(tmp_path, monkeypatch, moment):
     """Every renaming and every removal is the last thing that happens, one after the other."""
 

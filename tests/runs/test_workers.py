@@ -43,6 +43,7 @@ def test_workers_are_other_processes_and_are_kept():
     assert 1 <= len(pids) <= 2
 
 
+@pytest.mark.thorough
 def test_a_worker_that_dies_costs_one_task_and_is_named():
     outcomes = {o.task: o for o in run([1, 13, 2, 14, 3, 13, 4], 2)}
     assert outcomes[13].death == "worker process ended with exit code 7"
@@ -55,6 +56,7 @@ def test_every_task_may_kill_its_worker():
     assert [o.death != "" for o in run([13] * 6, 2)] == [True] * 6
 
 
+@pytest.mark.thorough
 def test_workers_that_cannot_start_are_reported_instead_of_retried_for_ever(capfd):
     with pytest.raises(ConfigError, match="workers cannot start"):
         run([1], 2, make=broken_start)
@@ -122,6 +124,7 @@ class Late:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.thorough
 def test_a_task_that_takes_too_long_is_ended_and_named(workers):
     outcomes = {o.task: o for o in map_unordered(Late, [1, 13, 2], workers=workers, limit=1.0)}
     assert [outcomes[n].result for n in (1, 2)] == [1, 2]
@@ -162,6 +165,7 @@ class Both:
         return sum(task)
 
 
+@pytest.mark.thorough
 def test_what_was_with_a_task_whose_worker_died_is_done_alone():
     tasks = [(1, 2), (3, 13, 4), (5,)]
     outcomes = {
@@ -172,6 +176,7 @@ def test_what_was_with_a_task_whose_worker_died_is_done_alone():
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere they notice at the next message")
+@pytest.mark.thorough
 def test_workers_end_with_their_parent_even_in_an_endless_task(tmp_path):
     code = (
         "import sys; sys.path.append(sys.argv[1])\n"

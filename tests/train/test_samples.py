@@ -115,6 +115,7 @@ def test_the_ego_is_not_moved_into_another(asked):
 
 
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")
+@pytest.mark.thorough
 def test_batches_are_the_same_for_any_number_of_workers(stream):
     alone = digest(stream, 0)
     for workers in range(1, 5):
@@ -122,6 +123,7 @@ def test_batches_are_the_same_for_any_number_of_workers(stream):
     assert digest(replace(stream, seed=4), 0) != alone
 
 
+@pytest.mark.thorough
 def test_a_stream_goes_on_where_it_ended(stream):
     whole = [
         arrays_of(batch)

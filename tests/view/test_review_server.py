@@ -87,6 +87,7 @@ def test_the_token_in_an_address_opens_the_page_only(server):
     ],
 )
 @pytest.mark.parametrize("method", ["GET", "POST"])
+@pytest.mark.thorough
 def test_foreign_origins_hosts_and_tokens_are_refused_and_change_nothing(
     server, store, method, headers
 ):
@@ -190,6 +191,7 @@ def test_the_validity_of_a_route_is_told_without_keeping_it(server, store):
         {"reviewer": "someone else"},
     ],
 )
+@pytest.mark.thorough
 def test_a_wrong_value_is_refused_and_not_kept(server, store, values):
     status, text = ask(server, "POST", "/api/review", review(**values))
 

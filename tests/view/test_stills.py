@@ -182,6 +182,7 @@ def test_in_a_grid_words_stand_for_abbreviations_and_a_line_explains_marks(scena
 
 @pytest.mark.parametrize("width", ["3.5in", "7in", "89mm"])
 @pytest.mark.parametrize("at", [[1.0], [0.0, 1.0, 3.0]])
+@pytest.mark.thorough
 def test_a_picture_of_a_paper_has_its_width_and_letters_that_can_be_read(
     scenario, shown, tmp_path, width, at
 ):

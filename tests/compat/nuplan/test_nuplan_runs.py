@@ -47,6 +47,7 @@ def test_the_command_line_drives_a_planner_of_the_present_folder(toy, tmp_path):
         pytest.param("nuplan_plantf_like:PlanTfLike", marks=pytest.mark.learned),
     ],
 )
+@pytest.mark.thorough
 def test_planners_with_the_imports_of_public_ones_drive(toy, tmp_path, planner):
     module = planner.partition(":")[0]
     shutil.copy(places.TESTS / f"{module}.py", tmp_path)

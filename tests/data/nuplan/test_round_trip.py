@@ -168,6 +168,7 @@ def exported(drone, folder, tokens):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_what_was_recorded_around_a_window_is_exported_too(tmp_path):
     street = next(town for town in DEMO_TOWNS if town.name == "street")
     make_town(tmp_path, replace(street, overlap_s=12.0))  # scenarios up to the last row

@@ -149,6 +149,7 @@ def test_a_store_behind_a_url_is_not_reviewed_in_its_copy(remote, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_without_a_network_a_url_of_google_ends_soon_and_in_one_line(tmp_path):
     # where there is a network, there is no such store either
     begin = monotonic()

@@ -110,6 +110,7 @@ def test_a_worker_that_dies_is_named_and_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.thorough
 def test_a_town_with_too_few_scenarios_is_drawn_again(tmp_path, monkeypatch):
     attempts = []
 

@@ -185,6 +185,7 @@ def test_foreign_objects_beside_tensors_change_no_views_or_types(tmp_path):
 
 @pytest.mark.parametrize("planner", LEARNED)
 @pytest.mark.parametrize("wanted", LEARNED)
+@pytest.mark.thorough
 def test_a_file_of_another_planner_says_whose_it_is(tmp_path, planner, wanted):
     if planner == wanted:
         return
@@ -221,6 +222,7 @@ def test_a_file_of_no_planner_says_so(tmp_path):
         ),
     ],
 )
+@pytest.mark.thorough
 def test_a_state_that_does_not_fit_names_the_tensors(tmp_path, change, message):
     entries = lightning_entries(state_of("plantf"))
     change(entries["state_dict"])

@@ -285,6 +285,7 @@ def _convert(folder, capsys, *words):
     return end.value.code, *capsys.readouterr()
 
 
+@pytest.mark.thorough
 def test_the_command_converts_and_draws_what_is_right_and_what_is_wrong(town, tmp_path, capsys):
     right = write_tracks(tmp_path / "right.csv", town[0])
     wrong = write_tracks(tmp_path / "wrong.csv", town[0], y_m=-town[0]["y_m"])
