@@ -17,15 +17,6 @@ from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.kernels import FloatArray
 from shiftsim.world.state import LightStatus
 
-_SHARES = {
-    "car": 0.50,
-    "van": 0.06,
-    "pickup": 0.05,
-    "truck": 0.04,
-    "bus": 0.03,
-    "motorcycle": 0.07,
-    "bicycle": 0.25,
-}
 _HALTS = {"bus": 0.4, "bicycle": 0.2}  # chance to stop for a while
 _HALTS_ELSE, _SLOW = 0.08, 0.07  # chance of all others, and of those who dawdle
 _NEVER = (0.0, 0.0)  # a halt that is none
@@ -38,11 +29,16 @@ _PARKED = -1  # number of what nobody drives
 _ON_FOOT = 1.0  # m, who is shorter walks
 
 
-def random_traffic(town: Town, rng: np.random.Generator, duration: float) -> Traffic:
-    """Traffic that was recorded for a time [s], without anybody touching anybody."""
-    routes = RandomRoutes(town, rng)
+def random_traffic(
+    town: Town, rng: np.random.Generator, duration: float, *, crowd: float = 1.0
+) -> Traffic:
+    """Traffic that was recorded for a time [s], without anybody touching anybody.
+
+    `crowd` times as many people walk, or cycle for each that drives.
+    """
+    routes = RandomRoutes(town, rng, crowd)
     drivers = [*_present(routes, rng), *_arriving(routes, rng, duration)]
-    pedestrians = _pedestrians(town, rng, duration)
+    pedestrians = _pedestrians(town, rng, duration, crowd)
     for _ in range(_ROUNDS):
         fresh = [replace(driver, admitted=set(), waiting=set()) for driver in drivers]
         traffic = Traffic(town, fresh, [replace(pedestrian) for pedestrian in pedestrians])
@@ -54,10 +50,6 @@ def random_traffic(town: Town, rng: np.random.Generator, duration: float) -> Tra
         ]
         drivers = [x for number, x in enumerate(drivers) if number not in left_out]
     return traffic
-
-
-def _category(rng: np.random.Generator) -> str:
-    return str(rng.choice(list(_SHARES), p=list(_SHARES.values())))
 
 
 def _driver(
@@ -103,7 +95,7 @@ def _present(routes: RandomRoutes, rng: np.random.Generator) -> list[Driver]:
     for _ in range(4 * wanted):
         if len(placed) >= wanted:
             break
-        category = _category(rng)
+        category = routes.category()
         path = routes.path(str(rng.choice(routes.entries)), category)
         if path is None or path.length < 40.0:
             continue
@@ -127,7 +119,7 @@ def _queue(
     out: list[Driver] = []
     stop = None
     for _ in range(int(rng.integers(1, 6))):
-        category = _category(rng)
+        category = routes.category()
         path = routes.path(entry, category)
         if path is None or not path.zones:
             continue
@@ -218,7 +210,7 @@ def _arriving(routes: RandomRoutes, rng: np.random.Generator, duration: float) -
         mean = 11.0 / (level * routes.likes[entry] * street.lanes**0.7 + 0.15)  # s
         time = float(rng.exponential(mean))
         while time < duration - 4.0:
-            category = _category(rng)
+            category = routes.category()
             path = routes.path(entry, category)
             if path is not None:
                 driver = _driver(path, category, rng, start=round(time, 2))
@@ -230,10 +222,12 @@ def _arriving(routes: RandomRoutes, rng: np.random.Generator, duration: float) -
     return sorted(out, key=lambda driver: driver.start)
 
 
-def _pedestrians(town: Town, rng: np.random.Generator, duration: float) -> list[Pedestrian]:
+def _pedestrians(
+    town: Town, rng: np.random.Generator, duration: float, crowd: float
+) -> list[Pedestrian]:
     """Pedestrians over crossings and along the streets."""
     out = []
-    level = float(rng.choice((0.5, 1.0, 1.5)))
+    level = crowd * float(rng.choice((0.5, 1.0, 1.5)))
     for walk in town.walks:
         last = walk.kerb - 4.0 if walk.crossing else 0.7 * walk.length
         if last < 3.0:

@@ -55,6 +55,7 @@ class TownSpec:
     num_recordings: int = 1
     overlap_s: float = 12.0  # of consecutive scenarios [s]
     min_scenarios: int = 6  # a town with fewer is drawn again
+    crowd: float = 1.0  # times as many pedestrians and cyclists as elsewhere
 
     @property
     def offset(self) -> FloatArray:
@@ -97,7 +98,7 @@ def generate_town(spec: TownSpec, attempt: int = 0) -> tuple[Town, list[Traffic]
     """A town, and the traffic of each of its recordings."""
     rng = spec.generator(attempt)
     town = random_town(spec.kind, spec.name, rng)
-    return town, [random_traffic(town, rng, DURATION) for _ in spec.starts]
+    return town, [random_traffic(town, rng, DURATION, crowd=spec.crowd) for _ in spec.starts]
 
 
 def write_recordings(folder: Path, spec: TownSpec, town: Town, traffics: list[Traffic]) -> None:

@@ -30,16 +30,35 @@ class Route(NamedTuple):
     is_bicycle: bool = False  # whether it keeps to the right
 
 
+_SHARES = {
+    "car": 0.50,
+    "van": 0.06,
+    "pickup": 0.05,
+    "truck": 0.04,
+    "bus": 0.03,
+    "motorcycle": 0.07,
+    "bicycle": 0.25,
+}
+
+
 class RandomRoutes:
     """Random routes, some streets more liked than others."""
 
-    def __init__(self, town: Town, rng: np.random.Generator) -> None:
+    def __init__(self, town: Town, rng: np.random.Generator, crowd: float = 1.0) -> None:
+        """`crowd` times as many as elsewhere cycle, for each that drives."""
         self.town, self.rng = town, rng
+        self._shares = np.array(list(_SHARES.values()))
+        self._shares[list(_SHARES).index("bicycle")] *= crowd
+        self._shares /= 1.0 + _SHARES["bicycle"] * (crowd - 1.0)
         streets = town.streets.items()
         self.entries = tuple(name for name, x in streets if x.junctions[0] and not x.junctions[1])
         likes = rng.gamma(2.0, 0.5, len(town.streets)).tolist()
         self._paths: dict[Route, Path] = {}
         self.likes: dict[str, float] = dict(zip(town.streets, likes, strict=True))
+
+    def category(self) -> str:
+        """A random one of those who drive."""
+        return str(self.rng.choice(list(_SHARES), p=self._shares))
 
     def path(self, entry: str, category: str) -> Path | None:
         """The path of a random route from an entry; None where none was found."""

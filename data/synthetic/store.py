@@ -5,6 +5,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from itertools import count, cycle, islice
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,11 @@ from shiftsim.data.store.writing import StoreWriter, window_row
 from shiftsim.data.synthetic import recordings
 from shiftsim.data.synthetic.layouts import KINDS
 from shiftsim.errors import ConfigError, DataError
+
+# what networks may be trained on, and what is kept back from them to test a semantic shift: other
+# kinds of layout, with more pedestrians and cyclists
+DOMAINS = ("all", "home", "foreign")
+FOREIGN, CROWD = ("roundabout", "shared"), 2.0
 
 DEMO_SPLIT = "demo-mini"
 _SPLIT_SIZE = 16
@@ -62,13 +68,18 @@ def _made_in_place(path: Path) -> Iterator[tuple[Path, Path]]:
         store.rename(path)
 
 
-def town_specs(towns: int, seed: int) -> list[recordings.TownSpec]:
-    """The random towns of a seed, of every kind in turn."""
-    kinds = list(KINDS)
-    return [
-        recordings.TownSpec(f"town-{seed}-{number:03d}", kinds[(number - 1) % len(kinds)], number)
-        for number in range(1, towns + 1)
-    ]
+def town_specs(towns: int, seed: int, domain: str = "all") -> list[recordings.TownSpec]:
+    """The random towns of a seed and a domain, of every kind in turn."""
+    name, crowd = ("foreign", CROWD) if domain == "foreign" else ("town", 1.0)
+    kinds = {"home": [kind for kind in KINDS if kind not in FOREIGN], "foreign": list(FOREIGN)}
+    wanted = kinds.get(domain, list(KINDS))
+    numbered = zip(count(1), cycle(KINDS))  # the same town in every store that has it
+    specs = (
+        recordings.TownSpec(f"{name}-{seed}-{number:03d}", kind, number, crowd=crowd)
+        for number, kind in numbered
+        if kind in wanted
+    )
+    return list(islice(specs, towns))
 
 
 def write_towns(
@@ -76,21 +87,27 @@ def write_towns(
     *,
     towns: int,  # how many; a store of more holds those of fewer
     seed: int,
+    domain: str = "all",
     spread: Callable[[Any, Sequence[recordings.TownSpec]], Iterable[Any]],  # over processes
     progress: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> ScenarioStore:
     """A store of random towns, the same bytes for the same number and seed.
 
-    It is a ConfigError if the folder holds something else, a DataError if a process dies.
+    It is a ConfigError if the folder holds something else, or if there is no such domain, a
+    DataError if a process dies.
     """
-    provenance = {"name": "towns", "seed": seed, "towns": towns}
+    if domain not in DOMAINS:
+        raise ConfigError(f"domain {domain!r} unknown", hint=f"one of {', '.join(DOMAINS)}")
+    provenance: dict[str, Any] = {"name": "towns", "seed": seed, "towns": towns}
+    if domain != DOMAINS[0]:
+        provenance["domain"] = domain
     if path.exists():
         if (path / MANIFEST).is_file() and (found := ScenarioStore(path)).generator == provenance:
             return found
         raise ConfigError(
             f"{str(path)!r} holds something else", hint="name a new folder with --out"
         )
-    specs = town_specs(towns, seed)
+    specs = town_specs(towns, seed, domain)
     progress(0, towns, "")
     with _made_in_place(path) as (parts, store):
         outcomes = spread(partial(partial, recordings.make_town, parts), specs)

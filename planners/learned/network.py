@@ -47,6 +47,19 @@ class Linear(nn.Linear):
         return linear(input, self.weight, self.bias)
 
 
+class Conv(nn.Conv1d):
+    """Convolution of three neighbours along a sequence, as one product, which is faster."""
+
+    def __init__(self, inputs: int, outputs: int, *, stride: int = 1, bias: bool = True) -> None:
+        super().__init__(inputs, outputs, 3, stride=stride, padding=1, bias=bias)
+
+    def forward(self, input: Tensor) -> Tensor:
+        """(A, length, inputs) to (A, length / stride, outputs)."""
+        padded = functional.pad(input, (0, 0, 1, 1))
+        windows = [padded[:, i : i + input.shape[1] : self.stride[0]] for i in range(3)]
+        return linear(torch.cat(windows, -1), self.weight.transpose(1, 2).flatten(1), self.bias)
+
+
 class Mlp(nn.Module):
     """Linear, GELU, Linear."""
 
@@ -281,11 +294,11 @@ class _HistoryBlock(nn.Module):
 class _Downsample(nn.Module):
     def __init__(self, dim: int) -> None:
         super().__init__()
-        self.reduction = nn.Conv1d(dim, 2 * dim, 3, stride=2, padding=1, bias=False)
+        self.reduction = Conv(dim, 2 * dim, stride=2, bias=False)
         self.norm = nn.LayerNorm(2 * dim)
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.norm(self.reduction(x.transpose(1, 2)).transpose(1, 2))
+        return self.norm(self.reduction(x))
 
 
 class _Level(nn.Module):
@@ -301,27 +314,27 @@ class HistoryEncoder(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.embed = nn.ModuleDict({"proj": nn.Conv1d(HISTORY_CHANNELS, _WIDTHS[0], 3, padding=1)})
+        self.embed = nn.ModuleDict({"proj": Conv(HISTORY_CHANNELS, _WIDTHS[0])})
         self.levels = nn.ModuleList(_Level(index) for index in range(len(_WIDTHS)))
         self.norm0, self.norm1, self.norm2 = (nn.LayerNorm(width) for width in _WIDTHS)
-        self.lateral_convs = nn.ModuleList(nn.Conv1d(width, DIM, 3, padding=1) for width in _WIDTHS)
-        self.fpn_conv = nn.Conv1d(DIM, DIM, 3, padding=1)
+        self.lateral_convs = nn.ModuleList(Conv(width, DIM) for width in _WIDTHS)
+        self.fpn_conv = Conv(DIM, DIM)
 
     def forward(self, steps: Tensor) -> Tensor:
         """(A, 20, 9) to (A, 128)."""
-        x = self.embed["proj"](steps.transpose(1, 2)).transpose(1, 2)
-        ends = []  # (A, 128, 2) by level: what the last step of the result depends on
+        x = self.embed["proj"](steps)
+        ends = []  # (A, 2, 128) by level: what the last step of the result depends on
         norms = (self.norm0, self.norm1, self.norm2)
         for level, norm, lateral in zip(self.levels, norms, self.lateral_convs, strict=True):
             assert isinstance(level, _Level)
             x = level.blocks(x)
-            ends.append(lateral(norm(x[:, -3:]).transpose(1, 2))[:, :, -2:])
+            ends.append(lateral(norm(x[:, -3:]))[:, -2:])
             x = level.downsample(x)
         merged = ends[2]
         for end in (ends[1], ends[0]):
-            finer = functional.interpolate(merged, scale_factor=2.0, mode="linear")
-            merged = end + finer[:, :, -2:]
-        return self.fpn_conv(merged)[:, :, -1]
+            finer = functional.interpolate(merged.transpose(1, 2), scale_factor=2.0, mode="linear")
+            merged = end + finer[:, :, -2:].transpose(1, 2)
+        return self.fpn_conv(merged)[:, -1]
 
 
 class EgoStateEncoder(nn.Module):

@@ -219,6 +219,7 @@ def make_towns(
     towns: int,
     *,
     seed: int = 0,
+    domain: str = "all",
     workers: int = 0,
     on_progress: OnProgress = _silent,
 ) -> ScenarioStore:
@@ -228,6 +229,8 @@ def make_towns(
         store: Name or folder of the store.
         towns: How many.
         seed: Of everything that is random.
+        domain: `home` for towns without roundabouts and shared spaces, `foreign` for these alone
+            with twice as many pedestrians and cyclists, `all` for every kind.
         workers: Processes; as many as the machine suggests where 0.
         on_progress: Called with towns done, towns in all and a name.
 
@@ -245,8 +248,9 @@ def make_towns(
 
     count = min(workers or default_workers(), towns)
     spread = partial(map_unordered, workers=count, alone=1)
+    folder = store_path(store)
     return write_towns(
-        store_path(store), towns=towns, seed=seed, spread=spread, progress=on_progress
+        folder, towns=towns, seed=seed, domain=domain, spread=spread, progress=on_progress
     )
 
 

@@ -393,6 +393,7 @@ def demo(
         None, min=1, help="Only make a store of N random towns to train in."
     ),
     seed: int | None = Option(None, min=0, help="Of the random towns; same seed, same bytes. [0]"),
+    domain: str = Option("all", help="Of the random towns: all, home or foreign."),
     quiet: Quiet = False,
 ) -> None:
     """Generate small recordings, convert them, run three planners with and without noise.
@@ -400,7 +401,7 @@ def demo(
     With --towns, generate, convert and filter random towns to train in, and run nothing.
     """
     if towns is not None:
-        _make_towns(out, towns, seed or 0, settings, quiet=quiet)
+        _make_towns(out, towns, seed or 0, domain, settings, quiet=quiet)
         return
     if seed is not None:
         raise ConfigError("--seed is of random towns only", hint="say how many with --towns")
@@ -430,16 +431,19 @@ def demo(
 
 
 def _make_towns(
-    out: Path | None, towns: int, seed: int, settings: cli.Settings, *, quiet: bool
+    out: Path | None, towns: int, seed: int, domain: str, settings: cli.Settings, *, quiet: bool
 ) -> None:
     """Generate, convert and filter random towns."""
     if "limit" in settings:
         raise ConfigError("--limit is of runs, --towns runs nothing", hint="leave one of them out")
-    folder = out.absolute() if out else store_path(f"towns-{seed}")
+    name = f"towns-{seed}" if domain == "all" else f"towns-{domain}-{seed}"
+    folder = out.absolute() if out else store_path(name)
     shown, workers = out or folder, settings.get("workers", 0)
     echo(f"generating and converting {plural(towns, 'town')} of seed {seed} → {shown}")
     with progress_bar(quiet=quiet) as advance:
-        store = shiftsim.make_towns(folder, towns, seed=seed, workers=workers, on_progress=advance)
+        store = shiftsim.make_towns(
+            folder, towns, seed=seed, domain=domain, workers=workers, on_progress=advance
+        )
     echo("driving every scenario as recorded, to leave out those that cannot be driven so")
     with progress_bar(quiet=quiet) as advance:
         found = store.filter(workers=workers, on_progress=advance)

@@ -22,7 +22,7 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from shiftsim.data import open_store
 from shiftsim.errors import ShiftsimError
-from shiftsim.geometry.boxes import boxes_to_corners, boxes_touch
+from shiftsim.geometry.boxes import boxes_to_corners, boxes_touch, wrap_angles
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.planners.learned import features
 from shiftsim.planners.learned.plantf import planner as plantf
@@ -32,9 +32,10 @@ from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import PACIFICA, center_poses
 
 STEPS = features.PLAN_POSES  # of a target
-BATCH, PER_BLOCK, PER_SCENARIO = 32, 16, 16  # samples; scenarios; samples of each of these
-SPARE = 2  # more of each scenario, for samples that cannot be made
-STRIDE = 5  # iterations between two samples
+BATCH, PER_BLOCK = 32, 16  # samples; scenarios
+# share of iterations that are samples: those in whose 8 s the ego turns, drives on, stands
+DRAWN = (0.4, 0.15, 0.05)
+TURNING, STANDING = 0.35, 1.0  # rad from which it turns, m below which it stands
 PERTURBED = 0.5  # share of samples
 # most that x, y [m], heading [rad], speed [m/s], acceleration [m/s^2], steering angle [rad] and
 # yaw rate [rad/s] are moved by
@@ -207,17 +208,15 @@ class BlockMaker:
         return Block(batches, dict(failed))
 
     def _of_scenario(self, token: str, key: list[int], failed: Counter[str]) -> list[Sample]:
-        """Up to `PER_SCENARIO` samples of a scenario."""
+        """Samples of a scenario."""
         made: list[Sample] = []
         try:
             scenario = self._store.read(token)
             self._planner.reset(scene_info(scenario))
         except ShiftsimError as error:
-            failed[type(error).__name__] += PER_SCENARIO
+            failed[type(error).__name__] += 1
             return made
         for iteration in _draw(scenario, key).tolist():
-            if len(made) == PER_SCENARIO:
-                break
             random = np.random.default_rng([*key, iteration + 1])
             try:
                 one = make_sample(self._planner, scenario, iteration, random)
@@ -231,11 +230,16 @@ class BlockMaker:
 
 
 def _draw(scenario: Scenario, key: list[int]) -> IntArray:
-    """Iterations of a scenario, some more than are wanted, of those that have a future."""
-    last = scenario.iteration_rows + STEPS * scenario.row_step < len(scenario.time_us)
-    usable = np.flatnonzero(last)[::STRIDE]
-    drawn: IntArray = np.random.default_rng([*key, 0]).permutation(usable)
-    return drawn[: PER_SCENARIO + SPARE]
+    """Some iterations of a scenario that have a future, most of those that are rare on a road."""
+    rows = scenario.iteration_rows
+    later = rows + STEPS * scenario.row_step
+    usable = np.flatnonzero(later < len(scenario.time_us))
+    changes = scenario.ego[later[usable], :3] - scenario.ego[rows[usable], :3]
+    turning = np.abs(wrap_angles(changes[:, 2])) > TURNING
+    standing = np.hypot(changes[:, 0], changes[:, 1]) < STANDING
+    share = np.select([turning, ~standing], DRAWN[:2], DRAWN[2])
+    drawn: IntArray = usable[np.random.default_rng([*key, 0]).random(len(usable)) < share]
+    return drawn
 
 
 class Blocks(IterableDataset[Block]):
