@@ -76,12 +76,6 @@ class Mlp(nn.Module):
         """(..., inputs) to (..., outputs)."""
         return self.fc2(self.act(self.fc1(x)))
 
-    def over_rows(self, x: Tensor) -> Tensor:
-        """The same over the last but one dimension: (B, inputs, C) to (B, outputs, C)."""
-        first, second = (layer.weight.expand(len(x), -1, -1) for layer in (self.fc1, self.fc2))
-        hidden = self.act(torch.baddbmm(self.fc1.bias[:, None], first, x))
-        return torch.baddbmm(self.fc2.bias[:, None], second, hidden)
-
 
 def head(inputs: int, hidden: int, outputs: int, *, bias: bool = True) -> nn.Sequential:
     """Linear, LayerNorm, ReLU, Linear; `bias` is that of the first layer."""

@@ -25,6 +25,13 @@ ROUTE_COLUMNS, ROUTE_TOKENS, ROUTE_CHANNELS = 4, 32, 64
 FREQUENCIES, LONGEST = 128, 10000.0  # of the time embedding
 
 
+def over_rows(mlp: Mlp, x: Tensor) -> Tensor:
+    """An MLP over the last but one dimension: (B, inputs, C) to (B, outputs, C)."""
+    first, second = (layer.weight.expand(len(x), -1, -1) for layer in (mlp.fc1, mlp.fc2))
+    hidden = mlp.act(torch.baddbmm(mlp.fc1.bias[:, None], first, x))
+    return torch.baddbmm(mlp.fc2.bias[:, None], second, hidden)
+
+
 class Mixer(nn.Module):
     """One mixer block: an MLP over the tokens, then one over the channels."""
 
@@ -36,7 +43,7 @@ class Mixer(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, T, C) to the same."""
-        x = x + self.tokens_mlp.over_rows(self.norm1(x))
+        x = x + over_rows(self.tokens_mlp, self.norm1(x))
         return x + self.channels_mlp(self.norm2(x))
 
 
@@ -53,7 +60,7 @@ class MixerEncoder(nn.Module):
 
     def mean(self, x: Tensor) -> Tensor:
         """(N, samples, columns) to (N, CHANNELS)."""
-        tokens = self.token_pre_project.over_rows(self.channel_pre_project(x))
+        tokens = over_rows(self.token_pre_project, self.channel_pre_project(x))
         return self.blocks(tokens).mean(dim=1)
 
     def token(self, x: Tensor) -> Tensor:
@@ -202,7 +209,7 @@ class RouteEncoder(nn.Module):
     def forward(self, route: Tensor) -> Tensor:
         """(B, lanes, points, 12) to (B, hidden); zero where there is no route."""
         points = route[..., :ROUTE_COLUMNS].flatten(1, 2)
-        x = self.token_pre_project.over_rows(self.channel_pre_project(points))
+        x = over_rows(self.token_pre_project, self.channel_pre_project(points))
         x = self.emb_project(self.norm(self.Mixer(x).mean(dim=1)))
         return x * (points != 0.0).any(dim=-1).any(dim=-1, keepdim=True)
 
