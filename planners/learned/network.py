@@ -225,8 +225,7 @@ class SceneTensors:
 
     def along_lines(self, middle: Tensor) -> list[Tensor]:
         """Of each point of the centre lines (B, M, K, 2): place, vector, direction, each (…, 2)."""
-        angle = self.orientations
-        directions = torch.stack([angle.cos(), angle.sin()], dim=-1)
+        directions = torch.stack([self.orientations.cos(), self.orientations.sin()], dim=-1)
         return [middle - self.centers[:, :, None, :2], self.vectors, directions]
 
 
@@ -324,10 +323,10 @@ class HistoryEncoder(nn.Module):
             x = level.blocks(x)
             ends.append(lateral(norm(x[:, -3:]))[:, -2:])
             x = level.downsample(x)
-        merged = ends[2]
-        for end in (ends[1], ends[0]):
+        merged = ends.pop()
+        while ends:
             finer = functional.interpolate(merged.transpose(1, 2), scale_factor=2.0, mode="linear")
-            merged = end + finer[:, :, -2:].transpose(1, 2)
+            merged = ends.pop() + finer[:, :, -2:].transpose(1, 2)
         return self.fpn_conv(merged)[:, -1]
 
 
@@ -345,8 +344,8 @@ class EgoStateEncoder(nn.Module):
 
     def forward(self, state: Tensor) -> Tensor:
         """(B, >= 6) to (B, 128)."""
-        each = [layer(state[:, i : i + 1]) for i, layer in enumerate(self.linears)]
-        tokens = torch.stack(each, dim=1) + self.pos_embed
+        each = (layer(state[:, i : i + 1]) for i, layer in enumerate(self.linears))
+        tokens = torch.stack(list(each), dim=1) + self.pos_embed
         mask = None
         if self.training:
             shape = len(state), STATE_CHANNELS - _KNOWN_STATES
