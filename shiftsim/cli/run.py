@@ -389,9 +389,7 @@ def bundle(
 def demo(
     settings: cli.Settings,
     out: Path | None = Option(None, help="Folder of the store."),
-    towns: int | None = Option(
-        None, min=1, help="Only make a store of N random towns to train in."
-    ),
+    towns: int | None = Option(None, min=1, help="Only make N random towns to train in."),
     seed: int | None = Option(None, min=0, help="Of the random towns; same seed, same bytes. [0]"),
     domain: str = Option("all", help="Of the random towns: all, home or foreign."),
     quiet: Quiet = False,
@@ -436,8 +434,7 @@ def _make_towns(
     """Generate, convert and filter random towns."""
     if "limit" in settings:
         raise ConfigError("--limit is of runs, --towns runs nothing", hint="leave one of them out")
-    name = f"towns-{seed}" if domain == "all" else f"towns-{domain}-{seed}"
-    folder = out.absolute() if out else store_path(name)
+    folder = out.absolute() if out else store_path(f"towns-{domain}-{seed}".replace("all-", ""))
     shown, workers = out or folder, settings.get("workers", 0)
     echo(f"generating and converting {plural(towns, 'town')} of seed {seed} → {shown}")
     with progress_bar(quiet=quiet) as advance:
