@@ -14,7 +14,7 @@ from shiftsim.errors import one_of
 from shiftsim.report.groups import KnownSet
 from shiftsim.report.paper import Published
 
-TRACKS = ("semantic-shift", "state-drift", "edits")
+TRACKS = ("semantic-shift", "state-drift", "edits", "finding")
 INTERPLAN_THRESHOLDS = "nuplan"  # of its edits, whatever the track's own
 _HERE = Path(__file__).parent
 
@@ -26,6 +26,15 @@ class Drawn:
     kinds: tuple[str, ...]  # of `sampling.KINDS`
     count: int  # of each kind, as many of each grade
     seed: int  # of all draws
+
+
+@dataclass(frozen=True, slots=True)
+class Towns:
+    """Towns that a track generates."""
+
+    domain: str
+    towns: int
+    seed: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +51,7 @@ class Track:
     own_thresholds: str  # threshold profile of one's own scenarios
     own_note: str  # what scores on one's own scenarios are, and are not
     drawn: Drawn | None  # what is drawn over one's own scenarios and driven, too
+    towns: tuple[Towns, ...]  # that are driven in place of one's own scenarios
 
     @property
     def rollouts_per_scenario(self) -> int:
@@ -68,6 +78,7 @@ def load_track(name: str) -> Track:
         own_thresholds=sets["own_thresholds"],
         own_note=sets["own_note"],
         drawn=Drawn(**drawn | {"kinds": tuple(drawn["kinds"])}) if drawn else None,
+        towns=tuple(Towns(**values) for values in table.get("towns", ())),
     )
 
 

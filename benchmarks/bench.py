@@ -13,30 +13,28 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from shiftsim.benchmarks import INTERPLAN_THRESHOLDS, Drawn, Track, known_sets, load_track
 from shiftsim.benchmarks import published as published_figures
+from shiftsim.benchmarks.inventory import coverage
 from shiftsim.data import open_store
 from shiftsim.edits.sampling import sample_edits
 from shiftsim.errors import ConfigError, DataError, one_of
-from shiftsim.files import DEFAULT_STORE, write_text
+from shiftsim.files import DEFAULT_STORE, store_path, write_text
 from shiftsim.report import build
 from shiftsim.report.figures import figures
 from shiftsim.report.groups import (
-    TRAFFIC,
     Group,
     KnownSet,
-    distinct_sets,
     read_groups,
     token_digest,
 )
 from shiftsim.report.palette import DEFAULT_FORM, FigureFormat
-from shiftsim.report.tables import FORMATS, Cell, Number, Table
+from shiftsim.report.tables import FORMATS, Table
 from shiftsim.runs.avoidable import grade
 from shiftsim.runs.config import make_config
 from shiftsim.runs.edited import EditSet, edits_text, make_edits
 from shiftsim.runs.execute import Progress, execute
+from shiftsim.runs.filter import filter_store
 from shiftsim.runs.prepare import RUNS, RunPlan, prepare
 from shiftsim.runs.results import Run, label_runs, open_run
 from shiftsim.runs.scenarios import default_split, open_edits, open_run_store
@@ -87,6 +85,13 @@ def plan_bench(
         "seeds": list(track.seeds),
         "store": DEFAULT_STORE,
     } | values
+    if track.towns:
+        if settings.get("store") or settings.get("split"):
+            raise ConfigError(
+                f"the track {track.name} drives in towns of its own",
+                hint="leave --store and --split out, or choose the track state-drift",
+            )
+        return _plan_towns(track, values, modes, out)
     if not values.get("split"):  # the same for recorded and for edited scenarios
         opened = open_store(str(values["store"]))
         edits = open_edits(edits_of, opened) if edits_of and track.drawn else None
@@ -122,6 +127,25 @@ def plan_bench(
     edited = _prepared(track, changed, drivable, folder, edits)
     lists = (_list_of(unlimited), _list_of(_without_limit(next(iter(edited.values())))))
     return Plan(track, folder, runs | edited, lists, text)
+
+
+def _plan_towns(track: Track, values: Mapping[str, Any], modes: Sequence[str], out: str) -> Plan:
+    """The plan of a track in generated towns, which are made here where they are not there."""
+    from shiftsim.api.stores import make_towns
+
+    sets = {}
+    for asked in track.towns:
+        domain, workers = asked.domain, int(values.get("workers") or 0)
+        place = store_path(f"{track.name}-{domain}")
+        store = make_towns(place, asked.towns, seed=asked.seed, domain=domain, workers=workers)
+        filter_store(store.path, workers=workers)
+        rules = {"thresholds": track.own_thresholds, "split": store.path.name}
+        sets[domain] = {**rules, **values, "store": str(store.path)}
+    folder = Path(out) if out else RUNS / _name(track, sets, "")
+    _check_folder(folder, track)
+    runs = _prepared(track, sets, modes, folder)
+    whole = [_without_limit(run) for name, run in runs.items() if name.endswith(f"-{modes[0]}")]
+    return Plan(track, folder, runs, tuple(map(_list_of, whole)))
 
 
 def _prepared(
@@ -171,7 +195,7 @@ def _drives(edits: EditSet, traffic: str) -> bool:
 def _name(track: Track, sets: Mapping[str, Mapping[str, Any]], edits: str) -> str:
     text = json.dumps([track.name, sets, *([edits] if edits else [])], sort_keys=True, default=str)
     digest = hashlib.blake2b(text.encode(), digest_size=2).hexdigest()
-    own = sets[OWN]
+    own = next(iter(sets.values()))
     split = Path(str(own.get("split") or own.get("store") or DEFAULT_STORE)).stem
     return f"{track.name}_{split}_{digest}"
 
@@ -390,61 +414,3 @@ def _read_manifest(folder: Path) -> dict[str, Any] | None:
             hint="run the benchmark again with this version of shiftsim",
         )
     return found
-
-
-def coverage(track: Track, groups: Sequence[Group]) -> Table:
-    """Finished rollouts of the track's contract, by set of scenarios and planner.
-
-    A score is the track's score only where all of them are there.
-    """
-    inside = [group for group in groups if _belongs(group, track)]
-    sets = {data.name: (data.label, data.whole) for data in distinct_sets(inside)}
-    if listed := track.reference:
-        sets.setdefault(listed.name, (listed.label, listed.count))
-    rows: list[tuple[Cell, ...]] = []
-    for name, (label, whole) in sets.items():
-        for planner in dict.fromkeys(group.planner for group in inside):
-            mine = [g for g in inside if (g.data.name, g.planner) == (name, planner)]
-            done = sum(_finished(group, track) for group in mine)
-            expected = whole * track.rollouts_per_scenario
-            if any(group.data.is_interplan for group in mine):  # for reactive traffic only
-                expected //= len(track.traffic)
-            verdict = "complete" if done == expected else f"partial ({done}/{expected})"
-            counts = (Number(done, 0), Number(expected, 0))
-            rows.append((label, planner, *counts, verdict if done else "not run"))
-    missing = [name for name in track.planners if name not in {g.planner for g in inside}]
-    rules = [f"own scenarios under thresholds {track.own_thresholds}"]
-    rules += [f"{listed.label} under {listed.thresholds}"] if listed else []
-    if drawn := track.drawn:
-        rules.append(f"recorded, and with {drawn.count} edits of each of {', '.join(drawn.kinds)}")
-    notes = [
-        f"contract: traffic {', '.join(track.traffic)} × noise {', '.join(track.noise)} × seeds "
-        f"{', '.join(map(str, track.seeds))} on all scenarios; {', '.join(rules)}",
-        f"scores that are not complete are not the benchmark's; own scenarios: {track.own_note}",
-    ]
-    notes += [f"planners of the paper that are not here: {', '.join(missing)}"] if missing else []
-    header = ("set", "planner", "rollouts", "of", "verdict")
-    title = f"Coverage of the track {track.name}"
-    return Table("coverage", title, header, tuple(rows), 2, tuple(notes))
-
-
-def _belongs(group: Group, track: Track) -> bool:
-    """Whether a group is part of the contract."""
-    listed, rules = track.reference, track.own_thresholds
-    if listed and group.data.known == listed.name:
-        rules = listed.thresholds
-    elif group.data.is_interplan:
-        rules = INTERPLAN_THRESHOLDS
-    modes = [TRAFFIC[name] for name in track.traffic]
-    return (
-        group.traffic in modes
-        and group.noise in track.noise
-        and group.data.thresholds == rules
-        and group.data.controller == "lqr"
-    )
-
-
-def _finished(group: Group, track: Track) -> int:
-    wanted = (0,) if group.noise == "none" else track.seeds
-    rows = [i for i, seed in enumerate(group.seeds) if seed in wanted]
-    return int(np.isfinite(group.values[rows, :, 0]).sum())

@@ -21,6 +21,7 @@ _MAIN_TABLE = {
     "semantic-shift": "semantic-shift",
     "state-drift": "noise-robustness",
     "edits": "edits",
+    "finding": "noise-robustness",
 }
 _SETTINGS = """planners store split edits checkpoints planner_args seeds noise traffic controller
 limit device batch_size strict workers timeout executor scheduler resume retry_failed out
@@ -39,7 +40,7 @@ save_rollouts allow_partial""".split()
 )
 def bench(
     settings: cli.Settings,
-    track: str = Argument(help="semantic-shift, state-drift or edits."),
+    track: str = Argument(help="semantic-shift, state-drift, edits or finding."),
     val14: str = Option("", help="Store, or STORE:SPLIT, with Val14 (left out)."),
     published: bool = Option(False, "--published", help="The paper's figures beside the own ones."),
     estimate: bool = Option(

@@ -2,12 +2,14 @@
 
 import csv
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from shiftsim import benchmarks
 from shiftsim.benchmarks import TRACKS, known_sets, load_track, published
+from shiftsim.benchmarks.bench import open_runs, plan_bench, run_bench
 from shiftsim.edits.sampling import GRADES, KINDS
 from shiftsim.errors import ConfigError
 from shiftsim.metrics import PROFILES
@@ -111,3 +113,21 @@ def test_cities_are_recognised_by_name_and_abbreviation():
     paper = published()
     names = ("san francisco", "SFO", "München", "Muenchen", "Stuttgart", "avenue")
     assert [paper.abbreviation(name) for name in names] == ["SFO", "SFO", "MUC", "MUC", "STR", ""]
+
+
+@pytest.mark.thorough
+def test_the_finding_is_driven_at_home_and_in_foreign_towns(tmp_path, monkeypatch):
+    monkeypatch.setenv("SHIFTSIM_DATA", str(tmp_path / "stores"))
+    few = tuple(replace(towns, towns=1) for towns in load_track("finding").towns)
+    track = replace(load_track("finding"), towns=few)
+    settings = {"planners": ["log-future"], "noise": ["none"], "seeds": [0], "workers": 1}
+    plan = plan_bench(track, settings | {"limit": 1}, out=str(tmp_path / "out"))
+    modes = ("nonreactive", "reactive")
+    assert list(plan.runs) == [f"{where}-{mode}" for where in ("home", "foreign") for mode in modes]
+    assert [listed.name for listed in plan.own] == ["finding-home", "finding-foreign"]
+    done = run_bench(plan)
+    assert all(run.is_complete for run in done)
+    [table] = open_runs([plan.folder]).coverage(open_runs([plan.folder]).groups())
+    assert {row[0].split(" ")[0] for row in table.rows} == {"finding-home", "finding-foreign"}
+    with pytest.raises(ConfigError, match="towns of its own"):
+        plan_bench(track, settings | {"store": "demo"})

@@ -16,7 +16,7 @@ from shiftsim.data.synthetic import recordings as town_recordings
 from shiftsim.data.synthetic.agents import SIZES, arc_at
 from shiftsim.data.synthetic.layouts import KINDS, random_town
 from shiftsim.data.synthetic.population import random_traffic
-from shiftsim.data.synthetic.store import town_specs, write_towns
+from shiftsim.data.synthetic.store import FOREIGN, town_specs, write_towns
 from shiftsim.data.synthetic.town import Lights
 from shiftsim.data.synthetic.traffic import DT
 from shiftsim.errors import ConfigError, DataError
@@ -48,6 +48,34 @@ def _files(store):
 
 
 # ---- the store
+
+
+def test_foreign_kinds_are_kept_back_from_towns_at_home():
+    home, foreign = (town_specs(8, 1, domain) for domain in ("home", "foreign"))
+    assert {spec.kind for spec in foreign} == set(FOREIGN) < set(KINDS)
+    assert {spec.kind for spec in home} == set(KINDS) - set(FOREIGN)
+    assert set(home) < set(town_specs(12, 1))
+    assert not {spec.name for spec in foreign} & {spec.name for spec in town_specs(40, 1)}
+
+
+@pytest.mark.thorough
+def test_a_crowd_is_of_pedestrians_and_cyclists():
+    def count(crowd):
+        traffics = []
+        for number in range(10):
+            town, rng = _town("junction", number)
+            traffics.append(random_traffic(town, rng, DURATION, crowd=crowd))
+        drivers = [driver.category for traffic in traffics for driver in traffic.drivers]
+        return sum(len(x.pedestrians) for x in traffics), drivers.count("bicycle") / len(drivers)
+
+    (few, rare), (many, frequent) = count(1.0), count(2.0)
+    assert 1.5 < many / few < 2.6
+    assert frequent / rare == pytest.approx(0.5 / 1.25 / 0.25, rel=0.25)
+
+
+def test_an_unknown_domain_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="domain 'abroad' unknown"):
+        write_towns(tmp_path / "x", towns=1, seed=1, domain="abroad", spread=ONE_PROCESS)
 
 
 @pytest.mark.thorough
