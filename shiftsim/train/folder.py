@@ -234,11 +234,12 @@ def draw_curves(
     """Draw errors while training, and scores after each round; nothing without matplotlib."""
     from shiftsim.report.palette import dashes, new_figure, planner_styles, save_picture
 
+    errors = [name for name in scores[-1] if name.startswith("ADE")] if scores else []
     try:
-        figure = new_figure(figsize=(8.0, 3.2))
+        figure = new_figure(figsize=(8.0 if not errors else 10.5, 3.2))
     except MissingExtraError:
         return
-    left, right = figure.subplots(1, 2)
+    left, right, *more = figure.subplots(1, 3 if errors else 2)
     samples = [row["samples"] / 1e6 for row in curve]
     for (name, factor), colour in zip(
         ERRORS[planner].items(), ("0.15", "0.6", "0.8"), strict=False
@@ -258,4 +259,13 @@ def draw_curves(
     right.set_ylabel("closed-loop score × 100")
     right.set_title("on towns left out", fontsize=9)
     right.legend(frameon=False, loc="lower right")
+    for axes in more:
+        for name, line in zip(errors, ("-", ":"), strict=False):
+            label = name.removeprefix("ADE of ").removesuffix(" [m]")
+            axes.plot(
+                at, [row[name] for row in scores], line, marker="o", color="0.15", label=label
+            )
+        axes.set(xlabel="samples [million]", ylabel="open loop: ADE [m]")
+        axes.set_ylim(bottom=0.0)
+        axes.legend(frameon=False)
     save_picture(figure, path)

@@ -20,6 +20,7 @@ from typing import Any
 from shiftsim.data import open_store
 from shiftsim.errors import DataError
 from shiftsim.files import write_text
+from shiftsim.metrics.open_loop import METRICS
 from shiftsim.planners.learned.checkpoint import resolve_device
 from shiftsim.runs.config import make_config
 from shiftsim.runs.execute import execute
@@ -53,6 +54,7 @@ from shiftsim.train.states import States, write_part
 
 _WRITE_EVERY, _REPORT_EVERY = 120.0, 10.0  # s
 _CURVE_EVERY = 50  # steps
+_BASELINE = "constant-velocity"  # driven beside a network, for comparison
 _NO_DRIVER = "deterministic:base"  # where the network does not drive
 
 
@@ -345,22 +347,35 @@ class PlanTfTraining(Recipe):
         run_folder = settings.out / "runs" / f"round-{self.progress.round:02d}"
         shutil.rmtree(run_folder, ignore_errors=True)  # of a training that was ended in it
         values: dict[str, Any] = {
-            "planners": [self.planner],
+            "planners": [self.planner, _BASELINE],
             "checkpoints": [f"{self.planner}={network}"],
+            "open_loop": True,
         }
         values |= {"store": settings.store, "split": str(split), "out": str(run_folder)}
         values |= {"noise": list(TESTED), "workers": settings.workers, "batch_size": TOGETHER}
         self._on_message(f"{where} testing; samples that could not be made: {self._reasons}")
-        rows = execute(prepare(make_config(values))).scores.to_pylist()
+        run = execute(prepare(make_config(values)))
+        rows = [row for row in run.scores.to_pylist() if row["planner"] == self.planner]
         if not rows:
             raise DataError(f"no scenario could be driven to its end, see {str(run_folder)!r}")
         sums = {noise: sum(r["cls"] for r in rows if r["noise"] == noise) for noise in TESTED}
-        return {noise: found / len(tokens) for noise, found in sums.items()}  # failures score 0
+        scores = {noise: found / len(tokens) for noise, found in sums.items()}  # failures score 0
+        return scores | _open_loop_errors(run.metrics.to_pylist())
 
     @property
     def _reasons(self) -> str:
         counts = self._left_out.most_common()
         return ", ".join(f"{count} {reason}" for reason, count in counts) or "none"
+
+
+def _open_loop_errors(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """Mean errors along the recording [m], by planner, over the scenarios that were tested."""
+    found: dict[str, list[float]] = {}
+    for row in rows:
+        short = METRICS.get(row["metric"], ("",))[0]
+        if short in ("ADE", "FDE") and row["value"] is not None:
+            found.setdefault(f"{short} of {row['planner']} [m]", []).append(row["value"])
+    return {name: sum(values) / len(values) for name, values in sorted(found.items())}
 
 
 def sum_of(row: dict[str, Any]) -> float:
@@ -376,4 +391,5 @@ def _curve_row(number: int, samples: int, results: list[learning.StepResult]) ->
 
 
 def _in_words(found: dict[str, float]) -> str:
-    return "  ".join(f"{noise} {100.0 * score:.1f}" for noise, score in found.items())
+    scaled = {name: 100.0 * value if name in TESTED else value for name, value in found.items()}
+    return "  ".join(f"{name} {value:.1f}" for name, value in scaled.items())
