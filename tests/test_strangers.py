@@ -122,6 +122,7 @@ def test_pages_are_not_written_through_a_link(theirs, home, link, toy):
     assert (asked.returncode, "is outside of this folder" in asked.stderr) == (2, True)
 
 
+@pytest.mark.thorough
 def test_a_page_that_is_a_link_is_replaced(theirs, home):
     (theirs / "view").mkdir()
     (theirs / "view" / "index.html").symlink_to(home / "precious")

@@ -220,6 +220,7 @@ def test_doctor_finds_this_installation_well(tmp_path):
     assert found["mismatches"] == []
 
 
+@pytest.mark.thorough
 def test_help_names_only_commands_that_exist(tmp_path):
     done = call(tmp_path, "--help")
     assert done.returncode == 0

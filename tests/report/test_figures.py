@@ -42,6 +42,7 @@ def test_there_are_pictures_of_robustness_cities_and_metrics(groups):
     assert set(drawn(groups)) == {"robustness_made-up", "cities_made-up", "metrics_made-up"}
 
 
+@pytest.mark.thorough
 def test_a_withheld_score_is_not_drawn_and_a_partial_one_on_request(run, groups):
     def points(found):
         axes = found["cities_made-up"].drawn.axes[0]
@@ -213,6 +214,7 @@ def test_intervals_stay_within_what_scores_can_be(tmp_path):
     assert (min(ends), max(ends)) == (0.0, 100.0)
 
 
+@pytest.mark.thorough
 def test_names_stand_at_the_ends_of_lines_where_they_find_room(tmp_path):
     for names, is_direct in ((PAPER, True), (OWN, False)):
         groups = read_groups([write_run(tmp_path / names[0], planners=names, noise=ALL)])

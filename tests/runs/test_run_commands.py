@@ -203,6 +203,7 @@ def test_the_name_of_a_class_is_that_in_tables_unless_a_label_is_given(call, tmp
     assert named == [f"{file}:Named", f"{file}:Other"]
 
 
+@pytest.mark.thorough
 def test_an_isolated_planner_has_its_own_name_too(call, tmp_path):
     file = tmp_path / "named_planners.py"
     file.write_text(NAMED)

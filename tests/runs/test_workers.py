@@ -31,6 +31,7 @@ def run(numbers, workers, alone=0, make=Square):
 
 
 @pytest.mark.parametrize("workers", [1, 2, 3])
+@pytest.mark.thorough
 def test_every_task_is_done_once_for_any_number_of_workers(workers):
     outcomes = run(range(10), workers)
     assert sorted(o.task for o in outcomes) == list(range(10))

@@ -129,6 +129,7 @@ def test_a_log_gets_the_score_that_nuplan_gave(nuplan_reference):
             assert abs(score - row[name]) < 1e-9, name
 
 
+@pytest.mark.thorough
 def test_every_changed_number_of_a_table_is_named(folder, nuplan_reference):
     keep(folder, LOGGED)
     named = []
@@ -188,6 +189,7 @@ def test_a_changed_number_of_a_log_is_named(
     assert report.mismatches[0].startswith(f"{named}: NR {LOGGED} SimplePlanner")
 
 
+@pytest.mark.thorough
 def test_nothing_in_a_log_is_run(folder, recorded, tmp_path):
     class Evil:
         def __reduce__(self):
@@ -202,6 +204,7 @@ def test_nothing_in_a_log_is_run(folder, recorded, tmp_path):
     assert not (tmp_path / "made").exists()
 
 
+@pytest.mark.thorough
 def test_objects_of_other_classes_are_left_out_and_named(folder, nuplan_reference):
     keep(folder, LOGGED)
     change_log(log_of(folder), b"interpolated_trajectory", b"interpolated_trajectorx")
@@ -238,6 +241,7 @@ def test_a_log_of_another_version_is_said_to_be_one(folder, nuplan_reference):
     assert any("_car_footprint" in line for line in report.mismatches)
 
 
+@pytest.mark.thorough
 def test_a_table_of_another_version_is_said_to_be_one(folder, nuplan_reference):
     keep(folder, LOGGED)
     [path] = folder.rglob("ego_jerk.parquet")
@@ -257,6 +261,7 @@ def test_a_table_of_another_version_is_said_to_be_one(folder, nuplan_reference):
     assert "1.2.2" in caught.value.hint
 
 
+@pytest.mark.thorough
 def test_a_row_that_is_gone_is_named(folder, nuplan_reference):
     keep(folder, LOGGED)
     [path] = folder.rglob("ego_jerk.parquet")
@@ -296,6 +301,7 @@ def test_runs_that_cannot_be_compared_are_named(folder, nuplan_reference):
     }
 
 
+@pytest.mark.thorough
 def test_a_run_that_failed_in_nuplan_is_named(folder, nuplan_reference):
     keep(folder, LOGGED)
     [path] = folder.rglob("runner_report.parquet")

@@ -113,6 +113,7 @@ def test_foreign_origins_hosts_and_tokens_are_refused_and_change_nothing(
         "/api/scenario/../../store.json",
     ],
 )
+@pytest.mark.thorough
 def test_no_file_is_served_by_its_path(server, path):
     status, text = ask(server, "GET", path)
 
@@ -250,6 +251,7 @@ def test_a_full_disk_is_reported_and_what_was_kept_stays(server, store, monkeypa
         ("/api/route", {"token": {}, "values": ["1"]}),
     ],
 )
+@pytest.mark.thorough
 def test_a_malformed_request_is_answered(server, path, body):
     status, text = ask(server, "POST", path, body)
     assert status == 400

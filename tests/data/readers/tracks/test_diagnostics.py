@@ -237,6 +237,7 @@ def _diagnose(path, road, **how):
     return diagnose(read_tracks(path, **how), road, 0.95)
 
 
+@pytest.mark.thorough
 def test_a_right_table_raises_no_doubt(town, tmp_path):
     columns, road = town
     found = _diagnose(write_tracks(tmp_path / "t.csv", columns), road)
@@ -249,6 +250,7 @@ def test_a_right_table_raises_no_doubt(town, tmp_path):
 
 
 @pytest.mark.parametrize("name", SPOILT)
+@pytest.mark.thorough
 def test_what_is_wrong_is_named_and_its_remedy_repairs_it(name, town, tmp_path):
     change, what, remedy, overrides = SPOILT[name]
     columns, road = town
@@ -311,6 +313,7 @@ def test_three_times_the_speed_cannot_be_for_how_cars_would_turn_and_brake(
     assert "--hz" in found.remedy
 
 
+@pytest.mark.thorough
 def test_the_map_of_another_place_is_named(town, tmp_path):
     columns, _ = town
     other = export_town(tmp_path / "towns", "junction")[1]

@@ -259,6 +259,7 @@ def test_files_of_levelxdata_need_nothing_said(town, tmp_path):
     assert sorted(set(names.tolist())) == sorted(set(c["kind"].tolist()))
 
 
+@pytest.mark.thorough
 def test_a_recording_that_is_converted_again_takes_the_place_of_the_old_one(town, tmp_path):
     inspection = TracksReader(write_tracks(tmp_path / "t.csv", town[0]), town[1])
     before = convert_tracks(inspection, tmp_path / "s")
