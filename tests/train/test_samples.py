@@ -2,6 +2,7 @@
 
 import hashlib
 from dataclasses import astuple, replace
+from functools import partial
 from itertools import islice
 
 import numpy as np
@@ -10,12 +11,17 @@ import torch
 from stores import write_toy_store
 
 from shiftsim.data import open_store
+from shiftsim.data.synthetic.store import write_towns
 from shiftsim.errors import PlannerError
 from shiftsim.geometry.boxes import from_frame
+from shiftsim.planners.basic import LogFuture
 from shiftsim.planners.learned import features
-from shiftsim.planners.learned.plantf.planner import PlanTF
+from shiftsim.planners.learned.plantf.planner import Plans, PlanTF
+from shiftsim.runs.workers import map_unordered
+from shiftsim.sim.loop import simulate
 from shiftsim.sim.planner import scene_info
 from shiftsim.train import samples
+from shiftsim.train.imitation import motion
 from shiftsim.train.samples import Stream, load_blocks, make_sample, targets
 
 pytestmark = [pytest.mark.learned, pytest.mark.slow]
@@ -163,3 +169,36 @@ def test_an_iteration_without_8_s_after_it_is_no_sample(asked):
     scenario, planner = asked
     short = replace(scenario, iteration_rows=scenario.iteration_rows[-1:] + 2 * 79)
     assert "8 s" in make_sample(planner, short, 0, Draws(0.9))
+
+
+class LabelReplay(PlanTF):
+    """Plans what a network is to learn: the recorded future, by way of a target."""
+
+    def on(self, scenario):
+        self._scenario = scenario
+        return self
+
+    def decode(self, output, observation):
+        scenario, ego = self._scenario, observation.history.ego[-1:, :3]
+        row = scenario.iteration_rows[observation.iteration]
+        rows = row + scenario.row_step * np.arange(1, samples.STEPS + 1)
+        future = scenario.ego[np.minimum(rows, len(scenario.ego) - 1), :3]
+        label = motion(torch.from_numpy(targets(ego, future[None], ego[0])))
+        plans = Plans(label.numpy(), np.zeros(1, np.float32))
+        return super().decode(plans, observation)
+
+
+@pytest.mark.thorough
+def test_labels_that_are_driven_are_those_of_log_future(tmp_path):
+    store = write_towns(
+        tmp_path / "town", towns=2, seed=5, spread=partial(map_unordered, workers=1)
+    )
+    apart = []  # from what log-future drives, where the ego turns and 8 s after it are recorded
+    for scenario in map(store.read, store.tokens):
+        count = len(scenario.iteration_rows) - samples.STEPS
+        if np.ptp(np.unwrap(scenario.ego[scenario.iteration_rows[:count], 2])) > 0.4:
+            planner = LabelReplay.asking(lambda scenes: [None] * len(scenes)).on(scenario)
+            ours, theirs = (simulate(scenario, one) for one in (planner, LogFuture()))
+            apart.append(np.hypot(*(ours.ego - theirs.ego)[:count, :2].T).max())
+    assert len(apart) >= 2
+    assert max(apart) < 0.6  # m: a plan begins where the ego is, 0.1 s are up to 1 m
