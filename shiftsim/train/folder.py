@@ -76,12 +76,14 @@ PRESETS = {
     "laptop": Preset(90_000, 3, 32, 5e-4),
     "workstation": Preset(5_000_000, 10, 128, 1e-3),
 }
+COSTS = {"plantf": 1.0, "pluto": 1.6}  # of a sample; presets have as many as take the same time
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImitationSettings:
-    """What a training of PlanTF depends on, and where and how it is done."""
+    """What a training of PlanTF or PLUTO depends on, and where and how it is done."""
 
+    planner: str = "plantf"
     out: Path = field(metadata={"option": Option("Folder for networks and curves.")})
     store: str = setting("demo", "Store by name, path or URL.")
     split: str = setting("", "Split of the store; all its scenarios if empty.")
@@ -105,8 +107,9 @@ class ImitationSettings:
     @property
     def recipe(self) -> Preset:
         """The preset, with what is given in its place."""
-        given = {name: getattr(self, name) for name in ("rounds", "samples")}
-        return PRESETS[self.preset]._replace(**{n: v for n, v in given.items() if v})
+        preset = PRESETS[self.preset]
+        samples = self.samples or round(preset.samples / COSTS[self.planner])
+        return preset._replace(rounds=self.rounds or preset.rounds, samples=samples)
 
     @property
     def determining(self) -> dict[str, object]:
@@ -153,7 +156,7 @@ def prepare_folder(settings: Settings | ImitationSettings, store: str, *, resume
         make_folder(settings.out)
         write_text(place, json.dumps(now, indent=2) + "\n")
         return
-    before = json.loads(place.read_text("utf-8"))
+    before = {"planner": "plantf"} | json.loads(place.read_text("utf-8"))  # was the only one once
     for name in sorted(now):
         if before.get(name) != now[name]:
             raise ConfigError(
@@ -222,9 +225,10 @@ def write_table(path: Path, rows: list[dict[str, Any]]) -> None:
         pq.write_table(pa.Table.from_pylist(rows), partial)
 
 
-ERRORS = {  # by planner: what is drawn of its curve, and times what
+TERMS = {  # by planner: what its curve has beside the loss, of which three are drawn, times what
     "carl": {"acceleration_error": 1.0, "steering_error": 10.0},
     "plantf": {"reg_loss": 1.0, "prediction_loss": 1.0, "cls_loss": 1.0},
+    "pluto": {"reg_loss": 1.0, "prediction_loss": 1.0, "cls_loss": 1.0, "ref_free_reg_loss": 1.0},
 }
 
 
@@ -240,9 +244,7 @@ def draw_curves(
         return
     left, right = figure.subplots(1, 2)
     samples = [row["samples"] / 1e6 for row in curve]
-    for (name, factor), colour in zip(
-        ERRORS[planner].items(), ("0.15", "0.6", "0.8"), strict=False
-    ):
+    for (name, factor), colour in zip(TERMS[planner].items(), ("0.15", "0.6", "0.8"), strict=False):
         label = name.replace("_", " ") + (f" × {factor:g}" if factor != 1.0 else "")
         values = [factor * row[name] for row in curve]
         left.plot(samples, values, label=label, color=colour, linewidth=0.9)

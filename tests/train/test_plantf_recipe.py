@@ -8,8 +8,8 @@ import shiftsim
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.train import folder, recipe
 from shiftsim.train.folder import BEST, LATEST, ImitationSettings, Preset
-from shiftsim.train.imitation import PlanTfLearner
-from shiftsim.train.recipe import PlanTfTraining
+from shiftsim.train.imitation import ImitationLearner
+from shiftsim.train.recipe import ImitationTraining
 from shiftsim.train.samples import Stream, load_blocks
 
 pytestmark = [pytest.mark.learned, pytest.mark.thorough]
@@ -38,7 +38,7 @@ def small(road, tmp_path, monkeypatch):
 
 def train(settings, **options):
     lines = []
-    PlanTfTraining(settings, lines.append, **options).run()
+    ImitationTraining(settings, lines.append, **options).run()
     return lines
 
 
@@ -55,7 +55,7 @@ def test_a_training_that_was_ended_goes_on_as_if_it_had_not(small, monkeypatch):
     monkeypatch.setattr(recipe, "_WRITE_EVERY", 0.0)
     monkeypatch.setattr(recipe, "_CURVE_EVERY", 1)
     train(whole)
-    learn, steps = PlanTfLearner.learn, []
+    learn, steps = ImitationLearner.learn, []
 
     def stopping(learner, batch):
         steps.append(1)
@@ -63,7 +63,7 @@ def test_a_training_that_was_ended_goes_on_as_if_it_had_not(small, monkeypatch):
             raise KeyboardInterrupt
         return learn(learner, batch)
 
-    monkeypatch.setattr(PlanTfLearner, "learn", stopping)
+    monkeypatch.setattr(ImitationLearner, "learn", stopping)
     with pytest.raises(KeyboardInterrupt):
         train(ended)
     train(ended, resume=True)
@@ -93,7 +93,7 @@ def test_what_comes_out_drives_and_says_how_it_came(small, road, tmp_path):
 
 def test_the_loss_of_one_batch_falls(small, road):
     tokens = tuple(sorted(shiftsim.open_store(road).tokens))
-    learner = PlanTfLearner("cpu", Preset(0, 1, BATCH, 3e-3), total=200, seed=0)
+    learner = ImitationLearner("plantf", "cpu", Preset(0, 1, BATCH, 3e-3), total=200, seed=0)
     batch = next(load_blocks(Stream(str(road), tokens, seed=0, batch=BATCH), 0, 0)).batches[0]
     losses = [learner.learn(batch).loss for _ in range(100)]
     assert losses[-1] < 0.6 * losses[0]
