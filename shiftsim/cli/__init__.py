@@ -403,7 +403,8 @@ def _run(words: list[str], debug: bool) -> int:
         path = context.command_path if context is not None else "shiftsim"
         return _print_error(error.format_message(), f"{path} --help", USAGE)
     if code == INTERRUPTED:  # typer has taken the interrupt for itself
-        option = ["--resume"] if words[:2] in (["train", "carl"], ["train", "plantf"]) else []
+        can_resume = words[:1] == ["train"] and words[1:2] != ["traffic"]
+        option = ["--resume"] if can_resume else []
         hint = f"go on, or start again, with: {shlex.join(['shiftsim', *words, *option])}"
         return _print_error("interrupted", hint, INTERRUPTED)
     return code if isinstance(code, int) else 0

@@ -32,22 +32,39 @@ def carl(
     _say_best("carl", chosen.out)
 
 
+_LEARNT = [item for item in ImitationSettings.__dataclass_fields__ if item != "planner"]
+
+
 @app.command()
-@cli.with_settings(of=ImitationSettings)
+@cli.with_settings(*_LEARNT, of=ImitationSettings)
 def plantf(
     settings: cli.Settings,
     resume: bool = Option(False, "--resume", help="Go on where it was ended."),
     quiet: Quiet = False,
 ) -> None:
     """Train PlanTF from recordings."""
+    _imitate(ImitationSettings(**settings), resume, quiet)
+
+
+@app.command()
+@cli.with_settings(*_LEARNT, of=ImitationSettings)
+def pluto(
+    settings: cli.Settings,
+    resume: bool = Option(False, "--resume", help="Go on where it was ended."),
+    quiet: Quiet = False,
+) -> None:
+    """Train PLUTO from recordings."""
+    _imitate(ImitationSettings(planner="pluto", **settings), resume, quiet)
+
+
+def _imitate(chosen: ImitationSettings, resume: bool, quiet: bool) -> None:
     from shiftsim.planners.learned.checkpoint import require_torch
 
     require_torch("training")
-    from shiftsim.train.recipe import PlanTfTraining
+    from shiftsim.train.recipe import ImitationTraining
 
-    chosen = ImitationSettings(**settings)
-    PlanTfTraining(chosen, _on_message(quiet), resume=resume).run()
-    _say_best("plantf", chosen.out)
+    ImitationTraining(chosen, _on_message(quiet), resume=resume).run()
+    _say_best(chosen.planner, chosen.out)
 
 
 @app.command()

@@ -69,23 +69,27 @@ class Preset(NamedTuple):
     rounds: int
     batch: int
     rate: float  # highest learning rate
+    published: bool = False  # the authors' schedule, by rounds, and the weights without a mean
 
 
 PRESETS = {
     # two cores for 90 minutes; the rate is that of the authors for this batch, by the square root
-    "laptop": Preset(90_000, 3, 32, 5e-4),
+    "laptop": Preset(150_000, 3, 32, 5e-4),
     "workstation": Preset(5_000_000, 10, 128, 1e-3),
+    "paper": Preset(25_000_000, 25, 128, 1e-3, published=True),
 }
+COSTS = {"plantf": 1.0, "pluto": 1.6}  # of a sample; presets have as many as take the same time
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImitationSettings:
-    """What a training of PlanTF depends on, and where and how it is done."""
+    """What a training of PlanTF or PLUTO depends on, and where and how it is done."""
 
+    planner: str = "plantf"
     out: Path = field(metadata={"option": Option("Folder for networks and curves.")})
     store: str = setting("demo", "Store by name, path or URL.")
     split: str = setting("", "Split of the store; all its scenarios if empty.")
-    preset: str = setting("laptop", "laptop or workstation.", choices=tuple(PRESETS))
+    preset: str = setting("laptop", "laptop, workstation or paper.", choices=tuple(PRESETS))
     device: str = setting("cpu", "cpu, cuda, cuda:N or auto.")
     seed: int = setting(0, "Of everything that is random.")
     workers: int = setting(2, "Processes that make samples, and that drive.")
@@ -105,8 +109,10 @@ class ImitationSettings:
     @property
     def recipe(self) -> Preset:
         """The preset, with what is given in its place."""
-        given = {name: getattr(self, name) for name in ("rounds", "samples")}
-        return PRESETS[self.preset]._replace(**{n: v for n, v in given.items() if v})
+        preset = PRESETS[self.preset]
+        cost = 1.0 if preset.published else COSTS[self.planner]
+        samples = self.samples or round(preset.samples / cost)
+        return preset._replace(rounds=self.rounds or preset.rounds, samples=samples)
 
     @property
     def determining(self) -> dict[str, object]:
@@ -153,7 +159,7 @@ def prepare_folder(settings: Settings | ImitationSettings, store: str, *, resume
         make_folder(settings.out)
         write_text(place, json.dumps(now, indent=2) + "\n")
         return
-    before = json.loads(place.read_text("utf-8"))
+    before = {"planner": "plantf"} | json.loads(place.read_text("utf-8"))  # was the only one once
     for name in sorted(now):
         if before.get(name) != now[name]:
             raise ConfigError(
@@ -222,9 +228,10 @@ def write_table(path: Path, rows: list[dict[str, Any]]) -> None:
         pq.write_table(pa.Table.from_pylist(rows), partial)
 
 
-ERRORS = {  # by planner: what is drawn of its curve, and times what
+TERMS = {  # by planner: what its curve has beside the loss, of which three are drawn, times what
     "carl": {"acceleration_error": 1.0, "steering_error": 10.0},
     "plantf": {"reg_loss": 1.0, "prediction_loss": 1.0, "cls_loss": 1.0},
+    "pluto": {"reg_loss": 1.0, "prediction_loss": 1.0, "cls_loss": 1.0, "ref_free_reg_loss": 1.0},
 }
 
 
@@ -241,9 +248,7 @@ def draw_curves(
         return
     left, right, *more = figure.subplots(1, 3 if errors else 2)
     samples = [row["samples"] / 1e6 for row in curve]
-    for (name, factor), colour in zip(
-        ERRORS[planner].items(), ("0.15", "0.6", "0.8"), strict=False
-    ):
+    for (name, factor), colour in zip(TERMS[planner].items(), ("0.15", "0.6", "0.8"), strict=False):
         label = name.replace("_", " ") + (f" × {factor:g}" if factor != 1.0 else "")
         values = [factor * row[name] for row in curve]
         left.plot(samples, values, label=label, color=colour, linewidth=0.9)

@@ -14,12 +14,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from shiftsim.planners.learned.checkpoint import network_module
 from shiftsim.planners.learned.network import Attention
 from shiftsim.planners.learned.plantf.network import Outputs as PlanTfOutputs
-from shiftsim.planners.learned.plantf.network import PlanTfNetwork
 from shiftsim.planners.learned.pluto.network import NEVER
 from shiftsim.planners.learned.pluto.network import Outputs as PlutoOutputs
-from shiftsim.train.folder import Preset
+from shiftsim.train.folder import TERMS, Preset, Weights
 from shiftsim.train.learning import (
     BatchGradient,
     GradientPool,
@@ -42,9 +42,8 @@ CIRCLE_RADIUS = 0.5 * math.hypot(PACIFICA.width, _THIRD) - 0.2
 PIXEL, INSIDE = 0.2, 0.95  # m; share of the raster in which a point counts
 TEMPERATURE = 0.1  # of the contrastive loss
 CLIP = 5.0  # of the norm of all gradients
-WARM_UP, FLOOR = 0.05, 2e-3  # of PlanTF here: share of rising, end of the learning rate as a share
+WARM_UP, FLOOR = 0.05, 2e-3  # here: share of rising, end of the learning rate as a share
 LANES = 2  # parts of a batch that a CPU computes side by side
-TERMS = ("reg_loss", "cls_loss", "prediction_loss")  # of PlanTF's loss
 
 
 def _sum(**terms: Tensor) -> Losses:
@@ -228,21 +227,30 @@ def begin(network: nn.Module, seed: int) -> None:
             nn.init.normal_(module.weight, 0.0, 0.02, generator=random)
 
 
-class PlanTfLearner(TrainedNetwork):
-    """PlanTF's network, trained on samples of a store.
+def loss_of(planner: str, out: Any, batch: Batch) -> Losses:
+    """Of PlanTF, or of PLUTO without the road and without contrast."""
+    if planner == "pluto":
+        assert batch.projection is not None
+        return pluto_loss(out, batch.target, batch.valid, batch.projection)
+    return plantf_loss(out, batch.target, batch.valid)
+
+
+class ImitationLearner(TrainedNetwork):
+    """The network of PlanTF or PLUTO, trained on samples of a store.
 
     A CPU computes the parts of a batch side by side, each with statistics of its own, as the
     authors' processes do without synchronisation; those of the first part are kept.
     """
 
-    def __init__(self, device: str, preset: Preset, total: int, seed: int) -> None:
+    def __init__(self, planner: str, device: str, preset: Preset, total: int, seed: int) -> None:
         """`total` steps are to be done; the learning rate falls towards their end."""
         torch.manual_seed(seed)
-        network = PlanTfNetwork()
+        network = network_module(planner).build_network()
         begin(network, seed)
         network.to(device).train()
         super().__init__(network, parameter_groups(network), total, betas=(0.9, 0.999))
-        self.batch, self._rate, self._device, self._seed = preset.batch, preset.rate, device, seed
+        self.batch, self._preset, self._device, self._seed = preset.batch, preset, device, seed
+        self._planner, self._terms = planner, tuple(TERMS[planner])
         self.place = (0, 0)  # of the next batch: the block of the stream, and the batch in it
         count = LANES if device == "cpu" else 1
         self._pool = GradientPool(device, count)
@@ -259,22 +267,31 @@ class PlanTfLearner(TrainedNetwork):
         parts = batch.on(self._device).split(len(self._lanes))
         found = self._pool.sum(self._gradient, self._lanes, parts, range(len(parts)))
         count = len(parts)
-        rate = self._rate * schedule(self.step / self.total, WARM_UP, FLOOR)
+        if self._preset.published:
+            rounds = self._preset.rounds
+            rate = rate_of_epoch(self.step * rounds // self.total, rounds, rate=self._preset.rate)
+        else:
+            rate = self._preset.rate * schedule(self.step / self.total, WARM_UP, FLOOR)
         apply_gradient(self.optimiser, self._trained, found, count, clip=CLIP, rate=rate)
         self.count_step()
-        terms = dict(zip(TERMS, (found.numbers / count).tolist(), strict=True))
+        terms = dict(zip(self._terms, (found.numbers / count).tolist(), strict=True))
         return StepResult(found.loss / count, terms)
 
-    def _gradient(self, network: PlanTfNetwork, batch: Batch, number: int) -> BatchGradient:
+    def _gradient(self, network: Any, batch: Batch, number: int) -> BatchGradient:
         """Of one part of a batch."""
         key = np.random.SeedSequence([self._seed, 4, self.step, number])
-        drawn = network.agent_encoder.ego_state_emb.random
-        assert drawn is not None
-        drawn.manual_seed(int(key.generate_state(1, np.uint64)[0] >> np.uint64(1)))
-        losses = plantf_loss(network(batch.inputs), batch.target, batch.valid)
-        gradients = torch.autograd.grad(losses["loss"], self._trained)
-        numbers = torch.stack([losses[name].detach() for name in TERMS]).cpu()
+        drawn = int(key.generate_state(1, np.uint64)[0] >> np.uint64(1))
+        network.agent_encoder.ego_state_emb.random.manual_seed(drawn)
+        losses = loss_of(self._planner, network(batch.inputs), batch)
+        gradients = torch.autograd.grad(  # of PLUTO some layers serve the contrast only
+            losses["loss"], self._trained, allow_unused=True, materialize_grads=True
+        )
+        numbers = torch.stack([losses[name].detach() for name in self._terms]).cpu()
         return BatchGradient(list(gradients), float(losses["loss"].detach()), numbers)
+
+    def driving(self) -> Weights:
+        """The network that drives."""
+        return self.network.state_dict() if self._preset.published else super().driving()
 
     def state(self) -> dict[str, Any]:
         """All that is needed to go on."""

@@ -2,9 +2,9 @@
 
 CaRL's imitates PDM-Closed (DAgger). A round collects states, first those that PDM-Closed meets
 under noise, then those that the network meets, at once where it has weights to begin with;
-PDM-Closed labels all of them. It trains on the states of all rounds so far. PlanTF's learns from
-recordings: samples are made when they are needed, and nothing is collected. What was done is kept
-at least every two minutes.
+PDM-Closed labels all of them. It trains on the states of all rounds so far. PlanTF's and PLUTO's
+learn from recordings: samples are made when they are needed, and nothing is collected. What was
+done is kept at least every two minutes.
 """
 
 import shutil
@@ -48,7 +48,7 @@ from shiftsim.train.folder import (
     Settings,
     Weights,
 )
-from shiftsim.train.imitation import PlanTfLearner
+from shiftsim.train.imitation import ImitationLearner
 from shiftsim.train.samples import Stream, load_blocks
 from shiftsim.train.states import States, write_part
 
@@ -292,15 +292,15 @@ class Training(Recipe):
         return partial(run_jobs, self._settings, checkpoint, on_progress)
 
 
-class PlanTfTraining(Recipe):
-    """Of PlanTF's network."""
+class ImitationTraining(Recipe):
+    """Of PlanTF's network, or of PLUTO's."""
 
-    planner = "plantf"
-    learner: PlanTfLearner
+    learner: ImitationLearner
 
     def __init__(
         self, settings: ImitationSettings, on_message: OnMessage, *, resume: bool = False
     ) -> None:
+        self.planner = settings.planner
         self._left_out = Counter[str]()  # samples that could not be made, by reason
         super().__init__(settings, settings.recipe.rounds, on_message, resume=resume)
 
@@ -308,7 +308,7 @@ class PlanTfTraining(Recipe):
         preset: Preset = self._settings.recipe
         steps = max(1, preset.samples // preset.rounds // preset.batch)
         total, seed = steps * preset.rounds, self._settings.seed
-        self.learner = PlanTfLearner(self.device, preset, total, seed)
+        self.learner = ImitationLearner(self.planner, self.device, preset, total, seed)
         return steps
 
     def _collect(self) -> None:
@@ -317,7 +317,8 @@ class PlanTfTraining(Recipe):
     def _results(self) -> Iterator[learning.StepResult]:
         settings, learner = self._settings, self.learner
         tokens = tuple(sorted(token for town in self.towns.trained.values() for token in town))
-        stream = Stream(settings.store, tokens, settings.seed, settings.recipe.batch)
+        batch = settings.recipe.batch
+        stream = Stream(settings.store, tokens, settings.seed, batch, self.planner)
         self._on_message(f"{self._where} training on {len(tokens)} scenarios")
         block, done = learner.place
         unused = 0

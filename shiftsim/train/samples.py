@@ -1,8 +1,9 @@
-"""Samples of a store for PlanTF, made when they are needed: nothing is cached.
+"""Samples of a store for PlanTF and PLUTO, made when they are needed: nothing is cached.
 
 A sample is one iteration of a recording as the planner would see it, through the planner's own
 features, and what ego and agents did in the 8 s after it. Half of the samples are perturbed: the
-ego is moved away from where it was, and its target leads back to the recording.
+ego is moved away from where it was, and its target leads back to the recording. What differs from
+planner to planner is in `KINDS`.
 
 Which samples there are and what is random in them depends on a seed and on places in the stream
 only. A stream is cut into blocks of some scenarios; a worker makes whole blocks, which come in
@@ -17,19 +18,23 @@ from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
+import shapely
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from shiftsim.data import open_store
 from shiftsim.errors import ShiftsimError
-from shiftsim.geometry.boxes import boxes_to_corners, boxes_touch, wrap_angles
-from shiftsim.kernels import FloatArray, IntArray
+from shiftsim.geometry.boxes import boxes_to_corners, boxes_touch, turned, wrap_angles
+from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.planners.learned import features
+from shiftsim.planners.learned.base import LearnedPlanner
 from shiftsim.planners.learned.plantf import planner as plantf
-from shiftsim.planners.learned.plantf.network import Inputs
-from shiftsim.sim.planner import History, observe_log, scene_info
+from shiftsim.planners.learned.pluto import planner as pluto
+from shiftsim.planners.learned.pluto.world import red_lights
+from shiftsim.sim.planner import History, Observation, observe_log, scene_info
+from shiftsim.world.layers import contains
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import PACIFICA, center_poses
+from shiftsim.world.state import HEADING, PACIFICA, VX, VY, center_poses
 
 STEPS = features.PLAN_POSES  # of a target
 BATCH, PER_BLOCK = 32, 16  # samples; scenarios
@@ -44,22 +49,25 @@ NEIGHBOURS = 10  # agents that the ego must not be moved into
 
 _SHORT = "less than 8 s recorded after it"
 _NO_ROAD = "no lane or crosswalk around it"
+_NO_LINE = "no reference line"
 
 
 class Sample(NamedTuple):
     """One sample. A rows of agents, the ego first."""
 
-    features: plantf.Features
-    target: np.ndarray  # (A, 80, 3) float32, of `targets`
-    valid: np.ndarray  # (A, 80) whether a row was recorded then
+    features: Any  # of the planner
+    target: np.ndarray  # (A, 80, 3) of `targets`; of PLUTO (A, 80, 6) of `motion_targets`
+    valid: BoolArray  # (A, 80) steps that count
+    projection: np.ndarray | None = None  # (R, 8, 2) of `projections`, of PLUTO only
 
 
 class Batch(NamedTuple):
     """Some samples; padding is valid nowhere."""
 
-    inputs: Inputs
-    target: Tensor  # (B, A, 80, 3)
+    inputs: Any  # of the planner's network
+    target: Tensor  # (B, A, 80, 3 or 6)
     valid: Tensor  # (B, A, 80)
+    projection: Tensor | None = None  # (B, R, 8, 2)
 
     def on(self, device: str) -> "Batch":
         """The same on a device."""
@@ -77,7 +85,8 @@ class Batch(NamedTuple):
         counts = parts.pop("counts")
         moved = {name: change(value) for name, value in parts.items()}
         moved["counts"] = [change(by_scene) for by_scene in counts]
-        return Batch(Inputs(**moved), change(self.target), change(self.valid))
+        labels = (None if value is None else change(value) for value in self[1:])
+        return Batch(type(self.inputs)(**moved), *labels)
 
 
 class Block(NamedTuple):
@@ -117,51 +126,163 @@ def targets(present: FloatArray, future: FloatArray, frame: FloatArray) -> np.nd
     return changes
 
 
-def make_sample(
-    planner: plantf.PlanTF, scenario: Scenario, iteration: int, random: np.random.Generator
-) -> Sample | str:
-    """The sample of an iteration, or why there is none; `planner` was reset to the scenario."""
-    row = int(scenario.iteration_rows[iteration])
-    rows = row + scenario.row_step * np.arange(1, STEPS + 1)
-    if rows[-1] >= len(scenario.time_us):
-        return _SHORT
-    observation = observe_log(scenario, iteration)
-    state = None
-    if random.random() < PERTURBED:
-        noise = random.uniform(-NOISE, NOISE)
-        state = _perturb(observation.history, noise)
-    if state is not None:
-        ego = observation.history.ego.copy()
-        ego[-1, :3] = features.map_poses(state[:3], ego[-1])
-        observation = observe_log(scenario, iteration, ego=ego)
-    read = planner.features(observation)
+def motion_targets(
+    present: FloatArray, future: FloatArray, velocities: FloatArray, frame: FloatArray
+) -> np.ndarray:
+    """(A, 80, 6) float32 of PLUTO: change of x, y [m], its turn's cosine and sine, velocity [m/s].
+
+    As `targets`, with velocities (A, 80, 2) in the frame of the map, which are only turned.
+    """
+    changes = targets(present, future, frame)
+    angle, velocity = changes[..., 2:], turned(velocities, frame[2])
+    parts = [changes[..., :2], np.cos(angle), np.sin(angle), velocity]
+    motion: np.ndarray = np.concatenate(parts, axis=-1, dtype=np.float32)
+    motion[np.isnan(future[..., 0])] = 0.0
+    return motion
+
+
+def projections(lines: Sequence[FloatArray], ego: FloatArray) -> np.ndarray:
+    """(R, 8, 2) float32 arc length and distance [m] of the ego on each line, after 1 to 8 s.
+
+    Args:
+        lines: R reference lines (K, 3).
+        ego: (80, 3) poses of the rear axle in the 8 s.
+    """
+    points = shapely.points(ego[9::10, :2])
+    curves = np.array([shapely.linestrings(line[:, :2]) for line in lines])[:, None]
+    both = [shapely.line_locate_point(curves, points), shapely.distance(curves, points)]
+    return np.stack(both, axis=-1).astype(np.float32)
+
+
+class Future(NamedTuple):
+    """What was recorded in the 8 s after a sample. A rows of agents, the ego first."""
+
+    present: FloatArray  # (A, 3) poses now
+    poses: FloatArray  # (A, 80, 3)
+    velocities: FloatArray  # (A, 80, 2) in the frame of the map [m/s]
+    valid: BoolArray  # (A, 80) whether there was a row
+
+
+class Moment(NamedTuple):
+    """The present of a sample."""
+
+    scenario: Scenario
+    row: int  # of the recording
+    observation: Observation
+
+    def future(self, near: IntArray) -> Future:
+        """Of the ego from where it is now, and of some tracks."""
+        scenario, tracks = self.scenario, self.scenario.tracks
+        rows = self.row + scenario.row_step * np.arange(1, STEPS + 1)
+        ego, agents = scenario.ego[rows], (rows[:, None], near)
+        own = turned(ego[:, VX : VY + 1], -ego[:, HEADING])
+        return Future(
+            np.vstack([self.observation.history.ego[-1:, :3], tracks.poses[self.row, near]]),
+            np.concatenate([ego[None, :, :3], tracks.poses[agents].swapaxes(0, 1)]),
+            np.concatenate([own[None], tracks.velocities[agents].swapaxes(0, 1)]),
+            np.vstack([np.ones((1, STEPS), np.bool_), tracks.valid[agents].T]),
+        )
+
+
+def _plantf_sample(planner: plantf.PlanTF, read: plantf.Features, now: Moment) -> Sample | str:
     if not len(read.road.objects):
         return _NO_ROAD
-    if state is not None:  # the steering angle that follows from a jump would be wrong
-        read.current_state[3:] = state[3:]
-    ego, tracks, near = observation.history.ego[-1, :3], scenario.tracks, read.agents.tracks
-    future, valid = np.empty((len(near) + 1, STEPS, 3)), np.ones((len(near) + 1, STEPS), np.bool_)
-    future[0], valid[1:] = scenario.ego[rows, :3], tracks.valid[rows[:, None], near].T
-    future[1:] = tracks.poses[rows, near[:, None]]
-    present = np.concatenate([ego[None], tracks.poses[row, near]])
-    return Sample(read, targets(present, future, ego), valid)
+    future = now.future(read.agents.tracks)
+    return Sample(read, targets(future.present, future.poses, future.present[0]), future.valid)
 
 
-def _perturb(history: History, noise: FloatArray) -> FloatArray | None:
-    """(7,) the present state moved by noise (7,), in its own frame; None where that is no place."""
-    state = perturbed_state(plantf.current_state(history).astype(np.float64), noise)
+def _pluto_sample(planner: pluto.Pluto, read: pluto.SceneInputs, now: Moment) -> Sample | str:
+    if not read.line_valid.any():
+        return _NO_LINE
+    seen = planner.surroundings
+    future = now.future(seen.agents.tracks)
+    future.valid[0, steps_before_red(planner, now, future.poses[0]) :] = False
+    target = motion_targets(*future[:3], future.present[0])
+    return Sample(read, target, future.valid, projections(seen.lines, future.poses[0]))
+
+
+def steps_before_red(planner: pluto.Pluto, now: Moment, ego: FloatArray) -> int:
+    """Steps of the ego (80, 3) before its centre is on a connector of the route that is red now."""
+    road = now.scenario.map
+    assert planner.route is not None
+    red = red_lights(road, planner.route, now.observation).tolist()
+    for step, (x, y, _) in enumerate(center_poses(ego) if red else ()):
+        if any(contains(road.edges.polygons, connector, x, y) for connector in red):
+            return step
+    return STEPS
+
+
+class Kind(NamedTuple):
+    """What of samples is a planner's own."""
+
+    planner: type[LearnedPlanner[Any, Any]]
+    tries: int  # of finding a free place for the moved ego
+    label: Callable[[Any, Any, Moment], Sample | str]  # of a planner and its features
+    make_inputs: Callable[..., Any]  # of its network, from features
+
+
+KINDS = {
+    "plantf": Kind(plantf.PlanTF, 1, _plantf_sample, plantf.make_batch),
+    "pluto": Kind(pluto.Pluto, 5, _pluto_sample, pluto.make_batch),
+}
+
+
+def make_sample(
+    planner: LearnedPlanner[Any, Any],
+    scenario: Scenario,
+    iteration: int,
+    random: np.random.Generator,
+) -> Sample | str:
+    """The sample of an iteration, or why there is none; `planner` was reset to the scenario."""
+    row, kind = int(scenario.iteration_rows[iteration]), KINDS[planner.name]
+    if row + STEPS * scenario.row_step >= len(scenario.time_us):
+        return _SHORT
+    observation = observe_log(scenario, iteration)
+    # recordings know no steering angle and no yaw rate: they are derived, and not from a jump
+    state = plantf.current_state(observation.history).astype(np.float64)
+    if random.random() < PERTURBED:
+        noise = random.uniform(-NOISE, NOISE)
+        moved = _perturb(observation.history, state, noise, kind.tries)
+        if moved is not None:
+            ego, state = observation.history.ego.copy(), moved
+            ego[-1, :3] = features.map_poses(state[:3], ego[-1])
+            observation = observe_log(scenario, iteration, ego=ego)
+    read = planner.features(observation)
+    read.current_state[3:] = state[3:]
+    return kind.label(planner, read, Moment(scenario, row, observation))
+
+
+def _perturb(
+    history: History, state: FloatArray, noise: FloatArray, tries: int
+) -> FloatArray | None:
+    """(7,) the state moved by noise (7,), in its own frame; None where that is no place."""
     ego, tracks = history.ego[-1], history.tracks
     near = features.nearest_agents(tracks, center_poses(ego[:3]), NEIGHBOURS)
-    pose = features.map_poses(state[:3], ego)
-    return state if is_free(pose, tracks.poses[-1, near], tracks.sizes[-1, near]) else None
-
-
-def make_batch(samples: Sequence[Sample]) -> Batch:
-    """A batch of samples."""
-    inputs = plantf.make_batch([one.features for one in samples], "cpu")
-    return Batch(
-        inputs, *features.stack_scenes([(one.target, one.valid) for one in samples], "cpu")
+    boxes = tracks.poses[-1, near], tracks.sizes[-1, near]
+    return free_state(
+        state, noise, lambda pose: is_free(features.map_poses(pose, ego), *boxes), tries
     )
+
+
+def free_state(
+    state: FloatArray, noise: FloatArray, free: Callable[[FloatArray], bool], tries: int
+) -> FloatArray | None:
+    """(7,) state moved by noise (7,) to a free pose (3,), by half of it at each further try.
+
+    Of several tries the last one counts anyway, as PLUTO's does; None where a single one fails.
+    """
+    for number in range(tries):
+        moved = perturbed_state(state, noise * 0.5**number)
+        if free(moved[:3]):
+            return moved
+    return moved if tries > 1 else None
+
+
+def make_batch(samples: Sequence[Sample], kind: Kind) -> Batch:
+    """A batch of samples."""
+    inputs = kind.make_inputs([one.features for one in samples], "cpu")
+    labels = [[value for value in one[1:] if value is not None] for one in samples]
+    return Batch(inputs, *features.stack_scenes(labels, "cpu"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,6 +293,7 @@ class Stream:
     tokens: tuple[str, ...]  # scenarios, sorted
     seed: int
     batch: int = BATCH
+    planner: str = "plantf"  # one of `KINDS`
 
     @property
     def blocks(self) -> int:
@@ -190,7 +312,8 @@ class BlockMaker:
 
     def __init__(self, stream: Stream) -> None:
         self._stream, self._store = stream, open_store(stream.store)
-        self._planner = plantf.PlanTF.asking(lambda scenes: ())
+        self._kind = KINDS[stream.planner]
+        self._planner = self._kind.planner.asking(lambda scenes: ())
 
     def __call__(self, block: int) -> Block:
         """The samples of a block, in batches, the last of which may be short."""
@@ -202,7 +325,7 @@ class BlockMaker:
         order = np.random.default_rng([self._stream.seed, 3, block]).permutation(len(made))
         size = self._stream.batch
         batches = [
-            make_batch([made[i] for i in order[first : first + size]])
+            make_batch([made[i] for i in order[first : first + size]], self._kind)
             for first in range(0, len(order), size)
         ]
         return Block(batches, dict(failed))

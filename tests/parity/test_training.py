@@ -290,6 +290,27 @@ def test_plantf_augmentation(case: str) -> None:
         np.testing.assert_allclose(found, theirs[both], atol=2e-6, err_msg=name)
 
 
+@pytest.mark.parametrize("case", ["free_costmap", "collision_half", "collision_all_five"])
+def test_pluto_augmentation(case: str) -> None:
+    stored = below(load("pluto/positive"), f"{case}/")
+    given, made = below(stored, "in/"), below(stored, "out/")
+    poses = np.dstack([given["agent.position"], given["agent.heading"]])
+    boxes = poses[1:11, 20], given["agent.shape"][1:11, 20, ::-1]
+    noise, tries = stored["noise"].astype(np.float64), samples.KINDS["pluto"].tries
+    free = lambda pose: samples.is_free(pose, *boxes)  # noqa: E731
+    state = samples.free_state(given["current_state"], noise, free, tries)
+    assert state is not None
+    np.testing.assert_allclose(state, given["current_state"] + stored["scale"] * noise, atol=1e-9)
+    np.testing.assert_allclose(state[3:], made["current_state"][3:], atol=1e-9)
+    present = np.vstack([state[None, :3], poses[1:, 20]])
+    velocities = given["agent.velocity"][:, 21:]
+    ours = samples.motion_targets(present, poses[:, 21:], velocities, state[:3])
+    target = tensor(made["agent.target"])
+    theirs = np.dstack([imitation.motion(target), made["agent.velocity"][:, 21:]])
+    there = given["agent.valid_mask"][:, 21:]
+    np.testing.assert_allclose(ours[there], theirs[there], atol=2e-6)
+
+
 def test_boxes_of_the_augmentation() -> None:
     stored = below(load("plantf/augmentation"), "boxes/")
     for ego, position, heading, shape, safe in zip(

@@ -1,4 +1,4 @@
-"""Samples of PlanTF: right by hand, and the same whoever makes them."""
+"""Samples of PlanTF and PLUTO: right by hand, and the same whoever makes them."""
 
 import hashlib
 from dataclasses import astuple, replace
@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from stores import write_toy_store
+from worlds import cruise_scenario
 
 from shiftsim.data import open_store
 from shiftsim.data.synthetic.store import write_towns
@@ -17,12 +18,22 @@ from shiftsim.geometry.boxes import from_frame
 from shiftsim.planners.basic import LogFuture
 from shiftsim.planners.learned import features
 from shiftsim.planners.learned.plantf.planner import Plans, PlanTF
+from shiftsim.planners.learned.pluto.planner import Pluto
 from shiftsim.runs.workers import map_unordered
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.planner import scene_info
 from shiftsim.train import samples
 from shiftsim.train.imitation import motion
-from shiftsim.train.samples import Stream, load_blocks, make_sample, targets
+from shiftsim.train.samples import (
+    Stream,
+    free_state,
+    load_blocks,
+    make_sample,
+    motion_targets,
+    projections,
+    targets,
+)
+from shiftsim.world.state import PACIFICA, LightStatus, TrafficLights
 
 pytestmark = [pytest.mark.learned, pytest.mark.slow]
 
@@ -61,8 +72,8 @@ class Draws:
 
 
 def arrays_of(batch):
-    inputs = [value for value in astuple(replace(batch.inputs, counts=None)) if value is not None]
-    return [*inputs, batch.target, batch.valid]
+    both = [*astuple(replace(batch.inputs, counts=None)), *batch[1:]]
+    return [value for value in both if value is not None]
 
 
 def digest(stream, workers, count=50):
@@ -122,10 +133,12 @@ def test_the_ego_is_not_moved_into_another(asked):
 
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")
 @pytest.mark.thorough
-def test_batches_are_the_same_for_any_number_of_workers(stream):
+@pytest.mark.parametrize(("planner", "workers"), [("plantf", (1, 2, 3, 4)), ("pluto", (2,))])
+def test_batches_are_the_same_for_any_number_of_workers(stream, planner, workers):
+    stream = replace(stream, planner=planner)
     alone = digest(stream, 0)
-    for workers in range(1, 5):
-        assert digest(stream, workers) == alone
+    for number in workers:
+        assert digest(stream, number) == alone
     assert digest(replace(stream, seed=4), 0) != alone
 
 
@@ -169,6 +182,96 @@ def test_an_iteration_without_8_s_after_it_is_no_sample(asked):
     scenario, planner = asked
     short = replace(scenario, iteration_rows=scenario.iteration_rows[-1:] + 2 * 79)
     assert "8 s" in make_sample(planner, short, 0, Draws(0.9))
+
+
+def pluto_sample(scenario, iteration=10, draws=None):
+    planner = Pluto.asking(lambda scenes: ())
+    planner.reset(scene_info(scenario))
+    return make_sample(planner, scenario, iteration, draws or Draws(0.9))
+
+
+def test_the_target_of_pluto_on_a_straight_road_is_its_speed(asked):
+    one = pluto_sample(asked[0])
+    np.testing.assert_allclose(one.target[0, :, 0], 0.6 * np.arange(1, 81), atol=1e-5)
+    np.testing.assert_allclose(one.target[0, :, 1:], [[0, 1, 0, 6, 0]] * 80, atol=1e-6)
+    np.testing.assert_array_equal(one.target[1:], [[[0, 0, 1, 0, 0, 0]] * 80])  # it is parked
+    assert one.target.dtype == one.projection.dtype == np.float32
+    assert one.valid.all()
+
+
+def test_a_turning_agent_turns_its_velocity_and_heading_in_the_frame_of_the_ego():
+    # on a circle of 20 m around (10, 20), at 8 m/s, from (10, 0); the ego looks along +y
+    angle = 0.04 * np.arange(81)
+    x, y = 10.0 + 20.0 * np.sin(angle), 20.0 - 20.0 * np.cos(angle)
+    poses = np.stack([x, y, angle], axis=-1)[None]
+    velocities = 8.0 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)[None, 1:]
+    poses[0, 80], velocities[0, 79] = np.nan, np.nan
+    made = motion_targets(poses[:, 0], poses[:, 1:], velocities, np.array([3.0, -2.0, np.pi / 2]))
+    turn = angle[1:80]
+    forward, left = 20.0 * (1.0 - np.cos(turn)), -20.0 * np.sin(turn)
+    known = [forward, left, np.cos(turn), np.sin(turn), 8.0 * np.sin(turn), -8.0 * np.cos(turn)]
+    np.testing.assert_allclose(made[0, :79], np.stack(known, axis=-1), atol=2e-6)
+    np.testing.assert_array_equal(made[0, 79], 0.0)
+
+
+def test_projections_are_arc_length_and_distance_on_every_line():
+    along = np.linspace(0.0, 120.0, 481)
+    straight = np.stack([along, 0.0 * along, 0.0 * along], axis=-1)
+    turn = along / 60.0
+    curve = np.stack([60.0 * np.sin(turn), 60.0 - 60.0 * np.cos(turn), turn], axis=-1)
+    times = 0.1 * np.arange(1, 81)
+    ego = np.stack([5.0 * times, 0.0 * times + 1.5, 0.0 * times], axis=-1)
+    inside = np.stack([58.0 * np.sin(times / 10), 60.0 - 58.0 * np.cos(times / 10)], axis=-1)
+    seconds = np.arange(1, 9)
+    made = projections([straight, curve], ego)
+    np.testing.assert_allclose(made[0], np.stack([5.0 * seconds, [1.5] * 8], axis=-1), rtol=1e-6)
+    made = projections([curve], inside)
+    # beside a vertex the foot is on a chord, which is turned by up to 0.0021 rad, 2 m away
+    np.testing.assert_allclose(made[0, :, 0], 6.0 * seconds, atol=5e-3)
+    np.testing.assert_allclose(made[0, :, 1], 2.0, atol=1e-3)
+
+
+def test_lines_begin_where_the_ego_was_moved_to(asked):
+    plain = pluto_sample(asked[0])
+    moved = pluto_sample(asked[0], draws=Draws(0.1, [0.5, 0.25, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    assert len(plain.projection) == len(plain.features.line_valid)
+    nearest = plain.projection[:, 0, 1].argmin()
+    known = np.stack([6.0 * np.arange(1, 9), [0.0] * 8], axis=-1)
+    np.testing.assert_allclose(plain.projection[nearest], known, atol=1e-5)
+    np.testing.assert_allclose(moved.projection[nearest], known - [0.5, 0.0], atol=1e-5)
+
+
+def test_steering_and_yaw_rate_are_derived_as_recordings_have_none():
+    scenario = cruise_scenario()
+    turning = scenario.ego.copy()
+    turning[:, 2] = 0.01 * np.arange(len(turning))  # 0.2 rad/s
+    read = pluto_sample(replace(scenario, ego=turning)).features
+    steering = np.arctan(0.2 * PACIFICA.wheel_base / 8.0)
+    np.testing.assert_allclose(read.current_state[3:], [8.0, 0.0, steering, 0.2], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("connector", "status", "steps"),
+    [("21", LightStatus.RED, 48), ("21", LightStatus.GREEN, 80), ("20", LightStatus.RED, 80)],
+)
+def test_what_the_ego_did_beyond_a_red_light_does_not_count(connector, status, steps):
+    # its centre, at 151.461 m and 10 m/s, comes to the connector at 200 m in the 49th step
+    scenario = cruise_scenario(speed=10.0, start=(150.0, 0.0, 0.0))
+    rows = np.full((len(scenario.time_us), 1), status, np.int8)
+    one = pluto_sample(replace(scenario, traffic_lights=TrafficLights((connector,), rows)), 0)
+    assert one.valid[0].tolist() == [True] * steps + [False] * (80 - steps)
+
+
+def test_a_sample_without_a_reference_line_is_none():
+    assert "no reference line" in pluto_sample(cruise_scenario(start=(10.0, 30.0, 0.0)))
+
+
+def test_of_pluto_the_noise_is_halved_until_the_place_is_free():
+    state, noise = np.zeros(7), np.full(7, 0.8)
+    found = free_state(state, noise, lambda pose: pose[0] < 0.3, 5)
+    np.testing.assert_array_equal(found, [0.2] * 7)
+    np.testing.assert_array_equal(free_state(state, noise, lambda pose: False, 5), [0.05] * 7)
+    assert free_state(state, noise, lambda pose: False, 1) is None
 
 
 class LabelReplay(PlanTF):

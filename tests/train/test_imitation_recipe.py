@@ -1,19 +1,21 @@
-"""PlanTF learns from a store: the same again, after an interruption as well, and drivable."""
+"""PlanTF and PLUTO learn from a store: the same again, also when interrupted, and drivable."""
 
 import pyarrow.parquet as pq
 import pytest
+import torch
 from stores import write_toy_store
 
 import shiftsim
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.train import folder, recipe
 from shiftsim.train.folder import BEST, LATEST, ImitationSettings, Preset
-from shiftsim.train.imitation import PlanTfLearner
-from shiftsim.train.recipe import PlanTfTraining
+from shiftsim.train.imitation import ImitationLearner
+from shiftsim.train.recipe import ImitationTraining
 from shiftsim.train.samples import Stream, load_blocks
 
 pytestmark = [pytest.mark.learned, pytest.mark.thorough]
 STEPS, BATCH = 6, 8
+both = pytest.mark.parametrize("planner", ["plantf", "pluto"])
 
 
 @pytest.fixture(scope="module")
@@ -27,6 +29,7 @@ def small(road, tmp_path, monkeypatch):
     """Makes the settings of a training that takes seconds."""
     preset = Preset(samples=STEPS * BATCH, rounds=2, batch=BATCH, rate=5e-4)
     monkeypatch.setitem(folder.PRESETS, "laptop", preset)
+    monkeypatch.setitem(folder.COSTS, "pluto", 1.0)
 
     def make(name, **changes):
         return ImitationSettings(
@@ -38,24 +41,29 @@ def small(road, tmp_path, monkeypatch):
 
 def train(settings, **options):
     lines = []
-    PlanTfTraining(settings, lines.append, **options).run()
+    ImitationTraining(settings, lines.append, **options).run()
     return lines
 
 
-def test_the_same_seed_gives_the_same_network_for_any_number_of_workers(small):
-    one, two, other = small("one"), small("two", workers=2), small("other", seed=1)
+@both
+def test_the_same_seed_gives_the_same_network_for_any_number_of_workers(small, planner):
+    one, two, other = (
+        small(name, planner=planner, **changes)
+        for name, changes in (("one", {}), ("two", {"workers": 2}), ("other", {"seed": 1}))
+    )
     for settings in (one, two, other):
         train(settings)
     networks = [(settings.out / LATEST).read_bytes() for settings in (one, two, other)]
     assert networks[0] == networks[1] != networks[2]
 
 
-def test_a_training_that_was_ended_goes_on_as_if_it_had_not(small, monkeypatch):
-    whole, ended = small("whole"), small("ended")
+@both
+def test_a_training_that_was_ended_goes_on_as_if_it_had_not(small, monkeypatch, planner):
+    whole, ended = small("whole", planner=planner), small("ended", planner=planner)
     monkeypatch.setattr(recipe, "_WRITE_EVERY", 0.0)
     monkeypatch.setattr(recipe, "_CURVE_EVERY", 1)
     train(whole)
-    learn, steps = PlanTfLearner.learn, []
+    learn, steps = ImitationLearner.learn, []
 
     def stopping(learner, batch):
         steps.append(1)
@@ -63,7 +71,7 @@ def test_a_training_that_was_ended_goes_on_as_if_it_had_not(small, monkeypatch):
             raise KeyboardInterrupt
         return learn(learner, batch)
 
-    monkeypatch.setattr(PlanTfLearner, "learn", stopping)
+    monkeypatch.setattr(ImitationLearner, "learn", stopping)
     with pytest.raises(KeyboardInterrupt):
         train(ended)
     train(ended, resume=True)
@@ -71,8 +79,9 @@ def test_a_training_that_was_ended_goes_on_as_if_it_had_not(small, monkeypatch):
     assert (ended.out / LATEST).read_bytes() == (whole.out / LATEST).read_bytes()
 
 
-def test_what_comes_out_drives_and_says_how_it_came(small, road, tmp_path):
-    settings = small("out")
+@both
+def test_what_comes_out_drives_and_says_how_it_came(small, road, tmp_path, planner):
+    settings = small("out", planner=planner)
     lines = train(settings)
     assert not [line for line in lines if "nan" in line]
     for name in ("curves.png", "curve.parquet", "settings.json", "runs/round-01/scores.parquet"):
@@ -83,8 +92,8 @@ def test_what_comes_out_drives_and_says_how_it_came(small, road, tmp_path):
     for row in rows:  # what is planned along the recording, beside what is driven
         assert row["ADE of plantf [m]"] > row["ADE of constant-velocity [m]"] >= 0.0
     done = shiftsim.run(
-        "plantf",
-        checkpoints=[f"plantf={settings.out / BEST}"],
+        planner,
+        checkpoints=[f"{planner}={settings.out / BEST}"],
         store=str(road),
         limit=1,
         workers=1,
@@ -93,12 +102,29 @@ def test_what_comes_out_drives_and_says_how_it_came(small, road, tmp_path):
     assert done.is_complete
 
 
-def test_the_loss_of_one_batch_falls(small, road):
+@both
+def test_the_loss_of_one_batch_falls(road, planner):
     tokens = tuple(sorted(shiftsim.open_store(road).tokens))
-    learner = PlanTfLearner("cpu", Preset(0, 1, BATCH, 3e-3), total=200, seed=0)
-    batch = next(load_blocks(Stream(str(road), tokens, seed=0, batch=BATCH), 0, 0)).batches[0]
+    learner = ImitationLearner(planner, "cpu", Preset(0, 1, BATCH, 3e-3), total=200, seed=0)
+    stream = Stream(str(road), tokens, seed=0, batch=BATCH, planner=planner)
+    batch = next(load_blocks(stream, 0, 0)).batches[0]
     losses = [learner.learn(batch).loss for _ in range(100)]
     assert losses[-1] < 0.6 * losses[0]
+
+
+def test_the_published_schedule_goes_by_rounds_and_drives_with_the_last_weights(road):
+    tokens = tuple(sorted(shiftsim.open_store(road).tokens))
+    preset = Preset(0, 5, BATCH, 1e-3, published=True)
+    learner = ImitationLearner("plantf", "cpu", preset, total=10, seed=0)
+    batch = next(load_blocks(Stream(str(road), tokens, seed=0, batch=BATCH), 0, 0)).batches[0]
+    rates = []
+    for _ in range(10):
+        learner.learn(batch)
+        rates.append(learner.optimiser.param_groups[0]["lr"])
+    expected = [1e-3 / 3, 2e-3 / 3, 1e-3, 1e-3, 1e-6 + 0.5 * (1e-3 - 1e-6)]
+    assert rates == pytest.approx([rate for rate in expected for _ in range(2)])
+    state = learner.network.state_dict()
+    assert all(torch.equal(state[name], value) for name, value in learner.driving().items())
 
 
 def test_too_few_scenarios_are_refused(small, tmp_path):
@@ -114,3 +140,15 @@ def test_too_few_scenarios_are_refused(small, tmp_path):
 def test_settings_that_make_no_training_are_refused(small, changes):
     with pytest.raises(ConfigError):
         small("wrong", **changes)
+
+
+def test_the_folder_of_another_planner_is_refused(small):
+    folder.prepare_folder(small("out"), "a store", resume=False)
+    with pytest.raises(ConfigError, match="planner 'plantf', not 'pluto'"):
+        folder.prepare_folder(small("out", planner="pluto"), "a store", resume=True)
+
+
+def test_a_sample_of_pluto_costs_more(monkeypatch):
+    plantf, pluto = (ImitationSettings(out="out", planner=name) for name in ("plantf", "pluto"))
+    assert pluto.recipe.samples == round(plantf.recipe.samples / 1.6)
+    assert pluto.recipe[1:] == plantf.recipe[1:]
