@@ -183,16 +183,20 @@ class Moment(NamedTuple):
 
     def future(self, near: IntArray) -> Future:
         """Of the ego from where it is now, and of some tracks."""
-        scenario, tracks = self.scenario, self.scenario.tracks
-        rows = self.row + scenario.row_step * np.arange(1, STEPS + 1)
-        ego, agents = scenario.ego[rows], (rows[:, None], near)
+        scenario, tracks, step = self.scenario, self.scenario.tracks, self.scenario.row_step
+        rows = slice(self.row + step, self.row + step * STEPS + 1, step)
+        ego = scenario.ego[rows]
+        poses, velocities, valid = (  # (80, A - 1, ...); indexing with two arrays is slow
+            values[rows].take(near, axis=1)
+            for values in (tracks.poses, tracks.velocities, tracks.valid)
+        )
         cos, sin, vx, vy = np.cos(ego[:, 2]), np.sin(ego[:, 2]), ego[:, VX], ego[:, VY]
         own = np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy])
         return Future(
             np.vstack([self.observation.history.ego[-1:, :3], tracks.poses[self.row, near]]),
-            np.concatenate([ego[None, :, :3], tracks.poses[agents].swapaxes(0, 1)]),
-            np.concatenate([own[None], tracks.velocities[agents].swapaxes(0, 1)]),
-            np.vstack([np.ones((1, STEPS), np.bool_), tracks.valid[agents].T]),
+            np.concatenate([ego[None, :, :3], poses.swapaxes(0, 1)]),
+            np.concatenate([own[None], velocities.swapaxes(0, 1)]),
+            np.vstack([np.ones((1, STEPS), np.bool_), valid.T]),
         )
 
 
