@@ -293,6 +293,7 @@ _COMMANDS = {
     "edits": "edits:app",
     "export": "store:export",
     "train": "training:app",
+    "features": "training:features",
     "checkpoint": "planners:checkpoint",
     "realism": "training:realism",
 }

@@ -9,7 +9,13 @@ from typer import Argument, Option
 
 from shiftsim import cli
 from shiftsim.cli import Json, Quiet, echo, new_app, print_result
-from shiftsim.train.folder import BEST, ImitationSettings, Settings, TrafficSettings
+from shiftsim.train.folder import (
+    BEST,
+    FeatureSettings,
+    ImitationSettings,
+    Settings,
+    TrafficSettings,
+)
 
 app = new_app("Train networks.", no_args_is_help=True)
 
@@ -89,6 +95,26 @@ def _say_best(planner: str, folder: Path) -> None:
 
 def _on_message(quiet: bool) -> Callable[[str], None]:
     return (lambda text: None) if quiet else partial(echo, err=True)
+
+
+@cli.with_settings("planner", "out", "split", "seed", "workers", "samples", of=FeatureSettings)
+def features(
+    settings: cli.Settings,
+    store: str = Argument(help="Store by name, path or URL."),
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Write samples of a store to files, to train on elsewhere."""
+    from shiftsim.planners.learned.checkpoint import require_torch
+
+    require_torch("features")
+    from shiftsim.train.folder import write_features
+
+    chosen = FeatureSettings(store=store, **settings)
+    index = write_features(chosen, _on_message(quiet))
+    lines = [f"{index['samples']} samples in {len(index['files'])} files: {chosen.out}"]
+    lines += [f"not made: {number} {reason}" for reason, number in index["failed"].items()]
+    print_result(index, iter(lines), as_json=as_json)
 
 
 def realism(

@@ -1,20 +1,30 @@
-"""The folder of a training: settings, state, networks, tables, and a picture of the curves."""
+"""The folder of a training: settings, state, networks, tables, and a picture of the curves.
+
+At the end: a folder of samples, for trainings elsewhere.
+"""
 
 import json
+import sys
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from itertools import count
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
-from shiftsim.errors import CheckpointError, ConfigError, MissingExtraError
+from shiftsim.errors import CheckpointError, ConfigError, DataError, MissingExtraError, one_of
 from shiftsim.files import atomic_write, write_text
 from shiftsim.runs.config import Option, setting
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from shiftsim.train.samples import Block
+
 SETTINGS = "settings.json"
 STATE = "state.pt"  # all that is needed to go on
+INDEX = "index.json"  # of samples in files
 # networks: after the last round, with the best score on the towns that are left out, after PPO
 LATEST, BEST, REINFORCED = "latest.safetensors", "best.safetensors", "ppo.safetensors"
 TAUS = (0.2, 0.3, 0.5)  # s, tried where none is given
@@ -122,6 +132,34 @@ class ImitationSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FeatureSettings:
+    """What samples in files depend on, and where and how they are made."""
+
+    store: str
+    planner: str = field(
+        metadata={"option": Option("Whose features: plantf or pluto.", ("--for",))}
+    )
+    out: Path = field(metadata={"option": Option("Folder for the samples.")})
+    split: str = setting("", "Split of the store; all its scenarios if empty.")
+    seed: int = setting(0, "Of everything that is random.")
+    workers: int = setting(2, "Processes that make samples; 0 for none but this one.")
+    samples: int = setting(0, "Stop at so many; 0 to take every scenario once.")
+
+    def __post_init__(self) -> None:
+        """Refuse other planners, and numbers that make no stream."""
+        one_of("--for", self.planner, tuple(COSTS))
+        for name in ("seed", "workers", "samples"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"{name} is negative", hint="give 0 or more")
+
+    @property
+    def determining(self) -> dict[str, object]:
+        """What a sample depends on; not how many there are."""
+        left_out = ("out", "workers", "samples")
+        return {name: value for name, value in asdict(self).items() if name not in left_out}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TrafficSettings:
     """What a training of traffic depends on, and where it is written."""
 
@@ -147,7 +185,9 @@ def _require_positive(settings: object, *names: str) -> None:
             raise ConfigError(f"{name} is {value!r}", hint="give a number above 0")
 
 
-def prepare_folder(settings: Settings | ImitationSettings, store: str, *, resume: bool) -> None:
+def prepare_folder(
+    settings: Settings | ImitationSettings | FeatureSettings, store: str, *, resume: bool
+) -> None:
     """Make the folder of a training on a store of this hash, or check that it is the same one.
 
     Raises:
@@ -212,11 +252,16 @@ def write_state(path: Path, state: dict[str, Any]) -> None:
 
 def write_network(path: Path, weights: Weights, planner: str = "carl") -> None:
     """Write a network as `--checkpoint PLANNER=PATH` reads it."""
-    from safetensors.torch import save_file
-
     tensors = {name: value.detach().cpu().contiguous() for name, value in weights.items()}
-    with atomic_write(path) as partial:
-        save_file(tensors, partial, {"planner": planner})
+    write_tensors(path, tensors, {"planner": planner})
+
+
+def write_tensors(path: Path, tensors: "dict[str, Tensor]", known: dict[str, str]) -> None:
+    """Write a safetensors file with what is known of it."""
+    from safetensors.torch import save
+
+    with atomic_write(path) as partial:  # its own `save_file` lets nobody else read the file
+        partial.write_bytes(save(tensors, known))
 
 
 def write_table(path: Path, rows: list[dict[str, Any]]) -> None:
@@ -274,3 +319,60 @@ def draw_curves(
         axes.set_ylim(bottom=0.0)
         axes.legend(frameon=False)
     save_picture(figure, path)
+
+
+def write_features(settings: FeatureSettings, on_message: OnMessage) -> dict[str, Any]:
+    """Write samples as a stream has them, a file for each of its blocks; returns the index of them.
+
+    Files that are there are not made again, so that it goes on where it was ended.
+
+    Raises:
+        DataError: No sample can be made.
+    """
+    from shiftsim.data import open_store
+    from shiftsim.runs.scenarios import open_split
+    from shiftsim.train.samples import Stream, load_blocks
+
+    store = open_store(settings.store)
+    tokens = tuple(sorted(open_split(store, settings.split)[0].tokens))
+    prepare_folder(settings, store.hash, resume=True)
+    stream = Stream(settings.store, tokens, settings.seed, sys.maxsize, settings.planner)
+    files: dict[str, int] = {}  # samples of each
+    failed, blocks, reported = Counter[str](), None, monotonic()
+    for number in count():
+        total = sum(files.values())
+        if number == stream.blocks and not total:
+            raise DataError("no sample could be made", hint=f"{dict(failed) or 'no scenarios'}")
+        if total >= settings.samples if settings.samples else number == stream.blocks:
+            break
+        path = settings.out / f"samples-{number:06d}.safetensors"
+        if blocks is None and not path.exists():
+            blocks = load_blocks(stream, number, settings.workers)
+        if blocks is not None:
+            _write_block(path, next(blocks))
+        files[path.name], reasons = _read_counts(path)
+        failed.update(reasons)
+        if monotonic() - reported > 10.0:
+            reported = monotonic()
+            on_message(f"{total + files[path.name]} samples in {len(files)} files")
+    made = {"samples": total, "failed": dict(failed), "files": files}
+    index = {**settings.determining, "store_hash": store.hash, **made}
+    write_text(settings.out / INDEX, json.dumps(index, indent=2) + "\n")
+    return index
+
+
+def _write_block(path: Path, block: "Block") -> None:
+    """Write all samples of a block, whose only batch they are."""
+    tensors = block.batches[0].tensors() if block.batches else {}
+    samples = len(block.batches[0].target) if block.batches else 0
+    made = {"samples": samples, "failed": block.failed}
+    write_tensors(path, tensors, {"made": json.dumps(made)})  # several entries have no order
+
+
+def _read_counts(path: Path) -> tuple[int, dict[str, int]]:
+    """How many samples a file has, and how many of its block could not be made, by reason."""
+    from safetensors import safe_open
+
+    with safe_open(path, "pt") as file:
+        made = json.loads(file.metadata()["made"])
+    return made["samples"], made["failed"]

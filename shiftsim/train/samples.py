@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
+import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
@@ -34,7 +35,7 @@ from shiftsim.planners.learned.pluto.world import red_lights
 from shiftsim.sim.planner import History, Observation, observe_log, scene_info
 from shiftsim.world.layers import contains
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import HEADING, PACIFICA, VX, VY, center_poses
+from shiftsim.world.state import PACIFICA, VX, VY, center_poses
 
 STEPS = features.PLAN_POSES  # of a target
 BATCH, PER_BLOCK = 32, 16  # samples; scenarios
@@ -79,13 +80,23 @@ class Batch(NamedTuple):
         starts = range(0, len(self.target), size)
         return [self._map(itemgetter(slice(start, start + size))) for start in starts]
 
+    def tensors(self) -> dict[str, Tensor]:
+        """All by name; `counts` (parts, B) are how many rows of a part are not padding."""
+        labels = {name: value for name, value in self._asdict().items() if value is not None}
+        del labels["inputs"]
+        return {**self._parts, "counts": torch.tensor(self.inputs.counts), **labels}
+
+    @property
+    def _parts(self) -> dict[str, Any]:
+        return {item.name: getattr(self.inputs, item.name) for item in fields(self.inputs)}
+
     def _map(self, change: Callable[[Any], Any]) -> "Batch":
         """The same with all changed that goes by scenes: tensors, and lists of counts."""
-        parts = {item.name: getattr(self.inputs, item.name) for item in fields(self.inputs)}
+        parts = self._parts
         counts = parts.pop("counts")
         moved = {name: change(value) for name, value in parts.items()}
         moved["counts"] = [change(by_scene) for by_scene in counts]
-        labels = (None if value is None else change(value) for value in self[1:])
+        labels: list[Any] = [None if value is None else change(value) for value in self[1:]]
         return Batch(type(self.inputs)(**moved), *labels)
 
 
@@ -172,15 +183,20 @@ class Moment(NamedTuple):
 
     def future(self, near: IntArray) -> Future:
         """Of the ego from where it is now, and of some tracks."""
-        scenario, tracks = self.scenario, self.scenario.tracks
-        rows = self.row + scenario.row_step * np.arange(1, STEPS + 1)
-        ego, agents = scenario.ego[rows], (rows[:, None], near)
-        own = turned(ego[:, VX : VY + 1], -ego[:, HEADING])
+        scenario, tracks, step = self.scenario, self.scenario.tracks, self.scenario.row_step
+        rows = slice(self.row + step, self.row + step * STEPS + 1, step)
+        ego = scenario.ego[rows]
+        poses, velocities, valid = (  # (80, A - 1, ...); indexing with two arrays is slow
+            values[rows].take(near, axis=1)
+            for values in (tracks.poses, tracks.velocities, tracks.valid)
+        )
+        cos, sin, vx, vy = np.cos(ego[:, 2]), np.sin(ego[:, 2]), ego[:, VX], ego[:, VY]
+        own = np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy])
         return Future(
             np.vstack([self.observation.history.ego[-1:, :3], tracks.poses[self.row, near]]),
-            np.concatenate([ego[None, :, :3], tracks.poses[agents].swapaxes(0, 1)]),
-            np.concatenate([own[None], tracks.velocities[agents].swapaxes(0, 1)]),
-            np.vstack([np.ones((1, STEPS), np.bool_), tracks.valid[agents].T]),
+            np.concatenate([ego[None, :, :3], poses.swapaxes(0, 1)]),
+            np.concatenate([own[None], velocities.swapaxes(0, 1)]),
+            np.vstack([np.ones((1, STEPS), np.bool_), valid.T]),
         )
 
 

@@ -152,3 +152,12 @@ def test_a_sample_of_pluto_costs_more(monkeypatch):
     plantf, pluto = (ImitationSettings(out="out", planner=name) for name in ("plantf", "pluto"))
     assert pluto.recipe.samples == round(plantf.recipe.samples / 1.6)
     assert pluto.recipe[1:] == plantf.recipe[1:]
+
+
+def test_a_folder_that_does_not_name_its_planner_is_of_plantf(small):
+    folder.prepare_folder(small("out"), "a store", resume=False)
+    place = small("out").out / folder.SETTINGS
+    place.write_text(place.read_text().replace('"planner": "plantf",', ""))
+    folder.prepare_folder(small("out"), "a store", resume=True)
+    with pytest.raises(ConfigError, match="planner 'plantf', not 'pluto'"):
+        folder.prepare_folder(small("out", planner="pluto"), "a store", resume=True)
