@@ -34,13 +34,13 @@ BUDGETS = {
     "shiftsim/report": 3_410,  # goal 2_200
     "shiftsim/view": 2_620,  # goal 1_800
     "shiftsim/env": 1_420,
-    "shiftsim/train": 2_860,  # goal 1_600
+    "shiftsim/train": 2_980,  # goal 1_600
     "shiftsim/compat": 3_900,  # goal 2_300
     "shiftsim/verify": 1_270,  # goal 1_200
-    "shiftsim/cli": 2_690,  # goal 2_300
+    "shiftsim/cli": 2_720,  # goal 2_300
     "benchmarks": 819,  # goal 700; the track finding brings 29
 }
-MOST_LINES, MOST_MODULES, MOST_KERNELS = 63_400, 300, 220  # the goal is 52_000 lines
+MOST_LINES, MOST_MODULES, MOST_KERNELS = 63_550, 300, 220  # the goal is 52_000 lines
 LONGEST_MODULE, CROWDED = 450, 16
 # modules of under 80 lines that one other module imports, and why they stand alone
 SMALL_AND_ALONE = {
