@@ -1,8 +1,7 @@
-"""PDMS and EPDMS: NAVSIM's scores of plans of 4 s, version 1 and version 2.
+"""PDMS and EPDMS: NAVSIM's scores of plans of 4 s, in versions v1 and v2.
 
-A plan is driven by the tracker and the bicycle of PDM-Closed, in a world that goes on as recorded
-from one iteration of a scenario on: its frame. PDM-Closed drives beside it and sets the scale of
-progress.
+Plans of one iteration, the frame, are driven by the tracker and the bicycle of PDM-Closed while all
+else goes on as recorded. PDM-Closed's own plan sets the scale of progress.
 
 Array axes: P plans, T = 41 states 0.1 s apart, R rows of time, N others, L red connectors.
 """
@@ -23,54 +22,26 @@ from shiftsim.planners.pdm.forecast import ring_of
 from shiftsim.planners.pdm.planner import PdmClosed
 from shiftsim.planners.pdm.rollout import roll_out
 from shiftsim.planners.pdm.scorer import AHEAD_SECONDS, TTC_STEPS, Place, first_violations
+from shiftsim.planners.proposals import contacts, places
 from shiftsim.planners.proposals.areas import Areas, areas_of
 from shiftsim.planners.proposals.comfort import ComfortBounds, comfort
-from shiftsim.planners.proposals.contacts import (
-    NEVER,
-    Obstacles,
-    first_faults,
-    near_others,
-    touches_boxes,
-)
-from shiftsim.planners.proposals.places import (
-    MULTIPLE,
-    OFF_ROAD,
-    OFF_ROUTE,
-    ego_box,
-    find_places,
-)
 from shiftsim.planners.proposals.tracker import DT, SCORED, STEP_US, drive_proposals
 from shiftsim.planners.routes.correction import known_blocks
 from shiftsim.sim.planner import observe_log, scene_info
-from shiftsim.world.layers import (
-    Polygons,
-    join_polygons,
-    make_polygons,
-    meeting,
-    square_around,
-)
+from shiftsim.world import layers, state
 from shiftsim.world.map import NONE, PerMap, VectorMap
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import (
-    HEADING,
-    LAST_AGENT_KIND,
-    PACIFICA,
-    STEERING_RATE,
-    Tracks,
-    center_poses,
-)
 
-RADIUS = 100.0  # m, half side of the square of map around the ego, and of what PDM-Closed sees
-SPACING, FRAMES = 0.5, 5  # s between recorded frames and poses of plans; steps between them
-REFERENCE_HORIZON = 5.0  # s that PDM-Closed looks for leads
-PAST_FRAMES = 3  # before the present one
-MIN_PROGRESS = 5.0  # m, of the better of a plan and the reference; below it all are equal
-DIRECTION_LIMITS, DIRECTION_STEPS = (2.0, 6.0), 11  # m off the route, within so many steps
+RADIUS = 100.0  # m, half side of the square of map around the ego, and how far PDM-Closed sees
+SPACING, FRAMES = 0.5, 5  # s between recorded frames, and between poses of plans; steps of 0.1 s
+LEAD_HORIZON = 5.0  # s in which PDM-Closed looks for leads
+MIN_PROGRESS = 5.0  # m, of the better of a plan and PDM-Closed's; below it all are equal
+DIRECTION_LIMITS, DIRECTION_STEPS = (2.0, 6.0), 11  # m off the route, in so many steps
 MAX_DEVIATION, DEVIATION_STEPS = 0.5, 20  # m beside the centerline, in so many steps in a row
-# of differences between two plans: acceleration, jerk, yaw rate, yaw acceleration
+# between two plans: acceleration [m/s^2], jerk [m/s^3], yaw rate [rad/s], its change [rad/s^2]
 EXTENDED_LIMITS = (0.7, 0.5, 0.1, 0.1)
 MAX_INTERVAL = 0.55  # s between the frames of two such plans
-SIZE = ego_box(PACIFICA)
+SIZE = places.ego_box(state.PACIFICA)
 
 
 class Version(NamedTuple):
@@ -82,30 +53,12 @@ class Version(NamedTuple):
     ttc_steps: int  # time indices that projections of the ego may reach
 
 
+_FACTORS = ("no_at_fault_collisions", "drivable_area_compliance", "driving_direction_compliance")
+_BOTH = {"ego_progress": 5.0, "time_to_collision_within_bound": 5.0}
+_V2 = dict.fromkeys(("lane_keeping", "history_comfort", "two_frame_extended_comfort"), 2.0)
 VERSIONS = {
-    "v1": Version(
-        ("no_at_fault_collisions", "drivable_area_compliance"),
-        {"ego_progress": 5.0, "time_to_collision_within_bound": 5.0, "comfort": 2.0},
-        5.0,
-        SCORED + 1 + TTC_STEPS[-1],
-    ),
-    "v2": Version(
-        (
-            "no_at_fault_collisions",
-            "drivable_area_compliance",
-            "driving_direction_compliance",
-            "traffic_light_compliance",
-        ),
-        {
-            "ego_progress": 5.0,
-            "time_to_collision_within_bound": 5.0,
-            "lane_keeping": 2.0,
-            "history_comfort": 2.0,
-            "two_frame_extended_comfort": 2.0,
-        },
-        4.0,
-        SCORED + 1,
-    ),
+    "v1": Version(_FACTORS[:2], {**_BOTH, "comfort": 2.0}, 5.0, SCORED + 1 + TTC_STEPS[-1]),
+    "v2": Version((*_FACTORS, "traffic_light_compliance"), {**_BOTH, **_V2}, 4.0, SCORED + 1),
 }
 
 
@@ -116,82 +69,57 @@ class Ground(NamedTuple):
     near_lanes: IntArray  # which of them belong to the frame
     drivable: Areas  # roadblocks, intersections, car parks; the intersections marked
     near_drivable: IntArray  # which of them belong to the frame
-    intersections: Polygons  # those of the frame
+    intersections: layers.Polygons  # those of the frame
     centerline: shapely.LineString  # along the corrected route, prepared
 
 
 class Surroundings(NamedTuple):
     """What moves and what lights show, from the frame on."""
 
-    others: Obstacles  # centres are infinite where one is absent
+    others: contacts.Obstacles  # centres are infinite where one is absent
     rows: IntArray  # row of time of each time index
     reaches: FloatArray  # (N,) how far each gets within the projection of the ego [m]
-    connectors: list[shapely.Polygon]  # (L,) of the route that are red at some time, prepared
+    connectors: list[shapely.Polygon]  # (L,) of the route that are red at some time
     red: BoolArray  # (T, L) when they are
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scores:
-    """NAVSIM's sub-scores of P plans by its names, all (P,); None where a version has none.
+    """Sub-scores of P plans by NAVSIM's names, all (P,); None where a version has none."""
 
-    Attributes:
-        score: The total: PDMS (v1) or EPDMS (v2).
-        two_frame_extended_comfort: None, and without weight, unless a previous plan was given.
-        driving_direction_compliance: Without weight in v1.
-        progress_m: Along the centerline [m].
-        collision_index: First time index of an at-fault collision, inf if none.
-        ttc_index: First time index at which the time to collision is too short, inf if none.
-        flags: (P, T, 3) whether the ego is on several lanes, off the road, off the route.
-        states: (P, T, 11) as driven.
-        time_us: Of the frame [us].
-    """
-
-    score: FloatArray
+    score: FloatArray  # the total: PDMS (v1), EPDMS (v2)
     no_at_fault_collisions: FloatArray
     drivable_area_compliance: FloatArray
-    driving_direction_compliance: FloatArray
+    driving_direction_compliance: FloatArray  # not in the total of v1
+    traffic_light_compliance: FloatArray | None = None
     ego_progress: FloatArray
     time_to_collision_within_bound: FloatArray
     comfort: FloatArray | None = None
-    traffic_light_compliance: FloatArray | None = None
     lane_keeping: FloatArray | None = None
     history_comfort: FloatArray | None = None
-    two_frame_extended_comfort: FloatArray | None = None
-    progress_m: FloatArray
-    collision_index: FloatArray
-    ttc_index: FloatArray
-    flags: BoolArray
-    states: FloatArray
-    time_us: int
+    two_frame_extended_comfort: FloatArray | None = None  # where a frame before is given
+    progress_m: FloatArray  # along the centerline [m]
+    collision_index: FloatArray  # first time index of an at-fault collision, inf if none
+    ttc_index: FloatArray  # first time index with too short a time to collision, inf if none
+    flags: BoolArray  # (P, T, 3) whether the ego is on several lanes, off the road, off the route
+    states: FloatArray  # (P, T, 11) as driven
+    time_us: int  # of the frame [us]
 
 
 @dataclass(frozen=True, slots=True)
 class FrameWorld:
-    """What plans of one frame are scored in; made by `frame_world`.
+    """What the plans of one frame are scored in; made by `frame_world`."""
 
-    Attributes:
-        version: `v1` or `v2`.
-        time_us: Of the frame [us].
-        ego: (11,) ego state.
-        past: (H, 11) ego states 0.1 s apart that comfort with history begins with.
-        ground: The map.
-        around: Others and lights.
-        plan: (T, 3) what PDM-Closed plans, in the frame of the map.
-        reach: How far that plan gets, times its multipliers [m].
-        reference: Scores of that plan.
-        human: Scores of what was driven, alone and without a past.
-    """
-
-    version: str
-    time_us: int
-    ego: FloatArray
-    past: FloatArray
-    ground: Ground
-    around: Surroundings
-    plan: FloatArray
-    reach: float
-    reference: Scores
-    human: Scores
+    version: str  # `v1` or `v2`
+    time_us: int  # of the frame [us]
+    ego: FloatArray  # (11,) ego state
+    past: FloatArray  # (H, 11) ego states before, 0.1 s apart
+    ground: Ground  # the map
+    around: Surroundings  # others and lights
+    plan: FloatArray  # (T, 3) what PDM-Closed plans, in the frame of the map
+    reach: float  # how far that plan gets, times its multipliers [m]
+    reference: Scores  # of that plan
+    human: Scores  # of what was driven, alone and without a past
 
 
 def frame_world(scenario: Scenario, iteration: int = 0, version: str = "v2") -> FrameWorld:
@@ -205,7 +133,7 @@ def frame_world(scenario: Scenario, iteration: int = 0, version: str = "v2") -> 
     rules = VERSIONS[one_of("version", version, VERSIONS)]
     row, step = int(scenario.iteration_rows[iteration]), FRAMES * scenario.row_step
     after = row + step * np.arange(round(rules.seconds / SPACING) + 1)
-    before = row - step * np.arange(PAST_FRAMES, -1, -1)
+    before = row - step * np.arange(3, -1, -1)
     if before[0] < 0 or after[-1] >= len(scenario.time_us):
         raise DataError(
             f"scenario {scenario.token!r}: iteration {iteration} has too little recording around "
@@ -215,13 +143,14 @@ def frame_world(scenario: Scenario, iteration: int = 0, version: str = "v2") -> 
     ego, time_us = scenario.ego[row].copy(), int(scenario.time_us[row])
     around = recorded_surroundings(scenario.tracks.rows(after), rules.ttc_steps)
     if version == "v2":
+        size = np.array([SIZE.length, SIZE.width])
+        footprint, others = boxes_to_corners(state.center_poses(ego[:3]), size), around.others
         # nuPlan rule 741: what touches the ego at the beginning is not there
-        footprint = boxes_to_corners(center_poses(ego[:3]), np.array([SIZE.length, SIZE.width]))
-        here = np.isfinite(around.others.centers[0, :, 0])
-        around.others.ignored[:] = here & touches_boxes(footprint, around.others.boxes[0])
-        around = _with_lights(around, scenario, after[: SCORED // FRAMES + 1])
+        touching = contacts.touches_boxes(footprint, others.boxes[0])
+        others.ignored[:] = touching & np.isfinite(others.centers[0, :, 0])
+        around = _with_lights(around, scenario, after)
     ground, plan = _reference_plan(scenario, iteration, version)
-    driven = to_frame(scenario.ego[after[1 : SCORED // FRAMES + 1], :3], ego[:3])
+    driven = to_frame(scenario.ego[after[1:9], :3], ego[:3])
     poses = [sample_plans(plan[None], time_us + STEP_US * np.arange(SCORED + 1), time_us)]
     poses.append(_poses_of(driven[None], ego, time_us, SPACING))
     states = drive_proposals(np.concatenate(poses), ego).states
@@ -248,9 +177,8 @@ def score(
         plans: (P, n, 3) rear axle x [m], y [m], heading [rad] in the frame of the ego, the first
             poses one interval from now; the last ones are held up to 4 s.
         interval: Time between poses [s].
-        human_filter: Whether what the driver of the recording fails as well does not count (v2).
-        previous: Scores of the same planners' plans in the frame before, for the extended comfort
-            (v2).
+        human_filter: Whether what the recorded driver fails as well does not count (v2).
+        previous: Scores of the plans in the frame before, for the extended comfort (v2).
 
     Raises:
         ValueError: The shapes do not fit, or the previous frame is not within 0.55 s before.
@@ -272,88 +200,92 @@ def evaluate(
 
     `past` (H, 11) comes before them where comfort looks back; without rows all are comfortable.
     """
-    others, rows = around.others, around.rows
-    lanes, road = (
-        find_places(states, SIZE, areas, near, np.zeros(len(areas.lane)), by_center=True)
-        for areas, near in (
-            (ground.lanes, ground.near_lanes),
-            (ground.drivable, ground.near_drivable),
-        )
-    )
+    others, rows, crossings = around.others, around.rows, ground.intersections
+    on_lanes = _locate(states, ground.lanes, ground.near_lanes)
+    on_road = _locate(states, ground.drivable, ground.near_drivable)
     # nuPlan rule 742: lanes tell how many of them the ego is on, other areas whether it is on any
-    off_road, crosses = road.flags[..., OFF_ROAD], ~road.flags[..., OFF_ROUTE]
-    flags = np.stack([lanes.flags[..., MULTIPLE], off_road, lanes.flags[..., OFF_ROUTE]], axis=-1)
-    places = lanes._replace(flags=flags, off_lane=flags[..., MULTIPLE] | off_road)
-    near = near_others(places, others, int(rows[-1]) + 1, AHEAD_SECONDS)
-    no_fault, collision_index = first_faults(places, others, near, rows[: SCORED + 1], True)
-    ttc_index = first_violations(
-        places, others, near, rows, around.reaches, SIZE, ground.intersections
-    )
-    points = shapely.points(places.centers)
+    flags, crosses = on_lanes.flags.copy(), ~on_road.flags[..., places.OFF_ROUTE]
+    flags[..., places.OFF_ROAD] = on_road.flags[..., places.OFF_ROAD]
+    at = on_lanes._replace(flags=flags, off_lane=flags[..., : places.OFF_ROUTE].any(axis=-1))
+    near = contacts.near_others(at, others, int(rows[-1]) + 1, AHEAD_SECONDS)
+    fault, fault_index = contacts.first_faults(at, others, near, rows[: SCORED + 1], True)
+    ttc_index = first_violations(at, others, near, rows, around.reaches, SIZE, crossings)
+    points = shapely.points(at.centers)
     along = shapely.line_locate_point(ground.centerline, points[:, [0, -1]])
-    wrong_way = flags[..., OFF_ROUTE] & (~crosses if version == "v2" else True)
+    off_route = flags[..., places.OFF_ROUTE]
     parts = {
-        "no_at_fault_collisions": no_fault,
-        "drivable_area_compliance": np.where(off_road.any(axis=1), 0.0, 1.0),
-        "driving_direction_compliance": _direction(places.centers, wrong_way),
-        "time_to_collision_within_bound": np.where(ttc_index < NEVER, 0.0, 1.0),
+        "no_at_fault_collisions": fault,
+        "drivable_area_compliance": _passed(~flags[..., places.OFF_ROAD].any(axis=1)),
+        # nuPlan rule 743: v2 has no wrong direction within intersections
+        "driving_direction_compliance": _direction(
+            at.centers, off_route & ~crosses if version == "v2" else off_route
+        ),
+        "time_to_collision_within_bound": _passed(ttc_index == contacts.NEVER),
         "progress_m": np.maximum(along[:, 1] - along[:, 0], 0.0),
-        "collision_index": collision_index,
+        "collision_index": fault_index,
         "ttc_index": ttc_index,
         "flags": flags,
         "states": states,
     }
     if version == "v1":
         return {**parts, "comfort": comfort(states, ComfortBounds()).score}
-    parts["traffic_light_compliance"] = _stops_at_red(places.corners, around)
-    away = ~shapely.dwithin(ground.centerline, points, MAX_DEVIATION)
+    parts["traffic_light_compliance"] = _passed(~_touches_red(at.corners, around))
     # nuPlan rule 744: intersections are left out, as if they took no time
-    runs = [_longest_run(row[~inside]) for row, inside in zip(away, crosses, strict=True)]
-    parts["lane_keeping"] = np.where(np.array(runs) >= DEVIATION_STEPS, 0.0, 1.0)
-    parts["history_comfort"] = _history_comfort(states, past)
-    return parts
+    outside = (row[~inside] for row, inside in zip(points, crosses, strict=True))
+    kept = [not _leaves_line(row, ground.centerline) for row in outside]
+    parts["lane_keeping"] = _passed(np.array(kept))
+    calm = [not len(past) or _is_calm(np.concatenate([past, row])) for row in states]
+    return {**parts, "history_comfort": _passed(np.array(calm))}
+
+
+def _is_calm(states: FloatArray) -> bool:
+    """Whether states (K, 11) 0.1 s apart are comfortable as in nuPlan."""
+    signals = comfort_signals(STEP_US * np.arange(len(states)), states)
+    return all(within_bounds(signals, NUPLAN))
+
+
+def _passed(flags: BoolArray) -> FloatArray:
+    return np.where(flags, 1.0, 0.0)
+
+
+def _locate(states: FloatArray, areas: Areas, near: IntArray) -> places.ProposalStates:
+    no_limits = np.zeros(len(areas.lane))
+    return places.find_places(states, SIZE, areas, near, no_limits, by_center=True)
 
 
 def _direction(centers: FloatArray, wrong_way: BoolArray) -> FloatArray:
     """(P,) factors from centres (P, T, 2), and whether they are off the route (P, T)."""
-    step = np.hypot(np.diff(centers[..., 0], axis=1), np.diff(centers[..., 1], axis=1))
-    padded = np.pad(np.where(wrong_way[:, 1:], step, 0.0), ((0, 0), (DIRECTION_STEPS - 1, 0)))
-    within = np.lib.stride_tricks.sliding_window_view(padded, DIRECTION_STEPS, axis=1)
-    longest, (low, high) = within.sum(axis=-1).max(axis=1), DIRECTION_LIMITS
-    return np.where(longest < low, 1.0, np.where(longest < high, 0.5, 0.0))
+    step = np.hypot(*np.moveaxis(np.diff(centers, axis=1), -1, 0))
+    way = np.zeros(wrong_way.shape)
+    np.cumsum(np.where(wrong_way[:, 1:], step, 0.0), axis=1, out=way[:, 1:])
+    longest = (way[:, DIRECTION_STEPS:] - way[:, :-DIRECTION_STEPS]).max(axis=1)
+    return 0.5 * ((longest < DIRECTION_LIMITS[0]) + 1.0 * (longest < DIRECTION_LIMITS[1]))
 
 
-def _longest_run(flags: BoolArray) -> int:
-    """Most flags in a row that are set."""
-    clear = np.flatnonzero(~flags)
-    return int(np.diff(np.concatenate([[-1], clear, [len(flags)]])).max()) - 1
+def _leaves_line(points: np.ndarray, line: shapely.LineString) -> bool:
+    """Whether so many points (K,) in a row are too far from a line."""
+    each = DEVIATION_STEPS  # every so many points there is one in each such row
+    if shapely.dwithin(line, points[each - 1 :: each], MAX_DEVIATION).all():
+        return False
+    near = np.flatnonzero(shapely.dwithin(line, points, MAX_DEVIATION))
+    return bool(np.diff(near, prepend=-1, append=len(points)).max() > each)
 
 
-def _stops_at_red(corners: FloatArray, around: Surroundings) -> FloatArray:
-    """(P,) 0 where the ego (P, T, 4, 2) touches a connector while it is red."""
+def _touches_red(corners: FloatArray, around: Surroundings) -> BoolArray:
+    """(P,) whether the ego (P, T, 4, 2) ever touches a connector while it is red."""
     touched = np.zeros(len(corners), np.bool_)
     if around.connectors:
         boxes = shapely.polygons(corners)
+        shapely.prepare(around.connectors)
         for connector, red in zip(around.connectors, around.red.T, strict=True):
-            # nuPlan rule 743: it does not matter whether the ego was on it before
             touched |= (shapely.intersects(connector, boxes) & red).any(axis=1)
-    return np.where(touched, 0.0, 1.0)
-
-
-def _history_comfort(states: FloatArray, past: FloatArray) -> FloatArray:
-    """(P,) nuPlan's comfort of states (P, T, 11) behind a past (H, 11)."""
-    if not len(past):
-        return np.ones(len(states))
-    times = STEP_US * np.arange(len(past) + states.shape[1])
-    signals = (comfort_signals(times, np.concatenate([past, row])) for row in states)
-    return np.array([float(all(within_bounds(found, NUPLAN))) for found in signals])
+    return touched
 
 
 def extended_differences(states: FloatArray, previous: FloatArray, seconds: float) -> FloatArray:
-    """(P, 4) root mean squares of what two frames' plans differ in, `seconds` apart.
+    """(P, 4) root mean squares of differences between states (P, T, 11) of frames `seconds` apart.
 
-    Acceleration [m/s^2] and jerk [m/s^3] at the rear axle, yaw rate [rad/s], yaw acceleration
-    [rad/s^2], over the states (P, T, 11) that both have.
+    As in `EXTENDED_LIMITS`, at the rear axle.
     """
     shift = round(seconds / DT)
     pairs = zip(states[:, :-shift], previous[:, shift:], strict=True)
@@ -365,7 +297,7 @@ def _motion(states: FloatArray) -> FloatArray:
     """(4, K) what `extended_differences` compares, of states (K, 11)."""
     signals, yaw_accel = comfort_signals(STEP_US * np.arange(len(states)), states), states[:, 0] + 0
     # nuPlan rule 745: a parabola here, where comfort takes a cubic
-    filter_signal(unwrap(states[:, HEADING]), make_filter(5, 2, 2), DT * DT, yaw_accel)
+    filter_signal(unwrap(states[:, state.HEADING]), make_filter(5, 2, 2), DT * DT, yaw_accel)
     return np.stack([signals.mag_accel, signals.mag_jerk, signals.yaw_rate, yaw_accel])
 
 
@@ -381,30 +313,26 @@ def _scored(
 
     What is 0 for `excused` counts as 1; `previous` are scores of the frame before.
     """
-    rules, raw = VERSIONS[version], parts["progress_m"]
-    factor = _factor(parts, version)
+    rules, raw, factor = VERSIONS[version], parts["progress_m"], _factor(parts, version)
     most = np.maximum(raw * factor, reach)
     share = np.minimum(raw / np.maximum(most, MIN_PROGRESS), 1.0)
-    if version == "v1":
-        progress = np.where(most > MIN_PROGRESS, share * factor, factor > 0.0)
-    else:
-        # nuPlan rule 740: multipliers shorten what a plan is compared with, not its own progress
-        progress = np.where(most > MIN_PROGRESS, share, 1.0)
+    # nuPlan rule 740: in v2 multipliers shorten what is compared with, not a plan's own progress
+    kept = (factor, _passed(factor > 0.0)) if version == "v1" else (1.0, 1.0)
+    progress = np.where(most > MIN_PROGRESS, share * kept[0], kept[1])
     named = {**parts, "ego_progress": progress}
-    if excused is not None:
-        for name in (*rules.multipliers, *rules.weights):
-            if (value := getattr(excused, name)) is not None and value[0] == 0.0:
-                named[name] = np.ones(len(raw))
+    for name in (*rules.multipliers, *rules.weights):
+        if excused is not None and getattr(excused, name) is not None:
+            named[name] = np.where(getattr(excused, name) == 0.0, 1.0, named[name])
     if previous is not None:
         seconds = (time_us - previous.time_us) * 1e-6
         if version == "v1" or not 0.0 < seconds < MAX_INTERVAL or len(previous.score) != len(raw):
             raise ValueError(
-                f"extended comfort (v2) needs as many plans from at most {MAX_INTERVAL} s before, "
-                f"not {len(previous.score)} from {seconds:.3g} s before {len(raw)}"
+                f"extended comfort (v2) compares {len(raw)} plans with as many of at most "
+                f"{MAX_INTERVAL} s before, not with {len(previous.score)} of {seconds:.3g} s before"
             )
         differences = extended_differences(parts["states"], previous.states, seconds)
-        alike = (differences <= EXTENDED_LIMITS).all(axis=1)
-        named["two_frame_extended_comfort"] = np.where(alike, 1.0, 0.0)
+        alike = _passed((differences <= EXTENDED_LIMITS).all(axis=1))
+        named["two_frame_extended_comfort"] = alike
     weights = {name: weight for name, weight in rules.weights.items() if name in named}
     mean = sum(weight * named[name] for name, weight in weights.items()) / sum(weights.values())
     return Scores(score=_factor(named, version) * mean, time_us=time_us, **named)
@@ -429,7 +357,8 @@ def sample_plans(poses: FloatArray, times: IntArray, time_us: int) -> FloatArray
     at = ((np.arange(SCORED + 1) * DT + time_us * 1e-6) * 1e6).astype(np.int64)
     at = np.clip(at, times[0], times[-1])
     low = np.clip(np.searchsorted(times, at) - 1, 0, len(times) - 2)
-    poses = np.concatenate([poses[..., :2], np.unwrap(poses[..., 2:], axis=1)], axis=-1)
+    poses = poses.copy()
+    poses[..., 2] = unwrap(poses[..., 2])
     slope = np.diff(poses, axis=1) / np.diff(times)[:, None]
     out: FloatArray = slope[:, low] * (at - times[low])[:, None] + poses[:, low]
     out[..., 2] = wrap_angles(out[..., 2])
@@ -441,13 +370,13 @@ def past_states(time_us: IntArray, states: FloatArray) -> FloatArray:
     # nuPlan rule 747: the last state before the present is left out, and rates are 0
     at = np.arange(time_us[0], time_us[-1], STEP_US)[:-1] - time_us[0]
     columns = states.copy()
-    columns[:, HEADING] = unwrap(states[:, HEADING])
+    columns[:, state.HEADING] = unwrap(states[:, state.HEADING])
     out = np.stack([np.interp(at, time_us - time_us[0], values) for values in columns.T], axis=1)
-    out[:, STEERING_RATE:] = 0.0
+    out[:, state.STEERING_RATE :] = 0.0
     return out
 
 
-def recorded_surroundings(tracks: Tracks, ttc_steps: int) -> Surroundings:
+def recorded_surroundings(tracks: state.Tracks, ttc_steps: int) -> Surroundings:
     """Tracks recorded every 0.5 s as they are each 0.1 s, without lights."""
     tracks = tracks.select(tracks.valid.any(axis=0))
     valid, number, count = tracks.valid, np.arange(tracks.num_tracks), len(tracks)
@@ -467,11 +396,11 @@ def recorded_surroundings(tracks: Tracks, ttc_steps: int) -> Surroundings:
     poses = slope * (DT * steps[:, None] - SPACING * before)[..., None] + start
     poses[absent] = np.nan
     # nuPlan rule 749: size and speed are those of the first frame
-    sizes, is_agent = tracks.sizes[first, number], tracks.kinds <= LAST_AGENT_KIND
+    sizes, is_agent = tracks.sizes[first, number], tracks.kinds <= state.LAST_AGENT_KIND
     speeds = np.where(is_agent, np.hypot(*tracks.velocities[first, number].T), 0.0)
     boxes, centers = boxes_to_corners(poses, sizes), poses[..., :2]
     travel = np.hypot(*np.diff(centers, axis=0).T).max(axis=1, initial=0.0)
-    others = Obstacles(
+    others = contacts.Obstacles(
         boxes=boxes,
         centers=np.where(absent[..., None], np.inf, centers),
         centroids=_centroids(boxes),
@@ -496,27 +425,15 @@ def _centroids(boxes: FloatArray) -> FloatArray:
     return np.stack([sum_x / 3.0 / area, sum_y / 3.0 / area], axis=-1)
 
 
-def _prepared(shapes: list[shapely.Polygon]) -> list[shapely.Polygon]:
-    for shape in shapes:
-        shapely.prepare(shape)
-    return shapes
-
-
 def _with_lights(around: Surroundings, scenario: Scenario, rows: IntArray) -> Surroundings:
-    """The same with the lights of the route, which are recorded every 0.5 s at some rows."""
-    road = scenario.map
-    route = road.lanes_of(known_blocks(road, scenario.route, scenario.token, "navsim"))
-    listed = [set(scenario.traffic_lights.red(row)) for row in rows.tolist()]
-    names = [
-        name for name in map(road.edges.ids.__getitem__, route) if name in set().union(*listed)
-    ]
-    red = np.array([[name in names_at for name in names] for names_at in listed], np.bool_)
-    red = red.reshape(len(listed), len(names))
-    shapes = [road.edges.shape(road.edges.index[name]) for name in names]
-    return around._replace(
-        connectors=_prepared(shapes),
-        red=red[np.arange(SCORED + 1) // FRAMES],
-    )
+    """The same with the red lights of the route, which are known at rows 0.5 s apart."""
+    edges, lights = scenario.map.edges, scenario.traffic_lights
+    blocks = known_blocks(scenario.map, scenario.route, scenario.token, "navsim")
+    listed = [set(lights.red(row)) for row in rows.tolist()]
+    lanes = [e for e in scenario.map.lanes_of(blocks) if any(edges.ids[e] in red for red in listed)]
+    red = np.array([[edges.ids[e] in ids for e in lanes] for ids in listed], np.bool_)
+    red = red.reshape(len(listed), len(lanes))[np.arange(SCORED + 1) // FRAMES]
+    return around._replace(connectors=[edges.shape(e) for e in lanes], red=red)
 
 
 def _reference_plan(scenario: Scenario, iteration: int, version: str) -> tuple[Ground, FloatArray]:
@@ -526,19 +443,18 @@ def _reference_plan(scenario: Scenario, iteration: int, version: str) -> tuple[G
     observation = observe_log(scenario, iteration)
     seen, paths, limit = planner.look(observation)
     ego, forecast = observation.history.ego[-1].copy(), seen.forecast
-    scene, targets = planner.scene_in(seen, paths, ego, limit, PACIFICA)
-    others, steps = forecast.others, np.arange(VERSIONS[version].ttc_steps)
-    lights = [ring_of(forecast, len(others.radii) + n) for n in range(len(forecast.light_bounds))]
-    around = Surroundings(
-        others,
-        steps // 2,
+    scene, targets = planner.scene_in(seen, paths, ego, limit, state.PACIFICA)
+    others, numbers = forecast.others, range(len(forecast.moves), len(forecast.ignored))
+    lights = [shapely.Polygon(ring_of(forecast, number)) for number in numbers]
+    rows, reaches = (
+        np.arange(VERSIONS[version].ttc_steps) // 2,
         (AHEAD_SECONDS + DT) * others.speeds[0],
-        _prepared([shapely.Polygon(ring) for ring in lights]),
-        np.ones((SCORED + 1, len(lights)), np.bool_),
     )
-    ground = _ground(scenario.map, seen.place, center_poses(ego[:3]))
+    red = np.ones((SCORED + 1, len(lights)), np.bool_)
+    around = Surroundings(others, rows, reaches, lights, red)
+    ground = _ground(scenario.map, seen.place, state.center_poses(ego[:3]))
     # nuPlan rule 739: proposals look for leads as far as they get in 5 s, and never brake at last
-    proposals = roll_out(scene, ego, targets, REFERENCE_HORIZON).poses[:, :, : SCORED + 1]
+    proposals = roll_out(scene, ego, targets, LEAD_HORIZON).poses[:, :, : SCORED + 1]
     poses = np.ascontiguousarray(proposals).reshape(-1, SCORED + 1, 3)
     parts = evaluate(drive_proposals(poses, ego).states, ground, around, version, ego[None, :][:0])
     reach = float((parts["progress_m"] * _factor(parts, version)).max())
@@ -547,11 +463,9 @@ def _reference_plan(scenario: Scenario, iteration: int, version: str) -> tuple[G
 
 def _ground(road: VectorMap, place: Place, center: FloatArray) -> Ground:
     """The map around a centre (3,); lanes and centerline are PDM-Closed's."""
-    square = square_around(center[0], center[1], RADIUS)
-    blocks = meeting(road.blocks.polygons, square)
-    crossings, parks = (
-        meeting(layer.polygons, square) for layer in (road.intersections, road.car_parks)
-    )
+    square = layers.square_around(center[0], center[1], RADIUS)
+    parts = (road.blocks, road.intersections, road.car_parks)
+    blocks, crossings, parks = (layers.meeting(part.polygons, square) for part in parts)
     offset = len(road.blocks), len(road.blocks) + len(road.intersections)
     drivable = (blocks[blocks < road.num_roadblocks], crossings + offset[0], parks + offset[1])
     line = shapely.LineString(place.centerline.xy)
@@ -561,16 +475,14 @@ def _ground(road: VectorMap, place: Place, center: FloatArray) -> Ground:
         place.selected[place.selected < len(road.edges)],
         _drivable_areas(road),
         np.concatenate(drivable),
-        make_polygons([road.intersections.rings(index) for index in crossings.tolist()]),
+        layers.make_polygons([road.intersections.rings(index) for index in crossings.tolist()]),
         line,
     )
 
 
-def _make_drivable(road: VectorMap) -> Areas:
-    layers = (road.blocks, road.intersections, road.car_parks)
-    kind = np.repeat(np.arange(3), [len(layer) for layer in layers])
-    polygons = join_polygons([layer.polygons for layer in layers])
+@PerMap
+def _drivable_areas(road: VectorMap) -> Areas:
+    parts = (road.blocks, road.intersections, road.car_parks)
+    kind = np.repeat(np.arange(3), [len(part) for part in parts])
+    polygons = layers.join_polygons([part.polygons for part in parts])
     return areas_of(polygons, kind == 1, np.full(len(kind), NONE))
-
-
-_drivable_areas = PerMap(_make_drivable)
