@@ -42,6 +42,7 @@ MAX_DEVIATION, DEVIATION_STEPS = 0.5, 20  # m beside the centerline, in so many 
 EXTENDED_LIMITS = (0.7, 0.5, 0.1, 0.1)
 MAX_INTERVAL = 0.55  # s between the frames of two such plans
 SIZE = places.ego_box(state.PACIFICA)
+Parts = dict[str, Any]  # sub-scores by name
 
 
 class Version(NamedTuple):
@@ -88,6 +89,7 @@ class Scores:
     """Sub-scores of P plans by NAVSIM's names, all (P,); None where a version has none."""
 
     score: FloatArray  # the total: PDMS (v1), EPDMS (v2)
+    multiplicative_metrics_prod: FloatArray  # product of the multipliers
     no_at_fault_collisions: FloatArray
     drivable_area_compliance: FloatArray
     driving_direction_compliance: FloatArray  # not in the total of v1
@@ -117,7 +119,6 @@ class FrameWorld:
     ground: Ground  # the map
     around: Surroundings  # others and lights
     plan: FloatArray  # (T, 3) what PDM-Closed plans, in the frame of the map
-    reach: float  # how far that plan gets, times its multipliers [m]
     reference: Scores  # of that plan
     human: Scores  # of what was driven, alone and without a past
 
@@ -143,30 +144,27 @@ def frame_world(scenario: Scenario, iteration: int = 0, version: str = "v2") -> 
     ego, time_us = scenario.ego[row].copy(), int(scenario.time_us[row])
     around = recorded_surroundings(scenario.tracks.rows(after), rules.ttc_steps)
     if version == "v2":
-        size = np.array([SIZE.length, SIZE.width])
-        footprint, others = boxes_to_corners(state.center_poses(ego[:3]), size), around.others
         # nuPlan rule 741: what touches the ego at the beginning is not there
-        touching = contacts.touches_boxes(footprint, others.boxes[0])
+        footprint = boxes_to_corners(state.center_poses(ego[:3]), np.array(SIZE[:2]))
+        others, touching = around.others, contacts.touches_boxes(footprint, around.others.boxes[0])
         others.ignored[:] = touching & np.isfinite(others.centers[0, :, 0])
         around = _with_lights(around, scenario, after)
     ground, plan = _reference_plan(scenario, iteration, version)
-    driven = to_frame(scenario.ego[after[1:9], :3], ego[:3])
+    human = to_frame(scenario.ego[after[1:9], :3], ego[:3])[None]
     poses = [sample_plans(plan[None], time_us + STEP_US * np.arange(SCORED + 1), time_us)]
-    poses.append(_poses_of(driven[None], ego, time_us, SPACING))
+    poses.append(_poses_of(human, ego, time_us))
     states = drive_proposals(np.concatenate(poses), ego).states
     past = past_states(scenario.time_us[before], scenario.ego[before])
-    reference = evaluate(states[:1], ground, around, version, past)
-    human = evaluate(states[1:], ground, around, version, past[:0])
-    reach = float(reference["progress_m"][0] * _factor(reference, version)[0])
-    scores = (_scored(parts, version, time_us) for parts in (reference, human))
-    return FrameWorld(version, time_us, ego, past, ground, around, plan, reach, *scores)
+    pairs = (states[:1], past), (states[1:], past[:0])
+    parts = (evaluate(driven, ground, around, version, before) for driven, before in pairs)
+    scores = (_scored(part, version, time_us, None) for part in parts)
+    return FrameWorld(version, time_us, ego, past, ground, around, plan, *scores)
 
 
 def score(
     world: FrameWorld,
     plans: FloatArray,
     *,
-    interval: float = SPACING,
     human_filter: bool = True,
     previous: Scores | None = None,
 ) -> Scores:
@@ -174,53 +172,62 @@ def score(
 
     Args:
         world: What they are driven in.
-        plans: (P, n, 3) rear axle x [m], y [m], heading [rad] in the frame of the ego, the first
-            poses one interval from now; the last ones are held up to 4 s.
-        interval: Time between poses [s].
+        plans: (P, n, 3) rear axle x [m], y [m], heading [rad] in the frame of the ego, 0.5 s, 1 s,
+            … from now; the last pose is held up to 4 s.
         human_filter: Whether what the recorded driver fails as well does not count (v2).
         previous: Scores of the plans in the frame before, for the extended comfort (v2).
 
     Raises:
-        ValueError: The shapes do not fit, or the previous frame is not within 0.55 s before.
+        ValueError: The plans are not finite or do not fit, or the previous frame is not within
+            0.55 s before.
     """
     plans = np.asarray(plans, np.float64)
-    if plans.ndim != 3 or plans.shape[1] < 1 or plans.shape[2] != 3:
-        raise ValueError(f"plans must have the shape (P, n, 3), not {plans.shape}")
-    poses = _poses_of(plans, world.ego, world.time_us, interval)
-    states = drive_proposals(poses, world.ego).states
+    if plans.ndim != 3 or plans.shape[2] != 3 or not plans.size or not np.isfinite(plans).all():
+        raise ValueError(f"plans must be finite and have the shape (P, n, 3), not {plans.shape}")
+    states = drive_proposals(_poses_of(plans, world.ego, world.time_us), world.ego).states
     parts = evaluate(states, world.ground, world.around, world.version, world.past)
-    excused = world.human if human_filter and world.version == "v2" else None
-    return _scored(parts, world.version, world.time_us, world.reach, excused, previous)
+    if previous is not None:
+        seconds = (world.time_us - previous.time_us) * 1e-6
+        if not 0.0 < seconds < MAX_INTERVAL or previous.states.shape != states.shape:
+            raise ValueError(
+                f"extended comfort compares {len(plans)} plans with as many of at most "
+                f"{MAX_INTERVAL} s before, not {len(previous.score)} of {seconds:.3g} s before"
+            )
+        differences = extended_differences(states, previous.states, seconds)
+        parts["two_frame_extended_comfort"] = 1.0 * (differences <= EXTENDED_LIMITS).all(axis=1)
+    human = world.human if human_filter and world.version == "v2" else None
+    reach = world.reference.progress_m * world.reference.multiplicative_metrics_prod
+    return _scored(parts, world.version, world.time_us, human, reach)
 
 
 def evaluate(
     states: FloatArray, ground: Ground, around: Surroundings, version: str, past: FloatArray
-) -> dict[str, Any]:
+) -> Parts:
     """Sub-scores of driven states (P, T, 11), all but those that compare plans, by name.
 
     `past` (H, 11) comes before them where comfort looks back; without rows all are comfortable.
     """
     others, rows, crossings = around.others, around.rows, ground.intersections
-    on_lanes = _locate(states, ground.lanes, ground.near_lanes)
-    on_road = _locate(states, ground.drivable, ground.near_drivable)
+    on_lanes, on_road = (
+        places.find_places(states, SIZE, areas, near, np.zeros(len(areas.lane)), by_center=True)
+        for areas, near in (ground[:2], ground[2:4])
+    )
     # nuPlan rule 742: lanes tell how many of them the ego is on, other areas whether it is on any
     flags, crosses = on_lanes.flags.copy(), ~on_road.flags[..., places.OFF_ROUTE]
-    flags[..., places.OFF_ROAD] = on_road.flags[..., places.OFF_ROAD]
-    at = on_lanes._replace(flags=flags, off_lane=flags[..., : places.OFF_ROUTE].any(axis=-1))
+    off_road = flags[..., places.OFF_ROAD] = on_road.flags[..., places.OFF_ROAD]
+    at = on_lanes._replace(flags=flags, off_lane=flags[..., places.MULTIPLE] | off_road)
     near = contacts.near_others(at, others, int(rows[-1]) + 1, AHEAD_SECONDS)
     fault, fault_index = contacts.first_faults(at, others, near, rows[: SCORED + 1], True)
     ttc_index = first_violations(at, others, near, rows, around.reaches, SIZE, crossings)
     points = shapely.points(at.centers)
     along = shapely.line_locate_point(ground.centerline, points[:, [0, -1]])
-    off_route = flags[..., places.OFF_ROUTE]
+    # nuPlan rule 743: v2 has no wrong direction within intersections
+    wrong_way = flags[..., places.OFF_ROUTE] & ~(crosses & (version == "v2"))
     parts = {
         "no_at_fault_collisions": fault,
-        "drivable_area_compliance": _passed(~flags[..., places.OFF_ROAD].any(axis=1)),
-        # nuPlan rule 743: v2 has no wrong direction within intersections
-        "driving_direction_compliance": _direction(
-            at.centers, off_route & ~crosses if version == "v2" else off_route
-        ),
-        "time_to_collision_within_bound": _passed(ttc_index == contacts.NEVER),
+        "drivable_area_compliance": 1.0 * ~off_road.any(axis=1),
+        "driving_direction_compliance": _direction(at.centers, wrong_way),
+        "time_to_collision_within_bound": 1.0 * (ttc_index == contacts.NEVER),
         "progress_m": np.maximum(along[:, 1] - along[:, 0], 0.0),
         "collision_index": fault_index,
         "ttc_index": ttc_index,
@@ -229,28 +236,15 @@ def evaluate(
     }
     if version == "v1":
         return {**parts, "comfort": comfort(states, ComfortBounds()).score}
-    parts["traffic_light_compliance"] = _passed(~_touches_red(at.corners, around))
+    parts["traffic_light_compliance"] = 1.0 * ~_touches_red(at.corners, around)
     # nuPlan rule 744: intersections are left out, as if they took no time
     outside = (row[~inside] for row, inside in zip(points, crosses, strict=True))
-    kept = [not _leaves_line(row, ground.centerline) for row in outside]
-    parts["lane_keeping"] = _passed(np.array(kept))
-    calm = [not len(past) or _is_calm(np.concatenate([past, row])) for row in states]
-    return {**parts, "history_comfort": _passed(np.array(calm))}
-
-
-def _is_calm(states: FloatArray) -> bool:
-    """Whether states (K, 11) 0.1 s apart are comfortable as in nuPlan."""
-    signals = comfort_signals(STEP_US * np.arange(len(states)), states)
-    return all(within_bounds(signals, NUPLAN))
-
-
-def _passed(flags: BoolArray) -> FloatArray:
-    return np.where(flags, 1.0, 0.0)
-
-
-def _locate(states: FloatArray, areas: Areas, near: IntArray) -> places.ProposalStates:
-    no_limits = np.zeros(len(areas.lane))
-    return places.find_places(states, SIZE, areas, near, no_limits, by_center=True)
+    leaves = [_leaves_line(row, ground.centerline) for row in outside]
+    parts["lane_keeping"] = 1.0 - np.array(leaves)
+    times = STEP_US * np.arange(len(past) + states.shape[1])
+    whole = (np.concatenate([past, row]) for row in states if len(past))
+    calm = [all(within_bounds(comfort_signals(times, row), NUPLAN)) for row in whole]
+    return {**parts, "history_comfort": np.array(calm or [True] * len(states), np.float64)}
 
 
 def _direction(centers: FloatArray, wrong_way: BoolArray) -> FloatArray:
@@ -283,10 +277,7 @@ def _touches_red(corners: FloatArray, around: Surroundings) -> BoolArray:
 
 
 def extended_differences(states: FloatArray, previous: FloatArray, seconds: float) -> FloatArray:
-    """(P, 4) root mean squares of differences between states (P, T, 11) of frames `seconds` apart.
-
-    As in `EXTENDED_LIMITS`, at the rear axle.
-    """
+    """(P, 4) RMS of `EXTENDED_LIMITS`' differences of states (P, T, 11), frames `seconds` apart."""
     shift = round(seconds / DT)
     pairs = zip(states[:, :-shift], previous[:, shift:], strict=True)
     differences = np.array([_motion(now) - _motion(before) for now, before in pairs])
@@ -302,52 +293,35 @@ def _motion(states: FloatArray) -> FloatArray:
 
 
 def _scored(
-    parts: dict[str, Any],
-    version: str,
-    time_us: int,
-    reach: float = 0.0,
-    excused: Scores | None = None,
-    previous: Scores | None = None,
+    parts: Parts, version: str, time_us: int, human: Scores | None, reach: FloatArray | float = 0.0
 ) -> Scores:
-    """Compare the progress of plans with what others reach [m], and add up.
-
-    What is 0 for `excused` counts as 1; `previous` are scores of the frame before.
-    """
+    """Compare progress with how far others get [m], and add up; what is 0 for the human is 1."""
     rules, raw, factor = VERSIONS[version], parts["progress_m"], _factor(parts, version)
     most = np.maximum(raw * factor, reach)
     share = np.minimum(raw / np.maximum(most, MIN_PROGRESS), 1.0)
     # nuPlan rule 740: in v2 multipliers shorten what is compared with, not a plan's own progress
-    kept = (factor, _passed(factor > 0.0)) if version == "v1" else (1.0, 1.0)
+    kept = (factor, 1.0 * (factor > 0.0)) if version == "v1" else (1.0, 1.0)
     progress = np.where(most > MIN_PROGRESS, share * kept[0], kept[1])
     named = {**parts, "ego_progress": progress}
     for name in (*rules.multipliers, *rules.weights):
-        if excused is not None and getattr(excused, name) is not None:
-            named[name] = np.where(getattr(excused, name) == 0.0, 1.0, named[name])
-    if previous is not None:
-        seconds = (time_us - previous.time_us) * 1e-6
-        if version == "v1" or not 0.0 < seconds < MAX_INTERVAL or len(previous.score) != len(raw):
-            raise ValueError(
-                f"extended comfort (v2) compares {len(raw)} plans with as many of at most "
-                f"{MAX_INTERVAL} s before, not with {len(previous.score)} of {seconds:.3g} s before"
-            )
-        differences = extended_differences(parts["states"], previous.states, seconds)
-        alike = _passed((differences <= EXTENDED_LIMITS).all(axis=1))
-        named["two_frame_extended_comfort"] = alike
+        if human is not None and getattr(human, name) is not None:
+            named[name] = np.where(getattr(human, name) == 0.0, 1.0, named[name])
     weights = {name: weight for name, weight in rules.weights.items() if name in named}
     mean = sum(weight * named[name] for name, weight in weights.items()) / sum(weights.values())
-    return Scores(score=_factor(named, version) * mean, time_us=time_us, **named)
+    named["multiplicative_metrics_prod"] = _factor(named, version)
+    return Scores(score=named["multiplicative_metrics_prod"] * mean, time_us=time_us, **named)
 
 
-def _factor(parts: dict[str, Any], version: str) -> FloatArray:
+def _factor(parts: Parts, version: str) -> FloatArray:
     """(P,) product of the multipliers."""
     return np.prod([parts[name] for name in VERSIONS[version].multipliers], axis=0)
 
 
-def _poses_of(plans: FloatArray, ego: FloatArray, time_us: int, interval: float) -> FloatArray:
+def _poses_of(plans: FloatArray, ego: FloatArray, time_us: int) -> FloatArray:
     """(P, T, 3) poses in the frame of the map from plans (P, n, 3) in that of an ego (11,)."""
     start = np.broadcast_to(ego[:3], (len(plans), 1, 3))
     poses = np.concatenate([start, from_frame(plans, ego[:3])], axis=1)
-    times = np.arange(1, plans.shape[1] + 1) * interval + time_us * 1e-6
+    times = np.arange(1, plans.shape[1] + 1) * SPACING + time_us * 1e-6
     return sample_plans(poses, np.append(time_us, (times * 1e6).astype(np.int64)), time_us)
 
 
@@ -378,7 +352,7 @@ def past_states(time_us: IntArray, states: FloatArray) -> FloatArray:
 
 def recorded_surroundings(tracks: state.Tracks, ttc_steps: int) -> Surroundings:
     """Tracks recorded every 0.5 s as they are each 0.1 s, without lights."""
-    tracks = tracks.select(tracks.valid.any(axis=0))
+    tracks = tracks.select(np.flatnonzero(tracks.valid.any(axis=0)))
     valid, number, count = tracks.valid, np.arange(tracks.num_tracks), len(tracks)
     frames, first = np.arange(count)[:, None], valid.argmax(axis=0)
     steps = np.arange(FRAMES * (count - 1) + 1)
@@ -400,15 +374,10 @@ def recorded_surroundings(tracks: state.Tracks, ttc_steps: int) -> Surroundings:
     speeds = np.where(is_agent, np.hypot(*tracks.velocities[first, number].T), 0.0)
     boxes, centers = boxes_to_corners(poses, sizes), poses[..., :2]
     travel = np.hypot(*np.diff(centers, axis=0).T).max(axis=1, initial=0.0)
-    others = contacts.Obstacles(
-        boxes=boxes,
-        centers=np.where(absent[..., None], np.inf, centers),
-        centroids=_centroids(boxes),
-        speeds=np.broadcast_to(speeds, absent.shape).copy(),
-        radii=0.5 * np.hypot(*sizes.T),
-        is_agent=is_agent,
-        ignored=np.zeros(len(number), np.bool_),
-    )
+    centers, middles = np.where(absent[..., None], np.inf, centers), _centroids(boxes)
+    speeds, radii = np.broadcast_to(speeds, absent.shape).copy(), 0.5 * np.hypot(*sizes.T)
+    ignored = np.zeros(len(number), np.bool_)
+    others = contacts.Obstacles(boxes, centers, middles, speeds, radii, is_agent, ignored)
     reaches = np.nan_to_num((TTC_STEPS[-1] + 1) * travel, nan=np.inf)
     return Surroundings(others, np.arange(ttc_steps), reaches, [], np.zeros((SCORED + 1, 0), bool))
 
@@ -446,19 +415,17 @@ def _reference_plan(scenario: Scenario, iteration: int, version: str) -> tuple[G
     scene, targets = planner.scene_in(seen, paths, ego, limit, state.PACIFICA)
     others, numbers = forecast.others, range(len(forecast.moves), len(forecast.ignored))
     lights = [shapely.Polygon(ring_of(forecast, number)) for number in numbers]
-    rows, reaches = (
-        np.arange(VERSIONS[version].ttc_steps) // 2,
-        (AHEAD_SECONDS + DT) * others.speeds[0],
-    )
-    red = np.ones((SCORED + 1, len(lights)), np.bool_)
-    around = Surroundings(others, rows, reaches, lights, red)
+    steps, red = VERSIONS[version].ttc_steps, np.ones((SCORED + 1, len(lights)), np.bool_)
+    reaches = (AHEAD_SECONDS + DT) * others.speeds[0]
+    around = Surroundings(others, np.arange(steps) // 2, reaches, lights, red)
     ground = _ground(scenario.map, seen.place, state.center_poses(ego[:3]))
     # nuPlan rule 739: proposals look for leads as far as they get in 5 s, and never brake at last
     proposals = roll_out(scene, ego, targets, LEAD_HORIZON).poses[:, :, : SCORED + 1]
     poses = np.ascontiguousarray(proposals).reshape(-1, SCORED + 1, 3)
-    parts = evaluate(drive_proposals(poses, ego).states, ground, around, version, ego[None, :][:0])
-    reach = float((parts["progress_m"] * _factor(parts, version)).max())
-    return ground, poses[np.argmax(_scored(parts, version, 0, reach).score)]
+    states = drive_proposals(poses, ego).states
+    parts = evaluate(states, ground, around, version, states[0, :0])
+    reach = (parts["progress_m"] * _factor(parts, version)).max()
+    return ground, poses[np.argmax(_scored(parts, version, 0, None, reach).score)]
 
 
 def _ground(road: VectorMap, place: Place, center: FloatArray) -> Ground:
@@ -466,18 +433,13 @@ def _ground(road: VectorMap, place: Place, center: FloatArray) -> Ground:
     square = layers.square_around(center[0], center[1], RADIUS)
     parts = (road.blocks, road.intersections, road.car_parks)
     blocks, crossings, parks = (layers.meeting(part.polygons, square) for part in parts)
-    offset = len(road.blocks), len(road.blocks) + len(road.intersections)
-    drivable = (blocks[blocks < road.num_roadblocks], crossings + offset[0], parks + offset[1])
-    line = shapely.LineString(place.centerline.xy)
+    after = len(road.blocks), len(road.blocks) + len(road.intersections)
+    drivable = [blocks[blocks < road.num_roadblocks], crossings + after[0], parks + after[1]]
+    shapes = [road.intersections.rings(index) for index in crossings.tolist()]
+    lanes, areas = place.selected[place.selected < len(road.edges)], np.concatenate(drivable)
+    line, polygons = shapely.LineString(place.centerline.xy), layers.make_polygons(shapes)
     shapely.prepare(line)
-    return Ground(
-        place.areas,
-        place.selected[place.selected < len(road.edges)],
-        _drivable_areas(road),
-        np.concatenate(drivable),
-        layers.make_polygons([road.intersections.rings(index) for index in crossings.tolist()]),
-        line,
-    )
+    return Ground(place.areas, lanes, _drivable_areas(road), areas, polygons, line)
 
 
 @PerMap
