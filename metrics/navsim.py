@@ -419,7 +419,7 @@ def _reference_plan(scenario: Scenario, iteration: int, version: str) -> tuple[G
     reaches = (AHEAD_SECONDS + DT) * others.speeds[0]
     around = Surroundings(others, np.arange(steps) // 2, reaches, lights, red)
     ground = _ground(scenario.map, seen.place, state.center_poses(ego[:3]))
-    # nuPlan rule 739: proposals look for leads as far as they get in 5 s, and never brake at last
+    # nuPlan rule 750: proposals look for leads as far as they get in 5 s, and never brake at last
     proposals = roll_out(scene, ego, targets, LEAD_HORIZON).poses[:, :, : SCORED + 1]
     poses = np.ascontiguousarray(proposals).reshape(-1, SCORED + 1, 3)
     states = drive_proposals(poses, ego).states
