@@ -208,10 +208,10 @@ def _percentiles_90(values: FloatArray) -> FloatArray:
 
 
 def unwrap(angles: FloatArray) -> FloatArray:
-    """Angles (K,) without turns of 2 pi between neighbours."""
-    turns = np.cumsum(np.rint(np.diff(angles) / (2.0 * np.pi)))
+    """Angles (..., K) without turns of 2 pi between neighbours."""
+    turns = np.cumsum(np.rint(np.diff(angles) / (2.0 * np.pi)), axis=-1)
     out = np.array(angles, np.float64)
-    out[1:] -= 2.0 * np.pi * turns
+    out[..., 1:] -= 2.0 * np.pi * turns
     return out
 
 

@@ -13,6 +13,7 @@ METRIC_TESTS = (
     "metrics/test_examples.py",
     "metrics/test_errors.py",
     "metrics/test_open_loop.py",
+    "metrics/test_navsim.py",
     "parity/test_metric_worlds.py::test_world",
     "parity/test_nuplan_runs.py",
 )

@@ -42,6 +42,7 @@ KINDS = {
     "dsc3d_synthetic": ["expected_ego_20hz.parquet|*/expected_ego_20hz.parquet"],
     "opendrive": ["*.refline.parquet"],
     "open_loop": ["openloop_plans.parquet"],
+    "navsim": ["frames.parquet", "v1_scores.parquet"],
     "scenario_edits": ["tokens.json", "build.json", "traffic.json"],
     "nuplan_real_logs": ["*.msgpack.xz", "tracker_steps.parquet", "comfort_signals.parquet"],
     "nuplan_experiment": [

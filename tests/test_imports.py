@@ -29,7 +29,13 @@ NEIGHBOURS = {
         "sim.plan_check",
         "sim.planner",
     ),
-    "metrics": ("sim.log",),
+    "metrics": (
+        "planners.pdm",
+        "planners.proposals",
+        "planners.routes",
+        "sim.log",
+        "sim.planner",
+    ),
     "view": ("report.explain", "report.palette", "report.statistics", "report.words"),
     "train": ("env", "report.palette"),
 }

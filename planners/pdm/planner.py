@@ -183,6 +183,13 @@ class PdmClosed:
 
     def step(self, observation: Observation) -> Step:
         """One planning step with everything that led to the plan."""
+        seen, paths, limit = self.look(observation)
+        assert self._scene is not None
+        ego = observation.history.ego[-1].copy()
+        return self.step_in(seen, paths, ego, limit, self._scene.vehicle)
+
+    def look(self, observation: Observation) -> tuple[Seen, Paths, float]:
+        """What a step is planned from: what is seen, the paths, the lane's speed limit [m/s]."""
         scene = self._scene
         if scene is None:
             raise PlannerError("pdm-closed: plan() was called before reset()")
@@ -200,7 +207,7 @@ class PdmClosed:
         forecast, tokens = self._forecast(scene.map, route, observation, center)
         place = Place(route.areas, selected, scene.map.intersections.polygons, paths.at(0))
         self.seen = Seen(forecast, tokens, place, lane)
-        return self.step_in(self.seen, paths, ego, float(scene.map.speed_limits[lane]), vehicle)
+        return self.seen, paths, float(scene.map.speed_limits[lane])
 
     def follow(self, line: FloatArray) -> Paths:
         """Lay the centerline (K, 3) and the paths beside it, once per scenario."""
@@ -213,7 +220,14 @@ class PdmClosed:
     def step_in(
         self, seen: Seen, paths: Paths, ego: FloatArray, limit: float, vehicle: VehicleParameters
     ) -> Step:
-        """One planning step in what an ego (11,) sees; what it touches is ignored from now on.
+        """One planning step in what an ego (11,) sees; arguments as for `scene_in`."""
+        scene, targets = self.scene_in(seen, paths, ego, limit, vehicle)
+        return plan_step(ego, targets, scene, seen.place, vehicle, self.parameters)
+
+    def scene_in(
+        self, seen: Seen, paths: Paths, ego: FloatArray, limit: float, vehicle: VehicleParameters
+    ) -> tuple[Scene, FloatArray]:
+        """What proposals are rolled out in, and target speeds; what the ego touches is ignored.
 
         `limit` is the speed limit of the lane, NaN where it has none [m/s].
         """
@@ -223,8 +237,7 @@ class PdmClosed:
             seen.forecast.ignored[:] = [token in self.collided for token in seen.tokens]
         limit = params.fallback_velocity if math.isnan(limit) else limit
         targets = limit * np.array(params.speed_fractions)
-        scene = Scene(paths, seen.forecast, size, params.following)
-        return plan_step(ego, targets, scene, seen.place, vehicle, params)
+        return Scene(paths, seen.forecast, size, params.following), targets
 
     def _forecast(
         self, road: VectorMap, route: Route, observation: Observation, center: FloatArray

@@ -45,8 +45,13 @@ class Proposals(NamedTuple):
     ranks: IntArray  # (41, M) order of what is around on a forecast map, -1 where not known
 
 
-def roll_out(scene: Scene, ego: FloatArray, targets: FloatArray) -> Proposals:
-    """Time indices 0 … 40 of all proposals, from beside the ego (11,)."""
+def roll_out(
+    scene: Scene, ego: FloatArray, targets: FloatArray, horizon: float = STEPS * DT
+) -> Proposals:
+    """Time indices 0 … 40 of all proposals, from beside the ego (11,).
+
+    Leads are looked for as far as the fastest one gets within `horizon` [s].
+    """
     num_paths, num_targets = len(scene.paths.xy), len(targets)
     shape, count = (num_paths, num_targets, STEPS + 1), len(scene.forecast.ignored)
     proposals = Proposals(
@@ -67,7 +72,7 @@ def roll_out(scene: Scene, ego: FloatArray, targets: FloatArray) -> Proposals:
         progress = project(path, ego[X], ego[Y], 0)[0]
         proposals.poses[number, :, 0] = read_pose(path, progress)
         proposals.motion[number, :, 0] = progress, ego[VX]
-        ahead = STEPS * DT * abs(float(targets.max()))
+        ahead = horizon * abs(float(targets.max()))
         proposals.corridors.spans[number] = progress, progress + ahead
         _roll_on(proposals, scene, number, (0, num_targets - 1), (1, SCORED))
     return proposals

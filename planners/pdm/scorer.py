@@ -66,13 +66,15 @@ def score(
     states: FloatArray, place: Place, others: Obstacles, size: EgoBox, params: PdmParameters
 ) -> Scores:
     """Score P proposals by their driven states (P, T, 11)."""
-    areas, steps = place.areas, np.arange(states.shape[1])
+    areas, count = place.areas, states.shape[1]
     no_limits = np.zeros(len(areas.lane))
     places = find_places(states, size, areas, place.selected, no_limits, by_center=True)
-    near = near_others(places, others, (steps[-1] + TTC_STEPS[-1]) // 2 + 1, AHEAD_SECONDS)
+    rows = np.arange(count + TTC_STEPS[-1]) // 2
+    reaches = (AHEAD_SECONDS + DT) * others.speeds[0]
+    near = near_others(places, others, rows[-1] + 1, AHEAD_SECONDS)
     # nuPlan rule 195: what is not at fault when it is first touched is not looked at again
-    no_collision, collision_index = first_faults(places, others, near, steps // 2, True)
-    ttc_index = _first_violations(places, others, near, size, place.intersections)
+    no_collision, collision_index = first_faults(places, others, near, rows[:count], True)
+    ttc_index = first_violations(places, others, near, rows, reaches, size, place.intersections)
     raw_progress, direction = _follow_route(places, place.centerline, params.direction_limits)
     drivable = np.where(places.flags[..., OFF_ROAD].any(axis=1), 0.0, 1.0)
     factor = no_collision * drivable * direction
@@ -114,16 +116,20 @@ def normalise(raw: FloatArray, factor: FloatArray) -> FloatArray:
 
 
 @kernel
-def _first_violations(
+def first_violations(
     places: ProposalStates,
     others: Obstacles,
     near: IntArray,
+    rows: IntArray,
+    reaches: FloatArray,
     size: EgoBox,
     intersections: Polygons,
 ) -> FloatArray:
     """(P,) first time indices at which a proposal comes too near to one of the others, inf if none.
 
-    Each of these counts until its first contact with the ego or its projection.
+    Each of these counts until its first contact with the ego or its projection. `rows` has the row
+    of time of each time index; as many indices are tested as have all projections in it. `reaches`
+    (N,) is how far each of the others gets from where it is within the projection [m].
     """
     states, centers, corners, off_lane = (
         places.states,
@@ -131,19 +137,14 @@ def _first_violations(
         places.corners,
         places.off_lane,
     )
-    others_at, speeds, boxes, centroids = (
-        others.centers,
-        others.speeds,
-        others.boxes,
-        others.centroids,
-    )
+    others_at, boxes, centroids = others.centers, others.boxes, others.centroids
     radii, box = others.radii, np.empty((4, 2))
     radius = 0.5 * np.hypot(size.length, size.width) + SLACK
     out = np.full(len(states), NEVER)
     is_over = np.empty(len(radii), np.bool_)
     for proposal in range(len(states)):
         is_over[:] = False
-        for step in range(states.shape[1]):
+        for step in range(len(rows) - TTC_STEPS[-1]):
             speed = np.hypot(states[proposal, step, VX], states[proposal, step, VY])
             if speed < TTC_STOPPED or out[proposal] < step:
                 continue
@@ -152,13 +153,13 @@ def _first_violations(
             cos, sin = np.cos(heading), np.sin(heading)
             margin = radius + AHEAD_SECONDS * speed
             for index in near:
-                reach = margin + radii[index] + (AHEAD_SECONDS + DT) * speeds[0, index]
-                dx, dy = others_at[step // 2, index, 0] - x, others_at[step // 2, index, 1] - y
+                reach, row = margin + radii[index] + reaches[index], rows[step]
+                dx, dy = others_at[row, index, 0] - x, others_at[row, index, 1] - y
                 if dx * dx + dy * dy > reach * reach or is_over[index]:
                     continue
                 touching = radius + radii[index]
                 for ahead in TTC_STEPS:
-                    row, travel = (step + ahead) // 2, 0.1 * ahead * speed
+                    row, travel = rows[step + ahead], 0.1 * ahead * speed
                     dx = others_at[row, index, 0] - (x + travel * cos)
                     dy = others_at[row, index, 1] - (y + travel * sin)
                     if dx * dx + dy * dy > touching * touching or is_over[index]:
