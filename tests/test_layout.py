@@ -22,9 +22,9 @@ BUDGETS = {
     "shiftsim/edits": 2_100,  # goal 2_100
     "shiftsim/sim": 1_790,  # goal 1_600
     "shiftsim/sim/traffic": 2_340,  # goal 2_200
-    "metrics": 2_320,
+    "metrics": 2_770,
     "shiftsim/runs": 5_480,  # goal 3_300
-    "planners": 4_350,  # goal 4_300
+    "planners": 4_370,  # goal 4_300
     "planners/learned": 4_910,  # goal 4_600
     "data/maps": 3_700,  # goal 3_000
     "data": 4_950,  # goal 3_900
@@ -40,7 +40,7 @@ BUDGETS = {
     "shiftsim/cli": 2_720,  # goal 2_300
     "benchmarks": 819,  # goal 700; the track finding brings 29
 }
-MOST_LINES, MOST_MODULES, MOST_KERNELS = 63_550, 300, 220  # the goal is 52_000 lines
+MOST_LINES, MOST_MODULES, MOST_KERNELS = 64_050, 300, 220  # the goal is 52_000 lines
 LONGEST_MODULE, CROWDED = 450, 16
 # modules of under 80 lines that one other module imports, and why they stand alone
 SMALL_AND_ALONE = {
