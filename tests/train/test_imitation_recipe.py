@@ -90,7 +90,7 @@ def test_what_comes_out_drives_and_says_how_it_came(small, road, tmp_path, plann
     assert [row["samples"] for row in rows] == [24, 48]
     assert all(0.0 <= row[noise] <= 1.0 for row in rows for noise in ("none", "ou-high"))
     for row in rows:  # what is planned along the recording, beside what is driven
-        assert row["ADE of plantf [m]"] > row["ADE of constant-velocity [m]"] >= 0.0
+        assert row[f"ADE of {planner} [m]"] > row["ADE of constant-velocity [m]"] >= 0.0
     done = shiftsim.run(
         planner,
         checkpoints=[f"{planner}={settings.out / BEST}"],
