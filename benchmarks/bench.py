@@ -7,8 +7,8 @@ to it, and `report/`.
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache, partial
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,6 +17,7 @@ from shiftsim.benchmarks import INTERPLAN_THRESHOLDS, Drawn, Track, known_sets, 
 from shiftsim.benchmarks import published as published_figures
 from shiftsim.benchmarks.inventory import coverage
 from shiftsim.data import open_store
+from shiftsim.data.synthetic.store import write_towns
 from shiftsim.edits.sampling import sample_edits
 from shiftsim.errors import ConfigError, DataError, one_of
 from shiftsim.files import DEFAULT_STORE, store_path, write_text
@@ -31,7 +32,7 @@ from shiftsim.report.groups import (
 from shiftsim.report.palette import DEFAULT_FORM, FigureFormat
 from shiftsim.report.tables import FORMATS, Table
 from shiftsim.runs.avoidable import grade
-from shiftsim.runs.config import make_config
+from shiftsim.runs.config import default_workers, make_config
 from shiftsim.runs.edited import EditSet, edits_text, make_edits
 from shiftsim.runs.execute import Progress, execute
 from shiftsim.runs.filter import filter_store
@@ -39,6 +40,7 @@ from shiftsim.runs.prepare import RUNS, RunPlan, prepare
 from shiftsim.runs.results import Run, label_runs, open_run
 from shiftsim.runs.scenarios import default_split, open_edits, open_run_store
 from shiftsim.runs.tables import stored_results
+from shiftsim.runs.workers import map_unordered
 from shiftsim.sim.traffic import traffic_name
 from shiftsim.view.build import Choice, galleries, write_site
 
@@ -131,16 +133,15 @@ def plan_bench(
 
 def _plan_towns(track: Track, values: Mapping[str, Any], modes: Sequence[str], out: str) -> Plan:
     """The plan of a track in generated towns, which are made here where they are not there."""
-    from shiftsim.api.stores import make_towns
-
+    workers = int(values.get("workers") or 0)
+    spread = partial(map_unordered, workers=workers or default_workers(), alone=1)
     sets = {}
     for asked in track.towns:
-        domain, workers = asked.domain, int(values.get("workers") or 0)
-        place = store_path(f"{track.name}-{domain}")
-        store = make_towns(place, asked.towns, seed=asked.seed, domain=domain, workers=workers)
+        place = store_path(f"{track.name}-{asked.domain}")
+        store = write_towns(place, **asdict(asked), spread=spread)
         filter_store(store.path, workers=workers)
         rules = {"thresholds": track.own_thresholds, "split": store.path.name}
-        sets[domain] = {**rules, **values, "store": str(store.path)}
+        sets[asked.domain] = {**rules, **values, "store": str(store.path)}
     folder = Path(out) if out else RUNS / _name(track, sets, "")
     _check_folder(folder, track)
     runs = _prepared(track, sets, modes, folder)

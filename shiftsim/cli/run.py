@@ -391,7 +391,7 @@ def demo(
     out: Path | None = Option(None, help="Folder of the store."),
     towns: int | None = Option(None, min=1, help="Only make N random towns to train in."),
     seed: int | None = Option(None, min=0, help="Of the random towns; same seed, same bytes. [0]"),
-    domain: str = Option("all", help="Of the random towns: all, home or foreign."),
+    domain: str | None = Option(None, help="Of the random towns: home or foreign. [all]"),
     quiet: Quiet = False,
 ) -> None:
     """Generate small recordings, convert them, run three planners with and without noise.
@@ -399,10 +399,11 @@ def demo(
     With --towns, generate, convert and filter random towns to train in, and run nothing.
     """
     if towns is not None:
-        _make_towns(out, towns, seed or 0, domain, settings, quiet=quiet)
+        _make_towns(out, towns, seed or 0, domain or "all", settings, quiet=quiet)
         return
-    if seed is not None:
-        raise ConfigError("--seed is of random towns only", hint="say how many with --towns")
+    for name, value in (("--seed", seed), ("--domain", domain)):
+        if value is not None:
+            raise ConfigError(f"{name} is of random towns only", hint="say how many with --towns")
     folder = out.absolute() if out else store_path(DEFAULT_STORE)
     if not (folder.exists() or quiet):
         echo(f"generating and converting recordings → {folder}")

@@ -299,6 +299,7 @@ def test_the_command_makes_converts_and_filters(tmp_path):
     ("words", "told"),
     [
         (("--seed", "1"), "--seed is of random towns only"),
+        (("--domain", "home"), "--domain is of random towns only"),
         (("--towns", "1", "--limit", "2"), "--limit is of runs, --towns runs nothing"),
         (("--towns", "0"), "'--towns': Input should be greater than or equal to 1"),
     ],
