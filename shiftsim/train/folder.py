@@ -308,15 +308,16 @@ def draw_curves(
     right.set(xlabel="samples [million]", ylim=(0, 100))
     right.set_ylabel("closed-loop score × 100")
     right.set_title("on towns left out", fontsize=9)
-    right.legend(frameon=False, loc="lower right")
+    right.legend(frameon=False)
     for axes in more:
-        for name, line in zip(errors, ("-", ":"), strict=False):
+        for name in errors:
+            line = "-" if planner in name else ":"
             label = name.removeprefix("ADE of ").removesuffix(" [m]")
             axes.plot(
                 at, [row[name] for row in scores], line, marker="o", color="0.15", label=label
             )
         axes.set(xlabel="samples [million]", ylabel="open loop: ADE [m]")
-        axes.set_ylim(bottom=0.0)
+        axes.set_ylim(0.0, 1.1 * axes.get_ylim()[1])
         axes.legend(frameon=False)
     save_picture(figure, path)
 
