@@ -250,7 +250,6 @@ def test_a_right_table_raises_no_doubt(town, tmp_path):
 
 
 @pytest.mark.parametrize("name", SPOILT)
-@pytest.mark.thorough
 def test_what_is_wrong_is_named_and_its_remedy_repairs_it(name, town, tmp_path):
     change, what, remedy, overrides = SPOILT[name]
     columns, road = town
