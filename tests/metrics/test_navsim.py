@@ -9,7 +9,7 @@ from worlds import cruise_scenario, standing_tracks
 
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import navsim
-from shiftsim.metrics.navsim import frame_world, recorded_surroundings, score
+from shiftsim.metrics.navsim import frame_world, recorded_surroundings, sample_plans, score
 from shiftsim.world.state import AgentKind, LightStatus, Tracks, TrafficLights
 
 TIMES = 0.5 * np.arange(1, 9)  # s
@@ -102,7 +102,8 @@ def test_boxes_are_interpolated_between_the_frames_that_have_them():
     tracks.velocities[0, 0] = 3.0, 4.0
     around = recorded_surroundings(tracks, 41)
     centers = around.others.centers
-    np.testing.assert_allclose(centers[:11, 0, 0], np.arange(11.0), rtol=0, atol=1e-12)
+    way = np.column_stack([np.arange(11.0), np.zeros(11)])
+    np.testing.assert_allclose(centers[:11, 0], way, rtol=0, atol=1e-12)
     assert np.isinf(centers[11:, 0]).all()
     assert (centers[:, 1] == 0.0).all()
     assert around.others.speeds[:, 0].tolist() == [5.0] * 41
@@ -114,6 +115,15 @@ def test_boxes_are_interpolated_between_the_frames_that_have_them():
     np.testing.assert_allclose(around.others.centroids[:11, 0], middle, atol=1e-12)
     assert around.reaches[0] == np.inf
     assert around.reaches[1] == 0.0
+
+
+def test_boxes_turn_the_short_way():
+    """From 3 rad to -3 rad in 1 s it turns left; halfway the box points backwards."""
+    tracks = standing_tracks(3, np.array([[0.0, 0.0, 3.0]]), [AgentKind.VEHICLE])
+    tracks.valid[1] = False
+    tracks.poses[2, 0, 2] = -3.0
+    front = recorded_surroundings(tracks, 41).others.boxes[5, 0, [0, 3]].mean(axis=0)
+    np.testing.assert_allclose(front, [-2.25, 0.0], rtol=0, atol=1e-12)
 
 
 def parked(x: float, kind: AgentKind = AgentKind.VEHICLE) -> Tracks:
@@ -129,6 +139,19 @@ def test_collisions_and_short_times_to_them_are_found_where_boxes_are():
         assert scores.time_to_collision_within_bound.tolist() == [0.0, 1.0]
         # 27.701 m at 8 m/s are 3.46 s, and 0.9 s before
         assert (scores.collision_index[0], scores.ttc_index[0]) == (35.0, 26.0)
+
+
+def test_traffic_that_crosses_is_hit_when_it_is_there():
+    """At 10 m/s from 30 m to the right, its side 22.951 m ahead of the front of the ego.
+
+    At 8 m/s the ego is there after 2.87 s; at 2.9 s the box is 1 m to the right, 4.5 m long.
+    """
+    tracks = parked(26.0 + 4.049 + 22.951 + 1.0)
+    tracks.poses[:, 0, 1] = 0.5 * (np.arange(ROWS) - 100.0) - 30.0
+    tracks.poses[:, 0, 2] = np.pi / 2.0
+    tracks.velocities[:, 0, 1] = 10.0
+    scores = score(frame_world(cruise_scenario(tracks=tracks), 20), ahead(8.0, 5.0))
+    assert scores.collision_index.tolist() == [29.0, np.inf]
 
 
 def test_the_second_version_leaves_out_what_touches_the_ego_at_first():
@@ -174,14 +197,33 @@ def test_what_is_no_plan_is_refused():
             score(world, plans)
 
 
-def test_a_frame_needs_recording_around_it():
-    scenario = cruise_scenario(history_rows=10, future_rows=40)
-    with pytest.raises(DataError, match="too little recording"):
-        frame_world(scenario, 0)
-    with pytest.raises(DataError, match="too little recording"):
-        frame_world(scenario, 150)
+@pytest.mark.parametrize(("version", "future"), [("v1", 100), ("v2", 80)])
+def test_a_frame_needs_recording_around_it(version, future):
+    """Rows are 0.05 s apart: 30 before it, and as many after it as the version reads."""
+    enough = cruise_scenario(iterations=2, history_rows=30, future_rows=future)
+    frame_world(enough, 0, version)
+    frame_world(enough, 1, version)
+    short = cruise_scenario(iterations=2, history_rows=29, future_rows=future - 1)
+    for iteration in (0, 1):
+        with pytest.raises(DataError, match="too little recording"):
+            frame_world(short, iteration, version)
     with pytest.raises(ConfigError, match="version 'v3' unknown"):
-        frame_world(scenario, 20, "v3")
+        frame_world(enough, 0, "v3")
+
+
+def test_comfort_looks_back_to_before_the_frame():
+    """The ego is at 26 m; it drove 8 m/s, and is shown from 1.5 s to 0.2 s before."""
+    past = frame_world(cruise_scenario(), 20).past
+    np.testing.assert_allclose(past[:, 0], 26.0 - 0.8 * np.arange(15, 1, -1), rtol=0, atol=1e-9)
+
+
+def test_plans_are_straight_between_their_poses():
+    """At 2 m/s for 0.5 s, at 6 m/s for 0.5 s, and held; times end a microsecond early."""
+    poses = np.zeros((1, 3, 3))
+    poses[0, :, 0] = 0.0, 1.0, 4.0
+    found = sample_plans(poses, np.array([0, 500_000, 1_000_000]), 0)
+    x = [*np.arange(0.0, 1.0, 0.2), *np.arange(1.0, 4.0, 0.6), *[4.0] * 31]
+    np.testing.assert_allclose(found[0, :, 0], x, rtol=0, atol=1e-5)
 
 
 def test_a_short_plan_is_held_at_its_end():

@@ -11,13 +11,13 @@ from worlds import standing_tracks
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.geometry.corridor import CLEAR, HIT
 from shiftsim.geometry.polylines import make_path
-from shiftsim.planners.pdm.corridor import Corridors, fill_corridor
+from shiftsim.planners.pdm.corridor import Corridors, Paths, fill_corridor
 from shiftsim.planners.pdm.forecast import forecast_ranks, make_forecast, touched
 from shiftsim.planners.pdm.parameters import FollowingModel
-from shiftsim.planners.pdm.rollout import _nearest, follow, read_pose
+from shiftsim.planners.pdm.rollout import Scene, _nearest, follow, read_pose, roll_out
 from shiftsim.planners.proposals.places import EgoBox
 from shiftsim.planners.routes.lead import red_lights
-from shiftsim.world.state import NUM_STATE, AgentKind
+from shiftsim.world.state import NUM_STATE, VX, AgentKind, X
 
 PATH = make_path(np.column_stack([np.linspace(0.0, 60.0, 61), np.zeros(61), np.zeros(61)]))
 
@@ -143,3 +143,19 @@ def test_what_the_ego_touches_is_found_and_a_light_once_it_is_on_its_connector(x
     ego = np.zeros(NUM_STATE)
     ego[:2] = x, y
     assert touched(forecast, ego, EgoBox(4.0, 2.0, 1.0)) == found
+
+
+@pytest.mark.parametrize(
+    ("seconds", "x", "is_lead"),
+    [((), 45.0, True), ((), 47.0, False), ((5.0,), 33.0, True), ((5.0,), 35.0, False)],
+)
+def test_leads_are_looked_for_as_far_as_the_fastest_gets_in_eight_seconds(seconds, x, is_lead):
+    """32 m at 4 m/s from 10 m on, or 20 m, and 1.15 m more; then come rears of vehicles."""
+    model, ego = FollowingModel(2.0, 1.2, 1.4, 2.8, 8.0), np.zeros(NUM_STATE)
+    ego[[X, VX]] = 10.0, 4.0
+    paths = Paths(*(array[None] for array in PATH))
+    scene = Scene(paths, seen([(x, 0.0, 0.0)]), EgoBox(4.0, 2.3, 2.0), model)
+    leads = roll_out(scene, ego, np.array([2.0, 4.0]), *seconds).leads
+    # a lead is as far ahead of the rear axle as of the front 4 m on; without one the path ends
+    expected = x - 2.25 - 4.0 if is_lead else 60.0
+    assert leads[0, :, 2, 0] == pytest.approx(np.full(2, expected), abs=1e-9)

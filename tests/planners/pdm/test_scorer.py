@@ -74,6 +74,16 @@ def test_time_to_collision_counts_from_a_speed_of_five_millimetres_per_second_on
     assert scores.ttc_index.tolist() == [0, np.inf]
 
 
+def test_what_touches_the_ego_from_behind_hides_nothing_and_is_not_ahead_later():
+    """It drives through the ego at 20 m/s; another stands 4 m ahead of the front."""
+    behind, ahead = (-3.0, 0.0, 0.0), (4.049 + 4.0 + 2.25, 0.0, 0.0)
+    through = forecast_of([behind], speed=20.0).others
+    place = Place(AREAS, np.array([0]), make_polygons([]), LINE)
+    assert score(driving(5.0), place, through, SIZE, DEFAULT).ttc_index.tolist() == [np.inf]
+    for poses in ([behind, ahead], [ahead, behind]):
+        assert scored(driving(5.0), *poses).ttc_index.tolist() == [0]
+
+
 @pytest.mark.parametrize(
     ("off", "direction"),
     [
