@@ -49,8 +49,8 @@ from shiftsim.train.folder import (
     Weights,
 )
 from shiftsim.train.imitation import ImitationLearner
-from shiftsim.train.samples import Stream, load_blocks
 from shiftsim.train.states import States, write_part
+from shiftsim.train.stream import Stream, load_blocks
 
 _WRITE_EVERY, _REPORT_EVERY = 120.0, 10.0  # s
 _CURVE_EVERY = 50  # steps
@@ -317,8 +317,10 @@ class ImitationTraining(Recipe):
     def _results(self) -> Iterator[learning.StepResult]:
         settings, learner = self._settings, self.learner
         tokens = tuple(sorted(token for town in self.towns.trained.values() for token in town))
-        batch = settings.recipe.batch
-        stream = Stream(settings.store, tokens, settings.seed, batch, self.planner)
+        preset = settings.recipe
+        stream = Stream(
+            settings.store, tokens, settings.seed, preset.batch, self.planner, preset.published
+        )
         self._on_message(f"{self._where} training on {len(tokens)} scenarios")
         block, done = learner.place
         unused = 0

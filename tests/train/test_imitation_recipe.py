@@ -11,7 +11,7 @@ from shiftsim.train import folder, recipe
 from shiftsim.train.folder import BEST, LATEST, ImitationSettings, Preset
 from shiftsim.train.imitation import ImitationLearner
 from shiftsim.train.recipe import ImitationTraining
-from shiftsim.train.samples import Stream, load_blocks
+from shiftsim.train.stream import Stream, load_blocks
 
 pytestmark = [pytest.mark.learned, pytest.mark.thorough]
 STEPS, BATCH = 6, 8

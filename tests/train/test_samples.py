@@ -25,14 +25,13 @@ from shiftsim.sim.planner import scene_info
 from shiftsim.train import samples
 from shiftsim.train.imitation import motion
 from shiftsim.train.samples import (
-    Stream,
     free_state,
-    load_blocks,
     make_sample,
     motion_targets,
     projections,
     targets,
 )
+from shiftsim.train.stream import Stream, load_blocks
 from shiftsim.world.state import PACIFICA, LightStatus, TrafficLights
 
 pytestmark = [pytest.mark.learned, pytest.mark.slow]
