@@ -49,10 +49,21 @@ WARM_UP, FLOOR = 0.05, 2e-3  # here: share of rising, end of the learning rate a
 SMALL = ("pos_emb", "type_emb", "speed_limit_emb", "traffic_emb", "t_embedder.mlp.0")
 SMALL += ("t_embedder.mlp.2",)
 ZERO = ("adaLN_modulation.1", "final_layer.proj.4")
-# here plans are in units that grow with time: at once, and per second [m, m, 1, 1]
-PLAN_BASE, PLAN_GROWTH = (0.5, 0.3, 0.05, 0.15), (2.5, 1.5, 0.04, 0.05)
-PLAN_MEAN = (4.5, 0.0, 0.0, 0.0)  # per second
-OTHERS_BASE, OTHERS_GROWTH = 0.2, 2.0  # [m], [m/s]
+# here plans and predictions are in units of two rows: at once, and what they grow by per second
+PLAN_MEAN = ((0.0, 0.0, 1.0, 0.0, 4.5, 0.0), (4.5, 0.0, 0.0, 0.0, 0.0, 0.0))
+PLAN_SIZE = ((0.5, 0.3, 0.05, 0.15, 2.0, 1.0), (2.5, 1.5, 0.04, 0.05, 0.2, 0.2))
+OTHERS_MEAN = ((0.0, 0.0, 1.0, 0.0, 0.0, 0.0), (0.0,) * 6)
+OTHERS_SIZE = ((0.2, 0.2, 0.1, 0.2, 1.0, 1.0), (2.0, 2.0, 0.05, 0.05, 0.2, 0.2))
+_PLACE, _HEADING, _VELOCITY, _POSE = slice(2), slice(2, 4), slice(4, 6), slice(4)
+_OF_PLUTO = (("loc", _PLACE), ("yaw", _HEADING), ("vel", _VELOCITY))
+LAST_LAYERS = {  # of networks, and the columns that they say
+    "plantf": {"trajectory_decoder.loc.3": _POSE, "agent_predictor.3": _PLACE},
+    "pluto": {
+        "ref_free_decoder.mlp.3": _POSE,
+        **{f"planning_decoder.{name}_head.mlp.3": columns for name, columns in _OF_PLUTO},
+        **{f"agent_predictor.{name}_predictor.mlp.3": columns for name, columns in _OF_PLUTO},
+    },
+}
 FINENESS = 5.0  # of a loss: errors above the share 1 / FINENESS of a unit count in proportion
 DRAWS, EARLIEST = 8, 1e-3  # of Diffusion Planner: for each scene; least time
 DECAYS = {"diffusion-planner": 0.01}  # of the weights, where it is not 1e-4 of products only
@@ -79,36 +90,35 @@ def motion(target: Tensor) -> Tensor:
 class Units(NamedTuple):
     """What plans and predictions are measured in by step, where it is not metres.
 
-    In metres the last seconds outweigh the first one, which is what is driven.
+    In metres the last seconds outweigh the first one, which is what is driven. Columns are x, y
+    [m], cosine and sine of the heading, velocity [m/s].
     """
 
-    mean: Tensor  # (80, 4) of the plan: x, y [m], cosine and sine of the heading
-    size: Tensor  # (80, 4) of what differs from it
-    others: Tensor  # (80, 2) of the predictions [m]
+    mean: Tensor  # (80, 6) of the plan
+    size: Tensor  # (80, 6) of what differs from it
+    others_mean: Tensor  # (80, 6) of the predictions
+    others_size: Tensor  # (80, 6)
 
     @classmethod
     def make(cls, device: str) -> "Units":
-        """As in what was recorded of all kinds of towns, about."""
+        """As in what was recorded in all kinds of towns, about."""
         time = 0.1 * torch.arange(1, 81, device=device)[:, None]
-        base, growth, speed, other, others = (
-            torch.tensor(values, device=device)
-            for values in (PLAN_BASE, PLAN_GROWTH, PLAN_MEAN, OTHERS_BASE, OTHERS_GROWTH)
-        )
-        mean = speed * time + torch.tensor([0.0, 0.0, 1.0, 0.0], device=device)
-        return cls(mean, base + growth * time, (other + others * time).expand(-1, 2))
+        rows = torch.tensor([PLAN_MEAN, PLAN_SIZE, OTHERS_MEAN, OTHERS_SIZE], device=device)
+        return cls(*(at_once + per_second * time for at_once, per_second in rows))
 
-    def layers(self) -> dict[str, tuple[Tensor, Tensor]]:
-        """By last layer of PlanTF's network: mean and size of its outputs, each (outputs,)."""
-        others = self.others.flatten()
-        return {
-            "trajectory_decoder.loc.3": (self.mean.flatten(), self.size.flatten()),
-            "agent_predictor.3": (torch.zeros_like(others), others),
-        }
+    def layers(self, planner: str) -> dict[str, tuple[Tensor, Tensor]]:
+        """By last layer of a network: mean and size of its outputs, each (outputs,)."""
+        of_plan, of_others = (self.mean, self.size), (self.others_mean, self.others_size)
+        found = {}
+        for name, columns in LAST_LAYERS[planner].items():
+            mean, size = of_others if "agent_predictor" in name else of_plan
+            found[name] = mean[:, columns].flatten(), size[:, columns].flatten()
+        return found
 
-    def in_metres(self, weights: Weights) -> Weights:
+    def in_metres(self, planner: str, weights: Weights) -> Weights:
         """Weights of a network whose last layers are in these units as files have them."""
         found = dict(weights)
-        for name, (mean, size) in self.layers().items():
+        for name, (mean, size) in self.layers(planner).items():
             found[f"{name}.weight"] = weights[f"{name}.weight"] * size[:, None]
             found[f"{name}.bias"] = weights[f"{name}.bias"] * size + mean
         return found
@@ -132,8 +142,8 @@ def plantf_loss(
     chosen = out.trajectory[torch.arange(len(best), device=best.device), best]
     said, others = out.prediction, target[:, 1:, :, :2]
     if units:
-        chosen, ego = (value * FINENESS / units.size for value in (chosen, ego))
-        said, others = (value * FINENESS / units.others for value in (said, others))
+        chosen, ego = (value * FINENESS / units.size[:, _POSE] for value in (chosen, ego))
+        said, others = (value * FINENESS / units.others_size[:, _PLACE] for value in (said, others))
     others = functional.smooth_l1_loss(said, others, reduction="none")
     return _sum(
         reg_loss=functional.smooth_l1_loss(chosen, ego),
@@ -198,6 +208,7 @@ def pluto_loss(
     *,
     signed: Tensor | None = None,
     contrast: tuple[Tensor, Tensor] | None = None,
+    units: Units | None = None,
 ) -> Losses:
     """Of PLUTO.
 
@@ -210,6 +221,7 @@ def pluto_loss(
         signed: (B, H, W) of `road_loss`, or None for no such term.
         contrast: Arguments of `contrastive_loss`. The batch is then anchors, positives, negatives,
             of which the last third counts in no other term.
+        units: As of `plantf_loss`.
     """
     count = len(target) * 2 // 3 if contrast else len(target)
     target, valid, scene = target[:count], valid[:count], torch.arange(count, device=target.device)
@@ -218,15 +230,21 @@ def pluto_loss(
     line, mode = pluto_assignment(projection[:count], lines, valid[:, 0])
     chosen, ego = trajectory[scene, line, mode], target[:, 0]
 
-    def error(said: Tensor, recorded: Tensor, counted: Tensor) -> Tensor:
+    def error(
+        said: Tensor, recorded: Tensor, counted: Tensor, sizes: Tensor | None = None
+    ) -> Tensor:
+        if sizes is not None:
+            said, recorded = (v * FINENESS / sizes[:, : v.shape[-1]] for v in (said, recorded))
         each = functional.smooth_l1_loss(said, recorded, reduction="none").sum(dim=-1)
         return _mean_of(each, counted)
 
+    own, of_others = (units.size, units.others_size) if units else (None, None)
+
     terms = {
-        "reg_loss": error(chosen, ego, valid[:, 0]),
+        "reg_loss": error(chosen, ego, valid[:, 0], own),
         "cls_loss": functional.cross_entropy(logits.flatten(1), line * logits.shape[-1] + mode),
-        "ref_free_reg_loss": error(out.ref_free_trajectory[:count], ego[..., :4], valid[:, 0]),
-        "prediction_loss": error(out.prediction[:count], target[:, 1:], valid[:, 1:]),
+        "ref_free_reg_loss": error(out.ref_free_trajectory[:count], ego[..., :4], valid[:, 0], own),
+        "prediction_loss": error(out.prediction[:count], target[:, 1:], valid[:, 1:], of_others),
     }
     if signed is not None:
         terms["collision_loss"] = road_loss(chosen, signed[:count])
@@ -328,7 +346,7 @@ def losses_of(
     out = network(batch.inputs)
     if planner == "pluto":
         assert batch.projection is not None
-        return pluto_loss(out, batch.target, batch.valid, batch.projection)
+        return pluto_loss(out, batch.target, batch.valid, batch.projection, units=units)
     return plantf_loss(out, batch.target, batch.valid, units)
 
 
@@ -356,9 +374,9 @@ class ImitationLearner(TrainedNetwork):
         begin(network, seed)
         network.to(device).train()
         self._units = None
-        if planner == "plantf" and not preset.published:
+        if planner in LAST_LAYERS and not preset.published:
             self._units = Units.make(device)
-            for name, (mean, size) in self._units.layers().items():
+            for name, (mean, size) in self._units.layers(planner).items():
                 network.get_submodule(name).register_forward_hook(_Scaled(mean, size))
             network.agent_encoder.ego_state_emb.state_dropout = HIDDEN
         if planner in DECAYS:
@@ -414,7 +432,7 @@ class ImitationLearner(TrainedNetwork):
         if self._preset.published and self._planner != "diffusion-planner":
             return self.network.state_dict()
         weights = super().driving()
-        return self._units.in_metres(weights) if self._units else weights
+        return self._units.in_metres(self._planner, weights) if self._units else weights
 
     def state(self) -> dict[str, Any]:
         """All that is needed to go on."""

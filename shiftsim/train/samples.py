@@ -182,9 +182,9 @@ def way_back(speed: float, present: FloatArray, future: FloatArray) -> FloatArra
     lon, lat, turn = to_frame(np.zeros(3), present)
     along = caught_up(lengths, np.append(steps, steps[-1]) / STEP, lon, speed)
     poses = np.column_stack([np.interp(along, lengths, column) for column in path.T])
-    before = np.minimum(along, 0.0)  # of what is behind the first pose
-    poses[:, 0] += before * np.cos(present[2])
-    poses[:, 1] += before * np.sin(present[2])
+    outside = along - np.clip(along, 0.0, lengths[-1])  # behind the first pose, beyond the last
+    poses[:, 0] += outside * np.cos(poses[:, 2])
+    poses[:, 1] += outside * np.sin(poses[:, 2])
     reach = max(NEAREST_BACK, TIME_BACK * max(speed, steps[0] / STEP))
     place = np.minimum((along - lon) / reach, 1.0)  # a cubic from the offset and its slope to 0
     slope, left = np.clip(np.tan(turn), -1.0, 1.0), 1.0 - place
