@@ -262,8 +262,9 @@ def write_network(path: Path, weights: Weights, planner: str = "carl") -> None:
 
     tensors = {name: value.detach().cpu().contiguous() for name, value in weights.items()}
     args = getattr(network_module(planner), "DEFAULT_ARGS", None)
-    known = {"args": json.dumps(args)} if args else {}
-    write_tensors(path, tensors, {"planner": planner, **known})
+    # one entry only: several have no order
+    known = {"args": json.dumps(args)} if args else {"planner": planner}
+    write_tensors(path, tensors, known)
 
 
 def write_tensors(path: Path, tensors: "dict[str, Tensor]", known: dict[str, str]) -> None:

@@ -28,6 +28,7 @@ from shiftsim.runs.filter import read_filter_results
 from shiftsim.runs.prepare import prepare
 from shiftsim.runs.scenarios import find_split
 from shiftsim.train import folder, learning
+from shiftsim.train.checks import check
 from shiftsim.train.driving import (
     TESTED,
     TOGETHER,
@@ -49,6 +50,7 @@ from shiftsim.train.folder import (
     Weights,
 )
 from shiftsim.train.imitation import ImitationLearner
+from shiftsim.train.samples import KINDS
 from shiftsim.train.states import States, write_part
 from shiftsim.train.stream import Stream, load_blocks
 
@@ -310,6 +312,18 @@ class ImitationTraining(Recipe):
         total, seed = steps * preset.rounds, self._settings.seed
         self.learner = ImitationLearner(self.planner, self.device, preset, total, seed)
         return steps
+
+    def run(self) -> None:
+        """Do all rounds that are not done yet, then see what the best network acts on."""
+        super().run()
+        settings = self._settings
+        planner = KINDS[self.planner].planner(str(settings.out / BEST), device=self.device)
+        tokens = tested_tokens(self.towns, settings.tests)
+        rows = check(planner, map(open_store(settings.store).read, tokens))
+        folder.write_table(settings.out / "checks.parquet", rows)
+        for row in rows:
+            passed = f"{100.0 * row['passed']:.0f} %" if row["cases"] else "no share"
+            self._on_message(f"{row['check']}: {passed} of {row['cases']} cases")
 
     def _collect(self) -> None:
         """Nothing: samples are made when they are needed."""
