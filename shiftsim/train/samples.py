@@ -26,7 +26,7 @@ from shiftsim.planners.learned.diffusion.features import Features as DiffusionFe
 from shiftsim.planners.learned.plantf import planner as plantf
 from shiftsim.planners.learned.pluto import planner as pluto
 from shiftsim.planners.learned.pluto.world import red_lights
-from shiftsim.sim.planner import History, Observation, observe_log
+from shiftsim.sim.planner import History, Observation, observe_log, past_rows
 from shiftsim.world.layers import contains
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import PACIFICA, VX, VY, center_poses
@@ -45,6 +45,10 @@ MOVED_POSE = NOISE * [0, 1, 1, 0, 0, 0, 0]
 MOVING = 2.0
 NEIGHBOURS = 10  # agents that the ego must not be moved into, and that Diffusion Planner predicts
 
+# a driven ego is a sample if it is this near to the path [m], and at most so many steps late
+MOST_AHEAD, MOST_ASIDE, MOST_LATE = 2.5, 1.5, 80
+
+_ELSEWHERE = "driven far from the recording"
 _SHORT = "less than 8 s recorded after it"
 _NO_ROAD = "no lane or crosswalk around it"
 _NO_LINE = "no reference line"
@@ -163,23 +167,23 @@ def projections(lines: Sequence[FloatArray], ego: FloatArray) -> np.ndarray:
     return np.stack(both, axis=-1).astype(np.float32)
 
 
-def way_back(speed: float, present: FloatArray, future: FloatArray) -> FloatArray:
-    """(80, 3) poses that lead a moved ego back to where it was recorded, as a driver would.
+def way_back(speed: float, path: FloatArray) -> FloatArray:
+    """(80, 3) poses that lead an ego that is elsewhere back to the recording, as a driver would.
 
     Beside the recorded path the ego comes back to it within some metres; behind the recording it
     gathers speed as a car does and drives as it did at the same place, and never ahead of it. The
     targets of the authors of PlanTF and PLUTO are back at once.
 
     Args:
-        speed: Of the moved ego [m/s].
-        present: (3,) recorded pose in the frame of the moved ego.
-        future: (80, 3) those after it.
+        speed: Of the ego [m/s].
+        path: (B + 81, 3) recorded poses in the frame of the ego, from where it is beside: those of
+            the B steps before now, if it is late, now, and of the 8 s after it.
     """
-    path = np.vstack([present, future])
+    path = path.copy()
     path[:, 2] = np.unwrap(path[:, 2])
     steps = np.hypot(*np.diff(path[:, :2], axis=0).T)
     lengths = np.concatenate([[0.0], np.cumsum(steps)])
-    lon, lat, turn = to_frame(np.zeros(3), present)
+    lon, lat, turn = to_frame(np.zeros(3), path[0])
     along = caught_up(lengths, np.append(steps, steps[-1]) / STEP, lon, speed)
     poses = np.column_stack([np.interp(along, lengths, column) for column in path.T])
     outside = along - np.clip(along, 0.0, lengths[-1])  # behind the first pose, beyond the last
@@ -201,20 +205,20 @@ def caught_up(lengths: FloatArray, speeds: FloatArray, place: float, speed: floa
     """(80,) places on a recorded path [m] of an ego that begins elsewhere, or with another speed.
 
     Args:
-        lengths: (81,) recorded places [m] at 0 to 8 s.
-        speeds: (81,) of the recording there [m/s].
+        lengths: (B + 81,) recorded places [m], of which the last 80 are still to come.
+        speeds: (B + 81,) of the recording there [m/s].
         place: Of the ego now [m].
         speed: Of the ego now [m/s].
     """
-    out = np.empty(len(lengths) - 1)
+    out, now = np.empty(STEPS), len(lengths) - STEPS - 1
     ahead = max(place, 0.0) + max(speed - speeds[0], 0.0) ** 2 / (2.0 * HARDEST[1])
-    at = 0
+    at = 0  # of the recording, where the ego is
     for step in range(len(out)):
         while at + 2 < len(lengths) and lengths[at + 1] < place + AHEAD:
             at += 1
         wanted = max(speeds[at], speeds[at + 1])
         speed = max(min(speed + HARDEST[0] * STEP, wanted), speed - HARDEST[1] * STEP)
-        reached = max(min(place + speed * STEP, lengths[step + 1] + ahead), place)
+        reached = max(min(place + speed * STEP, lengths[now + step + 1] + ahead), place)
         speed, place = (reached - place) / STEP, reached
         out[step] = place
     return out
@@ -236,7 +240,9 @@ class Moment(NamedTuple):
     row: int  # of the recording
     observation: Observation
     state: FloatArray  # (7,) of the ego, in the frame that it was recorded in
-    goes_back: bool  # whether the ego was moved and goes `way_back`, else it is back at once
+    # row from which on the ego goes `way_back`, the present one or one before it; None if it is
+    # there already, or at once
+    beside: int | None
 
     def future(self, near: IntArray) -> Future:
         """Of the ego from where it is now, and of some tracks."""
@@ -250,10 +256,9 @@ class Moment(NamedTuple):
         cos, sin, vx, vy = np.cos(ego[:, 2]), np.sin(ego[:, 2]), ego[:, VX], ego[:, VY]
         own, drive = np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy]), ego[:, :3]
         now = self.observation.history.ego[-1:, :3]
-        if self.goes_back:
-            here, recorded = now[0], scenario.ego[self.row, :3]
-            back = way_back(self.state[3], to_frame(recorded, here), to_frame(drive, here))
-            drive = from_frame(back, here)
+        if self.beside is not None:
+            path = scenario.ego[self.beside : rows.stop : step, :3]
+            drive = from_frame(way_back(self.state[3], to_frame(path, now[0])), now[0])
             own = np.diff(np.vstack([now, drive])[:, :2], axis=0) / STEP
         return Future(
             np.vstack([now, tracks.poses[self.row, near]]),
@@ -333,15 +338,26 @@ def make_sample(
     random: np.random.Generator,
     *,
     as_published: bool = False,
+    driven: FloatArray | None = None,
 ) -> Sample | str:
     """The sample of an iteration, or why there is none; `planner` was reset to the scenario.
 
     A moved ego of PlanTF and PLUTO is back at once `as_published`; otherwise, and of Diffusion
     Planner always, it goes `way_back`, and half of them are slower by any share of their speed.
+
+    Args:
+        planner: Whose features.
+        scenario: The recording.
+        iteration: Of the scenario.
+        random: Draws what is random.
+        as_published: See above.
+        driven: (K, 11) states in which a planner has driven the ego, instead of those recorded.
     """
     row, kind = int(scenario.iteration_rows[iteration]), KINDS[planner.name]
     if row + STEPS * scenario.row_step >= len(scenario.time_us):
         return _SHORT
+    if driven is not None:
+        return _driven_sample(planner, scenario, iteration, driven)
     observation = observe_log(scenario, iteration)
     # recordings know no steering angle and no yaw rate: they are derived, and not from a jump
     state = plantf.current_state(observation.history).astype(np.float64)
@@ -356,8 +372,29 @@ def make_sample(
             ego[-1, :3] = features.map_poses(state[:3], ego[-1])
             observation = observe_log(scenario, iteration, ego=ego)
     goes_back = moved is not None and not (as_published and kind.noise[3])
-    now = Moment(scenario, row, observation, state, goes_back)
+    now = Moment(scenario, row, observation, state, row if goes_back else None)
     return kind.label(planner, planner.features(observation), now)
+
+
+def _driven_sample(
+    planner: LearnedPlanner[Any, Any], scenario: Scenario, iteration: int, driven: FloatArray
+) -> Sample | str:
+    """Of an ego that a planner has driven near the recorded path, maybe late."""
+    row, step = int(scenario.iteration_rows[iteration]), scenario.row_step
+    if row + STEPS * step >= len(scenario.time_us):
+        return _SHORT
+    ego = scenario.ego[past_rows(scenario, iteration)].copy()
+    states = driven[max(iteration + 1 - len(ego), 0) : iteration + 1]
+    ego[len(ego) - len(states) :] = states
+    observation = observe_log(scenario, iteration, ego=ego)
+    before = np.arange(row, -1, -step)[: MOST_LATE + 1]
+    near = int(np.hypot(*(scenario.ego[before, :2] - ego[-1, :2]).T).argmin())
+    ahead, aside, turn = np.abs(to_frame(ego[-1, :3], scenario.ego[before[near], :3]))
+    if ahead > MOST_AHEAD or aside > MOST_ASIDE or turn > NOISE[2]:
+        return _ELSEWHERE
+    state = plantf.current_state(observation.history).astype(np.float64)
+    now = Moment(scenario, row, observation, state, int(before[near]))
+    return KINDS[planner.name].label(planner, planner.features(observation), now)
 
 
 def _perturb(

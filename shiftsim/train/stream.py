@@ -17,7 +17,9 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 from shiftsim.data import open_store
 from shiftsim.errors import ShiftsimError
 from shiftsim.geometry.boxes import wrap_angles
-from shiftsim.kernels import IntArray
+from shiftsim.kernels import FloatArray, IntArray
+from shiftsim.runs.results import Run, open_run
+from shiftsim.runs.task import Task
 from shiftsim.sim.planner import scene_info
 from shiftsim.train.samples import KINDS, STEPS, Batch, Sample, make_batch, make_sample
 from shiftsim.world.scenario import Scenario
@@ -25,6 +27,7 @@ from shiftsim.world.scenario import Scenario
 BATCH, PER_BLOCK = 32, 64  # samples; scenarios, enough that batches differ little
 # share of iterations that are samples: those in whose 8 s the ego turns, drives on, stands
 DRAWN = (0.2, 0.08, 0.025)
+DRIVEN = 0.4  # share of those that a planner has driven
 TURNING, STANDING = 0.35, 1.0  # rad from which it turns, m below which it stands
 
 
@@ -45,6 +48,7 @@ class Stream:
     batch: int = BATCH
     planner: str = "plantf"  # one of `KINDS`
     as_published: bool = False  # of `make_sample`
+    driven: tuple[str, ...] = ()  # folders of runs in which a planner drove some of the scenarios
 
     @property
     def blocks(self) -> int:
@@ -65,6 +69,11 @@ class BlockMaker:
         self._stream, self._store = stream, open_store(stream.store)
         self._kind = KINDS[stream.planner]
         self._planner = self._kind.planner.asking(lambda scenes: ())
+        self._driven: dict[str, list[tuple[Run, Task]]] = {}
+        for run in map(open_run, stream.driven):
+            for task, place in run.rollout_places.items():
+                if place is not None:
+                    self._driven.setdefault(task.token, []).append((run, task))
 
     def __call__(self, block: int) -> Block:
         """The samples of a block, in batches, the last of which may be short."""
@@ -90,23 +99,29 @@ class BlockMaker:
         except ShiftsimError as error:
             failed[type(error).__name__] += 1
             return made
-        for iteration in _draw(scenario, key).tolist():
-            random = np.random.default_rng([*key, iteration + 1])
-            try:
-                one = make_sample(
-                    self._planner,
-                    scenario,
-                    iteration,
-                    random,
-                    as_published=self._stream.as_published,
-                )
-            except ShiftsimError as error:
-                one = type(error).__name__
-            if isinstance(one, str):
-                failed[one] += 1
-            else:
-                made.append(one)
+        as_recorded = None, _draw(scenario, key)
+        driven = [self._drive(*one, scenario, key) for one in self._driven.get(token, ())]
+        for states, iterations in (as_recorded, *driven):
+            for iteration in iterations.tolist():
+                random = np.random.default_rng([*key, iteration + 1])
+                how: dict[str, Any] = {"as_published": self._stream.as_published, "driven": states}
+                try:
+                    one = make_sample(self._planner, scenario, iteration, random, **how)
+                except ShiftsimError as error:
+                    one = type(error).__name__
+                if isinstance(one, str):
+                    failed[one] += 1
+                else:
+                    made.append(one)
         return made
+
+    def _drive(
+        self, run: Run, task: Task, scenario: Scenario, key: list[int]
+    ) -> tuple[FloatArray, IntArray]:
+        """States of a rollout (K, 11), and some iterations of it."""
+        states = run.rollout(task, scenario).ego
+        drawn = np.random.default_rng([*key, 0, task.seed]).random(len(states)) < DRIVEN
+        return states, np.flatnonzero(drawn)
 
 
 def _draw(scenario: Scenario, key: list[int]) -> IntArray:

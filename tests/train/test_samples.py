@@ -133,7 +133,7 @@ def drive_back(pose, speed, recorded=8.0):
     future[:, 0] = 0.1 * recorded * np.arange(81)
     moved = np.array(pose)
     local = to_frame(future, moved)
-    return from_frame(samples.way_back(speed, local[0], local[1:]), moved)
+    return from_frame(samples.way_back(speed, local), moved)
 
 
 def test_an_ego_that_was_moved_comes_back_smoothly():
@@ -167,10 +167,30 @@ def test_a_slow_ego_waits_where_the_recording_waits():
     place = np.minimum(0.5 * np.arange(81), 10.0)
     place[60:] = 10.0 + 0.5 * np.arange(21)  # it stands from 2 to 6 s
     poses = np.stack([place, 0.0 * place, 0.0 * place], axis=-1)
-    back = samples.way_back(2.0, poses[0], poses[1:])
+    back = samples.way_back(2.0, poses)
     assert (back[:, 0] <= place[1:] + 1e-9).all()
     np.testing.assert_allclose(back[50:59, 0], 10.0, atol=1e-9)
     assert back[-1, 0] > 12.0
+
+
+def test_an_ego_that_was_driven_late_and_aside_follows_the_recording(asked):
+    scenario, planner = asked
+    driven = scenario.expert.copy()  # at 6 m/s, 4 s late, 1 m to the left, and slower
+    driven[40:] = driven[:-40]
+    driven[:, 1] += 1.0
+    driven[:, 3] = 3.0
+    one = make_sample(planner, scenario, 60, Draws(0.9), driven=driven)
+    np.testing.assert_allclose(one.features.current_state[3], 3.0)
+    target = one.target[0]
+    np.testing.assert_allclose(
+        np.diff(target[:10, 0]), 0.1 * (3.15 + 0.15 * np.arange(1, 10)), atol=5e-3
+    )
+    np.testing.assert_allclose(target[-1, :2], [target[-1, 0], -1.0], atol=1e-4)
+    assert 40.0 < target[-1, 0] < 48.0  # as fast as the recording, and still late
+    driven[:, 1] += 1.0
+    assert "far from" in make_sample(planner, scenario, 60, Draws(0.9), driven=driven)
+    driven[:, 0] -= 100.0
+    assert "far from" in make_sample(planner, scenario, 60, Draws(0.9), driven=driven)
 
 
 def test_targets_of_diffusion_planner_are_poses_of_the_ego_and_its_neighbours(asked):
