@@ -270,7 +270,32 @@ def write_py123d(folder, split="demo_val", site="avenue", labels="NuPlanBoxDetec
     _write_boxes(log / "box_detections_se3.arrow", frames, labels)
     _write_lights(log / "traffic_light_detections.arrow", content, frames)
     _write_map(log / "map.arrow", content)
+    _write_routes(log / "custom.scenario.arrow", content, frames)
     return log
+
+
+def known_route(content):
+    """Groups of lanes along which the route of the files leads: the first lane and what follows."""
+    lanes = {lane["id"]: lane for lane in content["lanes"]}
+    lane = next(lane for lane in content["lanes"] if lane["successors"] and not lane["inside"])
+    after = lanes[lane["successors"][0]]
+    return [lane["group"], after["group"], lanes[after["successors"][0]]["group"]]
+
+
+def _write_routes(path, content, frames):
+    """The true route from 3 s on, as py123d has it of nuPlan; before it there is none."""
+    routes = [[] if t < START_US + 1_000_000 else known_route(content) for t in frames]
+    packed = [
+        msgpack.packb({"lidar_token": "00ff", "route_roadblock_ids": list(map(str, route))})
+        for route in routes
+    ]
+    table = pa.table(
+        {
+            "custom.scenario.timestamp_us": pa.array(list(frames), pa.int64()),
+            "custom.scenario.data": pa.array(packed, pa.binary()),
+        }
+    )
+    _write(path, table, {"modality_id": "scenario", "metadata": {}})
 
 
 def frames_of(content):

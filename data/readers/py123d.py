@@ -4,6 +4,8 @@ py123d itself is not needed: its files are Arrow tables whose objects are packed
 have no version of their own, so every column is checked; tested with files of py123d 0.7.0.
 """
 
+import csv
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -21,12 +23,14 @@ from shiftsim.data.readers.codes import LaneNames
 from shiftsim.data.readers.files import SceneFolder, SourceFile, items, vectors
 from shiftsim.data.readers.reader import SourceRecording
 from shiftsim.data.readers.samples import TrackSamples
-from shiftsim.errors import import_extra
+from shiftsim.data.readers.windows import Span
+from shiftsim.errors import ConversionError, import_extra
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.state import AgentKind
 
 EGO = "ego"
 _FILES = ("sync", "ego_state_se3", "box_detections_se3", "traffic_light_detections")
+_FILES += ("custom.scenario",)  # of nuPlan
 # columns of these files, beside their time stamps, and of maps
 _EGO = dict(imu_se3=items(pa.float64(), 7))
 _BOXES = dict(
@@ -35,6 +39,7 @@ _BOXES = dict(
     velocity_3d=pa.list_(items(pa.float64(), 3)),  # null where it is unknown
     label=items(pa.uint16()),
 )
+_SCENARIO = dict(data=pa.binary())
 _LIGHTS = dict(lane_id=items(pa.int32()), status=items(pa.uint8()))
 _MAP = dict(map_layer=pa.int8(), object_id=pa.int64(), features=pa.binary(), wkb=pa.binary())
 _LANE = LaneNames(
@@ -50,6 +55,8 @@ _FEATURES = {  # of the elements of a map, by layer
     "lane group": {"intersection_id": (int,)},
     "stop zone": {"stop_zone_type": (int,)},
 }
+_TOO_NEAR = "scenario without 3 s before and 15 s after its begin"
+HISTORY_S, LENGTH_S = 3.0, 18.0  # of scenarios whose begin is given
 _DRIVABLE = ("lane group", "intersection", "car park", "drivable area")
 
 
@@ -60,12 +67,34 @@ class Py123dReader(SceneFolder):
     pattern = "ego_state_se3.arrow"
     hint = "give the folder that py123d wrote, with logs/ and maps/"
 
+    def __init__(
+        self,
+        source: Path,
+        *,
+        vehicles: bool = False,
+        starts: Mapping[str, Sequence[int]] | None = None,
+    ) -> None:
+        """Logs of a folder; with `starts`, by log, the scenarios that begin at these times [us]."""
+        super().__init__(source, vehicles=vehicles)
+        self._starts = starts
+        if starts is not None:
+            self.settings = {**self.settings, "starts": {k: list(v) for k, v in starts.items()}}
+
     def recordings(self) -> list[str]:
         """Folders of the logs, sorted."""
-        return [str(Path(file).parent) for file in super().recordings()]
+        found = [str(Path(file).parent) for file in super().recordings()]
+        if self._starts is None:
+            return found
+        missing = set(self._starts) - {Path(path).name for path in found}
+        if missing:
+            raise ConversionError(
+                f"{self.source}: {len(missing)} logs are not there, such as {min(missing)}",
+                "give the folder that holds them, or leave them out",
+            )
+        return [path for path in found if Path(path).name in self._starts]
 
     def files(self, recording: str) -> list[Path]:
-        """Tracks, lights, and the map of the log or of its city."""
+        """Tracks, lights, routes, and the map of the log or of its city."""
         path = Path(recording)
         files = [*(path / f"{name}.arrow" for name in _FILES), _read_sync(path)[1]]
         return [file for file in files if file.is_file()]
@@ -83,13 +112,39 @@ class Py123dReader(SceneFolder):
             samples = _read_tracks(path)
         lights = _read_lights(path)
         city = path.name if map_path.parent == path else about.get("location")
-        road = _read_map(map_path, f"{dataset}-{city}", lights.names if lights else ())
+        road, groups = _read_map(map_path, f"{dataset}-{city}", lights.names if lights else ())
+        how = self.recorded_ego(EGO)
+        if not self.vehicles:
+            how["routes"] = _read_routes(path, groups, samples.start_us)
+        if self._starts is not None:
+            begins = [(us - samples.start_us) * 1e-6 for us in sorted(self._starts[path.name])]
+            spans = [Span(round(begin - HISTORY_S, 2), LENGTH_S, HISTORY_S) for begin in begins]
+            fits = [s for s in spans if 0.0 <= s.start_s <= samples.duration - LENGTH_S + 0.05]
+            how["spans"] = fits
+            how["warnings"] = {_TOO_NEAR: len(spans) - len(fits)}
         source = f"{dataset} {split}, through py123d {about.get('version')}"
         licences = (text for name, text in codes.LICENCES.items() if dataset.startswith(name))
         metadata = {"source": source, "licence": next(licences, "that of the source")}
-        return SourceRecording(
-            samples, road, lights=lights, metadata=metadata, **self.recorded_ego(EGO)
-        )
+        return SourceRecording(samples, road, lights=lights, metadata=metadata, **how)
+
+
+def read_starts(path: Path) -> dict[str, list[int]]:
+    """Times [us] by log of a CSV file with columns `log_name` and `time_us`.
+
+    Raises:
+        ConversionError: It cannot be read, or has no such columns.
+    """
+    starts: dict[str, list[int]] = {}
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            for row in csv.DictReader(file):
+                starts.setdefault(row["log_name"], []).append(int(row["time_us"]))
+    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+        raise ConversionError(
+            f"{path}: {type(error).__name__}: {error}",
+            "give a CSV file with columns log_name and time_us, in microseconds",
+        ) from error
+    return starts
 
 
 class _File(SourceFile):
@@ -180,6 +235,26 @@ def _read_ego(log: Path) -> tuple[IntArray, FloatArray]:
     return stamps, np.column_stack([*moved, heading + turn, np.tile(size, (len(x), 1))])
 
 
+def _read_routes(
+    log: Path, groups: Mapping[int, list[str]], start_us: int
+) -> list[tuple[float, list[list[str]]]]:
+    """Routes of the log by the time since its first frame [s], where they change."""
+    file = _File(log / "custom.scenario.arrow")
+    if not file.path.is_file():
+        return []
+    stamps, table, _ = file.steps(_SCENARIO, {})
+    routes: list[tuple[float, list[list[str]]]] = []
+    before = None
+    for time_us, packed in zip(stamps.tolist(), table.column(0).to_pylist(), strict=True):
+        if packed != before:
+            before, form = packed, {"route_roadblock_ids": [str]}
+            found = file.unpack(packed, _load, form, f"'data' at {time_us}")
+            blocks = [int(name) for name in found["route_roadblock_ids"] if name.isdecimal()]
+            lanes = [groups[block] for block in blocks if block in groups]
+            routes.append(((time_us - start_us) * 1e-6, lanes))
+    return routes
+
+
 def _read_lights(log: Path) -> LightStates | None:
     file = _File(log / "traffic_light_detections.arrow")
     if not file.path.is_file():
@@ -190,8 +265,8 @@ def _read_lights(log: Path) -> LightStates | None:
 
 
 @lru_cache(maxsize=1)  # logs of one city follow each other
-def _read_map(path: Path, name: str, lit: tuple[str, ...]) -> BuiltMap:
-    """A map; `lit` are the lanes that have a light."""
+def _read_map(path: Path, name: str, lit: tuple[str, ...]) -> tuple[BuiltMap, dict[int, list[str]]]:
+    """A map, and the lanes of its groups; `lit` are the lanes that have a light."""
     file = _File(path)
     elements: dict[str, list[Any]] = {layer: [] for layer in _FEATURES}
     areas: dict[str, list[Any]] = {layer: [] for layer in codes.LAYERS.values() if layer != "lane"}
@@ -204,7 +279,9 @@ def _read_map(path: Path, name: str, lit: tuple[str, ...]) -> BuiltMap:
             areas[layer].append(file.area(wkb, f"wkb of {place}"))
     inside = {n for n, group in elements["lane group"] if group.get("intersection_id") is not None}
     pieces = []
+    groups: dict[int, list[str]] = {}
     for number, lane in elements["lane"]:
+        groups.setdefault(lane.get("lane_group_id"), []).append(str(number))
         if lane.get("lane_type") != codes.BIKE_LANE:
             light = str(number) if str(number) in lit else None
             inner = lane.get("lane_group_id") in inside
@@ -223,4 +300,4 @@ def _read_map(path: Path, name: str, lit: tuple[str, ...]) -> BuiltMap:
         car_parks=areas["car park"],
     )
     with file.naming():
-        return build_lane_map(source)
+        return build_lane_map(source), groups

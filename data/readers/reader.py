@@ -27,6 +27,9 @@ class SourceRecording:
     left_out_s: float = 0.0  # time at its end that no scenario reaches [s]
     needs_scenario: bool = False  # whether it is an error if none is left
     lights: LightStates | None = None
+    # routes that the source has itself, of the recording car: time from which on [s], and by block
+    # the ids of the lanes in it; where there is none, or none on the map, routes are found
+    routes: Sequence[tuple[float, Sequence[Sequence[str]]]] = ()
     metadata: Mapping[str, object] = field(default_factory=dict)  # source, licence and so on
     warnings: Mapping[str, int] = field(default_factory=dict)  # what the reader left out, by kind
     details: Mapping[str, Any] = field(default_factory=dict)  # for the report, JSON values only

@@ -4,8 +4,10 @@ A route is nuPlan's rule over the ego's path, then gaps are closed and the road 
 Blocks are indices of `VectorMap.blocks` here, ids only at the end.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -47,6 +49,22 @@ def find_route(road: VectorMap, poses: FloatArray, config: ConversionConfig) -> 
     names = road.blocks.ids
     is_linked = all(b in road.block_outgoing.at(a) for a, b in pairwise(driven))
     return Route(tuple(names[block] for block in (*driven, *ahead)), len(driven), is_linked)
+
+
+def with_known_blocks(
+    route: Route, road: VectorMap, segments: Mapping[str, Sequence[Any]], known: Sequence[str]
+) -> Route:
+    """The route with the blocks that lanes of the source lie in, if there are two or more.
+
+    `segments` are those of `BuiltMap`, `known` the ids of the lanes, in order.
+    """
+    edges: dict[str, list[int]] = {}
+    for number, name in enumerate(road.edges.ids):
+        for part in segments.get(name, ()):
+            edges.setdefault(part.piece.id, []).append(number)
+    blocks = [int(road.block_of[edge]) for lane in known for edge in edges.get(lane, ())]
+    ids = dict.fromkeys(road.blocks.ids[block] for block in blocks if block >= 0)
+    return replace(route, ids=tuple(ids)) if len(ids) >= _MIN_BLOCKS else route
 
 
 def follow_blocks(road: VectorMap, points: FloatArray) -> list[int]:

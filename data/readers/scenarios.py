@@ -21,7 +21,7 @@ from shiftsim.data.maps.lights import light_rows
 from shiftsim.data.readers import windows
 from shiftsim.data.readers.placement import extent_of
 from shiftsim.data.readers.reader import SourceRecording
-from shiftsim.data.readers.routes import find_route, starts_on_lane
+from shiftsim.data.readers.routes import find_route, starts_on_lane, with_known_blocks
 from shiftsim.data.readers.samples import (
     ROW_S,
     ROW_US,
@@ -255,6 +255,10 @@ def _scenario(
     route = find_route(road, states[:, :3], config)
     if route is None or not route.is_linked:
         return windows.ROUTE if route is None else windows.GAP
+    begun = [lanes for from_s, lanes in source.routes if from_s <= span.start_s + span.history_s]
+    if begun:
+        known = [lane for block in begun[-1] for lane in block]
+        route = with_known_blocks(route, road, source.map.segments, known)
     goal = states[-1, :3].copy()
     last = int(np.searchsorted(samples.track, track, side="right")) - 1
     if samples.time[last] > span.start_s + span.length_s:

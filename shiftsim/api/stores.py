@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from shiftsim.data import open_store
 from shiftsim.data.store.reading import ScenarioStore
-from shiftsim.errors import one_of
+from shiftsim.errors import ConfigError, one_of
 from shiftsim.files import DEFAULT_STORE, store_path
 
 if TYPE_CHECKING:
@@ -148,6 +148,7 @@ def convert_dataset(
     store: str | Path,
     *,
     egos: str = "recorded",
+    at: str | Path | None = None,
     workers: int = 0,
     on_progress: OnProgress = _silent,
 ) -> "ConversionReport":
@@ -159,6 +160,8 @@ def convert_dataset(
         store: Name or folder of the store.
         egos: `recorded`, the recording car, or `vehicles`, each vehicle that drives; of CommonRoad
             always the latter.
+        at: Of py123d: a CSV file with columns `log_name` and `time_us`; only the scenarios that
+            begin there are made.
         workers: Processes; as many as the machine suggests where 0.
         on_progress: Called with scenes done, scenes in all and a name.
 
@@ -173,12 +176,14 @@ def convert_dataset(
     """
     from shiftsim.data.readers.av2 import Av2Reader
     from shiftsim.data.readers.commonroad import CommonRoadReader
-    from shiftsim.data.readers.py123d import Py123dReader
+    from shiftsim.data.readers.py123d import Py123dReader, read_starts
 
+    if at and kind != "py123d":
+        raise ConfigError(f"at is for py123d, not {kind}", hint="leave it out")
     vehicles = one_of("egos", egos, ("recorded", "vehicles")) == "vehicles"
     readers: dict[str, Any] = {
         "av2": partial(Av2Reader, vehicles=vehicles),
-        "py123d": partial(Py123dReader, vehicles=vehicles),
+        "py123d": partial(Py123dReader, vehicles=vehicles, starts=at and read_starts(Path(at))),
         "commonroad": CommonRoadReader,
     }
     reader = readers[one_of("data set", kind, readers)](Path(folder))

@@ -38,6 +38,13 @@ Egos = Annotated[
         "commonroad."
     ),
 ]
+At = Annotated[
+    Path | None,
+    Option(
+        help="Of py123d: only scenarios that begin where this CSV file says, by columns log_name "
+        "and time_us."
+    ),
+]
 _DATASETS = {
     "av2": """Convert scenes of Argoverse 2 motion forecasting, train or val.
 
@@ -259,10 +266,11 @@ def _add_dataset(kind: str, text: str) -> None:
         folder: Source,
         store: Store,
         egos: Egos = "recorded",
+        at: At = None,
         quiet: Quiet = False,
         as_json: Json = False,
     ) -> None:
-        make = partial(shiftsim.convert_dataset, kind, folder, egos=egos, **settings)
+        make = partial(shiftsim.convert_dataset, kind, folder, egos=egos, at=at, **settings)
         _convert(make, store, "dataset", _scene_lines, quiet=quiet, as_json=as_json)
 
 

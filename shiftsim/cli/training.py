@@ -63,6 +63,17 @@ def pluto(
     _imitate(ImitationSettings(planner="pluto", **settings), resume, quiet)
 
 
+@app.command()
+@cli.with_settings(*_LEARNT, of=ImitationSettings)
+def diffusion_planner(
+    settings: cli.Settings,
+    resume: bool = Option(False, "--resume", help="Go on where it was ended."),
+    quiet: Quiet = False,
+) -> None:
+    """Train Diffusion Planner from recordings."""
+    _imitate(ImitationSettings(planner="diffusion-planner", **settings), resume, quiet)
+
+
 def _imitate(chosen: ImitationSettings, resume: bool, quiet: bool) -> None:
     from shiftsim.planners.learned.checkpoint import require_torch
 

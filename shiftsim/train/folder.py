@@ -20,7 +20,7 @@ from shiftsim.runs.config import Option, setting
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from shiftsim.train.samples import Block
+    from shiftsim.train.stream import Block
 
 SETTINGS = "settings.json"
 STATE = "state.pt"  # all that is needed to go on
@@ -84,16 +84,20 @@ class Preset(NamedTuple):
 
 PRESETS = {
     # two cores for 90 minutes; the rate is that of the authors for this batch, by the square root
-    "laptop": Preset(150_000, 3, 32, 5e-4),
+    "laptop": Preset(150_000, 3, 32, 1e-3),
     "workstation": Preset(5_000_000, 10, 128, 1e-3),
     "paper": Preset(25_000_000, 25, 128, 1e-3, published=True),
 }
-COSTS = {"plantf": 1.0, "pluto": 1.6}  # of a sample; presets have as many as take the same time
+COSTS = {
+    "plantf": 1.0,
+    "pluto": 1.6,
+    "diffusion-planner": 2.5,
+}  # of a sample; presets have as many as take the same time
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImitationSettings:
-    """What a training of PlanTF or PLUTO depends on, and where and how it is done."""
+    """What a training from recordings depends on, and where and how it is done."""
 
     planner: str = "plantf"
     out: Path = field(metadata={"option": Option("Folder for networks and curves.")})
@@ -137,7 +141,9 @@ class FeatureSettings:
 
     store: str
     planner: str = field(
-        metadata={"option": Option("Whose features: plantf or pluto.", ("--for",))}
+        metadata={
+            "option": Option("Whose features: plantf, pluto or diffusion-planner.", ("--for",))
+        }
     )
     out: Path = field(metadata={"option": Option("Folder for the samples.")})
     split: str = setting("", "Split of the store; all its scenarios if empty.")
@@ -252,8 +258,13 @@ def write_state(path: Path, state: dict[str, Any]) -> None:
 
 def write_network(path: Path, weights: Weights, planner: str = "carl") -> None:
     """Write a network as `--checkpoint PLANNER=PATH` reads it."""
+    from shiftsim.planners.learned.checkpoint import network_module
+
     tensors = {name: value.detach().cpu().contiguous() for name, value in weights.items()}
-    write_tensors(path, tensors, {"planner": planner})
+    args = getattr(network_module(planner), "DEFAULT_ARGS", None)
+    # one entry only: several have no order
+    known = {"args": json.dumps(args)} if args else {"planner": planner}
+    write_tensors(path, tensors, known)
 
 
 def write_tensors(path: Path, tensors: "dict[str, Tensor]", known: dict[str, str]) -> None:
@@ -277,6 +288,7 @@ TERMS = {  # by planner: what its curve has beside the loss, of which three are 
     "carl": {"acceleration_error": 1.0, "steering_error": 10.0},
     "plantf": {"reg_loss": 1.0, "prediction_loss": 1.0, "cls_loss": 1.0},
     "pluto": {"reg_loss": 1.0, "prediction_loss": 1.0, "cls_loss": 1.0, "ref_free_reg_loss": 1.0},
+    "diffusion-planner": {"ego_planning_loss": 1.0, "neighbor_prediction_loss": 1.0},
 }
 
 
@@ -332,12 +344,14 @@ def write_features(settings: FeatureSettings, on_message: OnMessage) -> dict[str
     """
     from shiftsim.data import open_store
     from shiftsim.runs.scenarios import open_split
-    from shiftsim.train.samples import Stream, load_blocks
+    from shiftsim.train.stream import Stream, load_blocks
 
     store = open_store(settings.store)
     tokens = tuple(sorted(open_split(store, settings.split)[0].tokens))
     prepare_folder(settings, store.hash, resume=True)
-    stream = Stream(settings.store, tokens, settings.seed, sys.maxsize, settings.planner)
+    stream = Stream(
+        settings.store, tokens, settings.seed, sys.maxsize, settings.planner, as_published=True
+    )
     files: dict[str, int] = {}  # samples of each
     failed, blocks, reported = Counter[str](), None, monotonic()
     for number in count():

@@ -7,7 +7,7 @@ values of a network. B scenes, A agents of which the first is the ego, T = 80 st
 
 import copy
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -15,6 +15,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from shiftsim.planners.learned.checkpoint import network_module
+from shiftsim.planners.learned.diffusion.network import DiffusionNetwork
+from shiftsim.planners.learned.diffusion.network_sampler import log_alpha_at
 from shiftsim.planners.learned.network import Attention
 from shiftsim.planners.learned.plantf.network import Outputs as PlanTfOutputs
 from shiftsim.planners.learned.pluto.network import NEVER
@@ -43,6 +45,30 @@ PIXEL, INSIDE = 0.2, 0.95  # m; share of the raster in which a point counts
 TEMPERATURE = 0.1  # of the contrastive loss
 CLIP = 5.0  # of the norm of all gradients
 WARM_UP, FLOOR = 0.05, 2e-3  # here: share of rising, end of the learning rate as a share
+# layers of Diffusion Planner that begin small, and at zero
+SMALL = ("pos_emb", "type_emb", "speed_limit_emb", "traffic_emb", "t_embedder.mlp.0")
+SMALL += ("t_embedder.mlp.2",)
+ZERO = ("adaLN_modulation.1", "final_layer.proj.4")
+# here plans and predictions are in units of two rows: at once, and what they grow by per second
+PLAN_MEAN = ((0.0, 0.0, 1.0, 0.0, 4.5, 0.0), (4.5, 0.0, 0.0, 0.0, 0.0, 0.0))
+PLAN_SIZE = ((0.5, 0.3, 0.05, 0.15, 2.0, 1.0), (2.5, 1.5, 0.04, 0.05, 0.2, 0.2))
+OTHERS_MEAN = ((0.0, 0.0, 1.0, 0.0, 0.0, 0.0), (0.0,) * 6)
+OTHERS_SIZE = ((0.2, 0.2, 0.1, 0.2, 1.0, 1.0), (2.0, 2.0, 0.05, 0.05, 0.2, 0.2))
+_PLACE, _HEADING, _VELOCITY, _POSE = slice(2), slice(2, 4), slice(4, 6), slice(4)
+_OF_PLUTO = (("loc", _PLACE), ("yaw", _HEADING), ("vel", _VELOCITY))
+LAST_LAYERS = {  # of networks, and the columns that they say
+    "plantf": {"trajectory_decoder.loc.3": _POSE, "agent_predictor.3": _PLACE},
+    "pluto": {
+        "ref_free_decoder.mlp.3": _POSE,
+        **{f"planning_decoder.{name}_head.mlp.3": columns for name, columns in _OF_PLUTO},
+        **{f"agent_predictor.{name}_predictor.mlp.3": columns for name, columns in _OF_PLUTO},
+    },
+}
+FINENESS = 5.0  # of a loss: errors above the share 1 / FINENESS of a unit count in proportion
+DRAWS, EARLIEST = 8, 1e-3  # of Diffusion Planner: for each scene; least time
+DECAYS = {"diffusion-planner": 0.01}  # of the weights, where it is not 1e-4 of products only
+HIGHEST = {"diffusion-planner": 5e-4}  # learning rate, whatever the preset
+HIDDEN = 0.5  # here: share of the scalars of the ego state that are not shown
 LANES = 2  # parts of a batch that a CPU computes side by side
 
 
@@ -61,7 +87,46 @@ def motion(target: Tensor) -> Tensor:
     return torch.cat([target[..., :2], angle.cos(), angle.sin()], dim=-1)
 
 
-def plantf_loss(out: PlanTfOutputs, target: Tensor, valid: Tensor) -> Losses:
+class Units(NamedTuple):
+    """What plans and predictions are measured in by step, where it is not metres.
+
+    In metres the last seconds outweigh the first one, which is what is driven. Columns are x, y
+    [m], cosine and sine of the heading, velocity [m/s].
+    """
+
+    mean: Tensor  # (80, 6) of the plan
+    size: Tensor  # (80, 6) of what differs from it
+    others_mean: Tensor  # (80, 6) of the predictions
+    others_size: Tensor  # (80, 6)
+
+    @classmethod
+    def make(cls, device: str) -> "Units":
+        """As in what was recorded in all kinds of towns, about."""
+        time = 0.1 * torch.arange(1, 81, device=device)[:, None]
+        rows = torch.tensor([PLAN_MEAN, PLAN_SIZE, OTHERS_MEAN, OTHERS_SIZE], device=device)
+        return cls(*(at_once + per_second * time for at_once, per_second in rows))
+
+    def layers(self, planner: str) -> dict[str, tuple[Tensor, Tensor]]:
+        """By last layer of a network: mean and size of its outputs, each (outputs,)."""
+        of_plan, of_others = (self.mean, self.size), (self.others_mean, self.others_size)
+        found = {}
+        for name, columns in LAST_LAYERS[planner].items():
+            mean, size = of_others if "agent_predictor" in name else of_plan
+            found[name] = mean[:, columns].flatten(), size[:, columns].flatten()
+        return found
+
+    def in_metres(self, planner: str, weights: Weights) -> Weights:
+        """Weights of a network whose last layers are in these units as files have them."""
+        found = dict(weights)
+        for name, (mean, size) in self.layers(planner).items():
+            found[f"{name}.weight"] = weights[f"{name}.weight"] * size[:, None]
+            found[f"{name}.bias"] = weights[f"{name}.bias"] * size + mean
+        return found
+
+
+def plantf_loss(
+    out: PlanTfOutputs, target: Tensor, valid: Tensor, units: Units | None = None
+) -> Losses:
     """Of PlanTF: `reg_loss`, `cls_loss` of the mode nearest to the target, `prediction_loss`.
 
     Args:
@@ -69,12 +134,17 @@ def plantf_loss(out: PlanTfOutputs, target: Tensor, valid: Tensor) -> Losses:
         target: (B, A, 80, 3) change of x [m], y [m] and heading [rad] since the present, in the
             frame of the ego; 0 where not recorded.
         valid: (B, A, 80) whether it was recorded. The terms of the ego take all of it.
+        units: What errors are measured in, a fifth of it; None for metres.
     """
     ego = motion(target[:, 0])
     away = torch.linalg.vector_norm(out.trajectory[..., :2].detach() - ego[:, None, :, :2], dim=-1)
     best = away.sum(dim=-1).argmin(dim=-1)
     chosen = out.trajectory[torch.arange(len(best), device=best.device), best]
-    others = functional.smooth_l1_loss(out.prediction, target[:, 1:, :, :2], reduction="none")
+    said, others = out.prediction, target[:, 1:, :, :2]
+    if units:
+        chosen, ego = (value * FINENESS / units.size[:, _POSE] for value in (chosen, ego))
+        said, others = (value * FINENESS / units.others_size[:, _PLACE] for value in (said, others))
+    others = functional.smooth_l1_loss(said, others, reduction="none")
     return _sum(
         reg_loss=functional.smooth_l1_loss(chosen, ego),
         cls_loss=functional.cross_entropy(out.probability, best),
@@ -138,6 +208,7 @@ def pluto_loss(
     *,
     signed: Tensor | None = None,
     contrast: tuple[Tensor, Tensor] | None = None,
+    units: Units | None = None,
 ) -> Losses:
     """Of PLUTO.
 
@@ -150,6 +221,7 @@ def pluto_loss(
         signed: (B, H, W) of `road_loss`, or None for no such term.
         contrast: Arguments of `contrastive_loss`. The batch is then anchors, positives, negatives,
             of which the last third counts in no other term.
+        units: As of `plantf_loss`.
     """
     count = len(target) * 2 // 3 if contrast else len(target)
     target, valid, scene = target[:count], valid[:count], torch.arange(count, device=target.device)
@@ -158,15 +230,21 @@ def pluto_loss(
     line, mode = pluto_assignment(projection[:count], lines, valid[:, 0])
     chosen, ego = trajectory[scene, line, mode], target[:, 0]
 
-    def error(said: Tensor, recorded: Tensor, counted: Tensor) -> Tensor:
+    def error(
+        said: Tensor, recorded: Tensor, counted: Tensor, sizes: Tensor | None = None
+    ) -> Tensor:
+        if sizes is not None:
+            said, recorded = (v * FINENESS / sizes[:, : v.shape[-1]] for v in (said, recorded))
         each = functional.smooth_l1_loss(said, recorded, reduction="none").sum(dim=-1)
         return _mean_of(each, counted)
 
+    own, of_others = (units.size, units.others_size) if units else (None, None)
+
     terms = {
-        "reg_loss": error(chosen, ego, valid[:, 0]),
+        "reg_loss": error(chosen, ego, valid[:, 0], own),
         "cls_loss": functional.cross_entropy(logits.flatten(1), line * logits.shape[-1] + mode),
-        "ref_free_reg_loss": error(out.ref_free_trajectory[:count], ego[..., :4], valid[:, 0]),
-        "prediction_loss": error(out.prediction[:count], target[:, 1:], valid[:, 1:]),
+        "ref_free_reg_loss": error(out.ref_free_trajectory[:count], ego[..., :4], valid[:, 0], own),
+        "prediction_loss": error(out.prediction[:count], target[:, 1:], valid[:, 1:], of_others),
     }
     if signed is not None:
         terms["collision_loss"] = road_loss(chosen, signed[:count])
@@ -188,6 +266,28 @@ def diffusion_loss(said: Tensor, clean: Tensor, valid: Tensor) -> Losses:
         neighbor_prediction_loss=_mean_of(error[:, 1:], valid),
         ego_planning_loss=error[:, 0].mean(),
     )
+
+
+def diffusion_losses(
+    network: DiffusionNetwork, batch: Batch, random: torch.Generator, draws: int = DRAWS
+) -> Losses:
+    """Of Diffusion Planner, mean over so many draws of time and noise, which share the encoder."""
+    scene = network.normalise(batch.inputs)
+    current, absent = network.present(scene)
+    poses = motion(batch.target)
+    clean = network.state_normaliser(torch.where(batch.valid[..., None], poses, 0.0))
+    options: dict[str, Any] = {"device": clean.device, "generator": random}
+    times = EARLIEST + (1.0 - EARLIEST) * torch.rand((draws, len(clean)), **options)
+    context = network.context(scene, absent, times)
+    found = []
+    for call, time in enumerate(times):
+        alpha = torch.exp(log_alpha_at(time))[:, None, None, None]
+        noise = torch.randn(clean.shape, **options)
+        noisy = alpha * clean + torch.sqrt(1.0 - alpha**2) * noise
+        states = torch.cat([current[:, :, None], noisy], dim=2)
+        said = network.dit(states.flatten(2), call, context).view(states.shape)[:, :, 1:]
+        found.append(diffusion_loss(said, clean, batch.valid[:, 1:]))
+    return {name: torch.stack([one[name] for one in found]).mean() for name in found[0]}
 
 
 def parameter_groups(network: nn.Module, decay: float = 1e-4) -> list[dict[str, Any]]:
@@ -216,27 +316,52 @@ def diffusion_rate_of_epoch(epoch: int, rate: float = 5e-4) -> float:
 
 
 def begin(network: nn.Module, seed: int) -> None:
-    """First values as of the authors of PlanTF and PLUTO, from a seed."""
+    """First values as of the authors, from a seed."""
     random = torch.Generator().manual_seed(seed)
-    for module in network.modules():
+    for name, module in network.named_modules():
         if isinstance(module, nn.Linear):
-            nn.init.xavier_uniform_(module.weight, generator=random)
+            if name.endswith(SMALL):
+                nn.init.normal_(module.weight, 0.0, 0.02, generator=random)
+            elif name.endswith(ZERO):
+                nn.init.zeros_(module.weight)
+            else:
+                nn.init.xavier_uniform_(module.weight, generator=random)
             if module.bias is not None:
                 nn.init.zeros_(module.bias)
         elif isinstance(module, nn.Embedding):
             nn.init.normal_(module.weight, 0.0, 0.02, generator=random)
 
 
-def loss_of(planner: str, out: Any, batch: Batch) -> Losses:
-    """Of PlanTF, or of PLUTO without the road and without contrast."""
+def losses_of(
+    planner: str,
+    network: Any,
+    batch: Batch,
+    random: torch.Generator,
+    units: Units | None = None,
+) -> Losses:
+    """Of a network that is trained; of PLUTO without the road and without contrast."""
+    if planner == "diffusion-planner":
+        return diffusion_losses(network, batch, random)
+    network.agent_encoder.ego_state_emb.random = random
+    out = network(batch.inputs)
     if planner == "pluto":
         assert batch.projection is not None
-        return pluto_loss(out, batch.target, batch.valid, batch.projection)
-    return plantf_loss(out, batch.target, batch.valid)
+        return pluto_loss(out, batch.target, batch.valid, batch.projection, units=units)
+    return plantf_loss(out, batch.target, batch.valid, units)
+
+
+class _Scaled(NamedTuple):
+    """Hook of a layer: its outputs times sizes, above means."""
+
+    mean: Tensor
+    size: Tensor
+
+    def __call__(self, module: nn.Module, inputs: Any, output: Tensor) -> Tensor:
+        return self.mean + self.size * output
 
 
 class ImitationLearner(TrainedNetwork):
-    """The network of PlanTF or PLUTO, trained on samples of a store.
+    """The network of PlanTF, PLUTO or Diffusion Planner, trained on samples of a store.
 
     A CPU computes the parts of a batch side by side, each with statistics of its own, as the
     authors' processes do without synchronisation; those of the first part are kept.
@@ -248,7 +373,17 @@ class ImitationLearner(TrainedNetwork):
         network = network_module(planner).build_network()
         begin(network, seed)
         network.to(device).train()
-        super().__init__(network, parameter_groups(network), total, betas=(0.9, 0.999))
+        self._units = None
+        if planner in LAST_LAYERS and not preset.published:
+            self._units = Units.make(device)
+            for name, (mean, size) in self._units.layers(planner).items():
+                network.get_submodule(name).register_forward_hook(_Scaled(mean, size))
+            network.agent_encoder.ego_state_emb.state_dropout = HIDDEN
+        if planner in DECAYS:
+            groups = [{"params": list(network.parameters()), "weight_decay": DECAYS[planner]}]
+        else:
+            groups = parameter_groups(network)
+        super().__init__(network, groups, total, betas=(0.9, 0.999))
         self.batch, self._preset, self._device, self._seed = preset.batch, preset, device, seed
         self._planner, self._terms = planner, tuple(TERMS[planner])
         self.place = (0, 0)  # of the next batch: the block of the stream, and the batch in it
@@ -258,8 +393,6 @@ class ImitationLearner(TrainedNetwork):
         shared = {id(value): value for value in self._trained}  # the rest is copied
         others = [copy.deepcopy(network, dict(shared)) for _ in range(count - 1)]
         self._lanes = [network, *others]
-        for lane in self._lanes:
-            lane.agent_encoder.ego_state_emb.random = torch.Generator(device)
         keep_memory()
 
     def learn(self, batch: Batch) -> StepResult:
@@ -269,9 +402,14 @@ class ImitationLearner(TrainedNetwork):
         count = len(parts)
         if self._preset.published:
             rounds = self._preset.rounds
-            rate = rate_of_epoch(self.step * rounds // self.total, rounds, rate=self._preset.rate)
+            epoch, rate = self.step * rounds // self.total, self._preset.rate
+            if self._planner == "diffusion-planner":
+                rate = diffusion_rate_of_epoch(epoch)
+            else:
+                rate = rate_of_epoch(epoch, rounds, rate=rate)
         else:
-            rate = self._preset.rate * schedule(self.step / self.total, WARM_UP, FLOOR)
+            highest = min(self._preset.rate, HIGHEST.get(self._planner, self._preset.rate))
+            rate = highest * schedule(self.step / self.total, WARM_UP, FLOOR)
         apply_gradient(self.optimiser, self._trained, found, count, clip=CLIP, rate=rate)
         self.count_step()
         terms = dict(zip(self._terms, (found.numbers / count).tolist(), strict=True))
@@ -281,8 +419,8 @@ class ImitationLearner(TrainedNetwork):
         """Of one part of a batch."""
         key = np.random.SeedSequence([self._seed, 4, self.step, number])
         drawn = int(key.generate_state(1, np.uint64)[0] >> np.uint64(1))
-        network.agent_encoder.ego_state_emb.random.manual_seed(drawn)
-        losses = loss_of(self._planner, network(batch.inputs), batch)
+        random = torch.Generator(self._device).manual_seed(drawn)
+        losses = losses_of(self._planner, network, batch, random, self._units)
         gradients = torch.autograd.grad(  # of PLUTO some layers serve the contrast only
             losses["loss"], self._trained, allow_unused=True, materialize_grads=True
         )
@@ -291,7 +429,10 @@ class ImitationLearner(TrainedNetwork):
 
     def driving(self) -> Weights:
         """The network that drives."""
-        return self.network.state_dict() if self._preset.published else super().driving()
+        if self._preset.published and self._planner != "diffusion-planner":
+            return self.network.state_dict()
+        weights = super().driving()
+        return self._units.in_metres(self._planner, weights) if self._units else weights
 
     def state(self) -> dict[str, Any]:
         """All that is needed to go on."""

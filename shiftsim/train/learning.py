@@ -211,18 +211,20 @@ class TrainedNetwork:
         """`total` steps are to be done; `groups` of parameters are those of the optimiser."""
         self.network, self.total, self.step = network, total, 0
         self.optimiser = torch.optim.AdamW(groups, lr=RATE, betas=betas, fused=True)
-        self.mean = {name: value.detach().clone() for name, value in self._parameters.items()}
+        self.mean = {name: value.detach().clone() for name, value in self._averaged.items()}
 
     @property
-    def _parameters(self) -> dict[str, Tensor]:
-        return dict(self.network.named_parameters())
+    def _averaged(self) -> dict[str, Tensor]:
+        """Weights, and statistics of what goes through them."""
+        values = self.network.state_dict().items()
+        return {name: value for name, value in values if value.is_floating_point()}
 
     def count_step(self) -> None:
         """Take the weights after one more step into the mean."""
         self.step += 1
         drift = 1.0 - min(AVERAGED, (1.0 + self.step) / (10.0 + self.step))
-        for name, value in self._parameters.items():
-            self.mean[name].lerp_(value.detach(), drift)
+        for name, value in self._averaged.items():
+            self.mean[name].lerp_(value, drift)
 
     def driving(self) -> Weights:
         """The network with the mean weights, which drives."""

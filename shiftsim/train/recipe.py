@@ -17,6 +17,8 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
+import numpy as np
+
 from shiftsim.data import open_store
 from shiftsim.errors import DataError
 from shiftsim.files import write_text
@@ -26,8 +28,10 @@ from shiftsim.runs.config import make_config
 from shiftsim.runs.execute import execute
 from shiftsim.runs.filter import read_filter_results
 from shiftsim.runs.prepare import prepare
+from shiftsim.runs.results import Run
 from shiftsim.runs.scenarios import find_split
 from shiftsim.train import folder, learning
+from shiftsim.train.checks import check
 from shiftsim.train.driving import (
     TESTED,
     TOGETHER,
@@ -49,11 +53,13 @@ from shiftsim.train.folder import (
     Weights,
 )
 from shiftsim.train.imitation import ImitationLearner
-from shiftsim.train.samples import Stream, load_blocks
+from shiftsim.train.samples import KINDS
 from shiftsim.train.states import States, write_part
+from shiftsim.train.stream import Stream, load_blocks
 
 _WRITE_EVERY, _REPORT_EVERY = 120.0, 10.0  # s
 _CURVE_EVERY = 50  # steps
+DRIVEN = 0.06  # of the scenarios that are trained on, in each round
 _BASELINE = "constant-velocity"  # driven beside a network, for comparison
 _NO_DRIVER = "deterministic:base"  # where the network does not drive
 
@@ -311,14 +317,69 @@ class ImitationTraining(Recipe):
         self.learner = ImitationLearner(self.planner, self.device, preset, total, seed)
         return steps
 
+    def run(self) -> None:
+        """Do all rounds that are not done yet, then see what the best network acts on."""
+        super().run()
+        settings = self._settings
+        planner = KINDS[self.planner].planner(str(settings.out / BEST), device=self.device)
+        tokens = tested_tokens(self.towns, settings.tests)
+        rows = check(planner, map(open_store(settings.store).read, tokens))
+        folder.write_table(settings.out / "checks.parquet", rows)
+        for row in rows:
+            passed = f"{100.0 * row['passed']:.0f} %" if row["cases"] else "no share"
+            self._on_message(f"{row['check']}: {passed} of {row['cases']} cases")
+
     def _collect(self) -> None:
-        """Nothing: samples are made when they are needed."""
+        """From the second round on, let the network drive where it is trained; see `Stream.driven`.
+
+        The other samples are made when they are needed.
+        """
+        settings, number = self._settings, self.progress.round
+        if number == 0 or settings.recipe.published:
+            return
+        tokens = np.sort(np.concatenate([*map(np.array, self.towns.trained.values())]))
+        drawn = np.random.default_rng([settings.seed, 6, number]).permutation(tokens)
+        share = round(DRIVEN * len(tokens))
+        self._drive(self._driven[-1], sorted(drawn[: max(share, 1)].tolist()), [self.planner])
+
+    @property
+    def _driven(self) -> list[Path]:
+        """Runs of the rounds so far in which the network drove where it is trained."""
+        rounds = 0 if self._settings.recipe.published else self.progress.round
+        return [self._settings.out / "driven" / f"round-{i + 1:02d}" for i in range(rounds)]
+
+    def _drive(self, out: Path, tokens: list[str], planners: list[str], **more: Any) -> Run:
+        """Drive some scenarios with the latest network, with and without noise."""
+        settings, split = self._settings, out.with_suffix(".txt")
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_text(split, "\n".join(tokens) + "\n")
+        shutil.rmtree(out, ignore_errors=True)  # of a training that was ended in it
+        values: dict[str, Any] = {
+            "planners": planners,
+            "checkpoints": [f"{self.planner}={settings.out / LATEST}"],
+            "store": settings.store,
+            "split": str(split),
+            "out": str(out),
+            "noise": list(TESTED),
+            "workers": settings.workers,
+            "batch_size": TOGETHER,
+            **more,
+        }
+        return execute(prepare(make_config(values)))
 
     def _results(self) -> Iterator[learning.StepResult]:
         settings, learner = self._settings, self.learner
         tokens = tuple(sorted(token for town in self.towns.trained.values() for token in town))
-        batch = settings.recipe.batch
-        stream = Stream(settings.store, tokens, settings.seed, batch, self.planner)
+        preset = settings.recipe
+        stream = Stream(
+            settings.store,
+            tokens,
+            settings.seed,
+            preset.batch,
+            self.planner,
+            preset.published,
+            tuple(map(str, self._driven)),
+        )
         self._on_message(f"{self._where} training on {len(tokens)} scenarios")
         block, done = learner.place
         unused = 0
@@ -342,20 +403,10 @@ class ImitationTraining(Recipe):
         return self.learner.driving()
 
     def _scores(self, network: Path, where: str) -> dict[str, float]:
-        settings = self._settings
-        split, tokens = settings.out / "tests.txt", tested_tokens(self.towns, settings.tests)
-        write_text(split, "\n".join(tokens) + "\n")
-        run_folder = settings.out / "runs" / f"round-{self.progress.round:02d}"
-        shutil.rmtree(run_folder, ignore_errors=True)  # of a training that was ended in it
-        values: dict[str, Any] = {
-            "planners": [self.planner, _BASELINE],
-            "checkpoints": [f"{self.planner}={network}"],
-            "open_loop": True,
-        }
-        values |= {"store": settings.store, "split": str(split), "out": str(run_folder)}
-        values |= {"noise": list(TESTED), "workers": settings.workers, "batch_size": TOGETHER}
+        tokens = tested_tokens(self.towns, self._settings.tests)
         self._on_message(f"{where} testing; samples that could not be made: {self._reasons}")
-        run = execute(prepare(make_config(values)))
+        run_folder = self._settings.out / "runs" / f"round-{self.progress.round:02d}"
+        run = self._drive(run_folder, tokens, [self.planner, _BASELINE], open_loop=True)
         rows = [row for row in run.scores.to_pylist() if row["planner"] == self.planner]
         if not rows:
             raise DataError(f"no scenario could be driven to its end, see {str(run_folder)!r}")

@@ -1,19 +1,14 @@
-"""Samples of a store for PlanTF and PLUTO, made when they are needed: nothing is cached.
+"""Samples of a store for PlanTF, PLUTO and Diffusion Planner, made when needed: nothing is cached.
 
 A sample is one iteration of a recording as the planner would see it, through the planner's own
 features, and what ego and agents did in the 8 s after it. Half of the samples are perturbed: the
 ego is moved away from where it was, and its target leads back to the recording. What differs from
 planner to planner is in `KINDS`.
 
-Which samples there are and what is random in them depends on a seed and on places in the stream
-only. A stream is cut into blocks of some scenarios; a worker makes whole blocks, which come in
-their order whoever makes them.
 """
 
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
-from itertools import count
+from collections.abc import Callable, Sequence
+from dataclasses import fields
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -21,43 +16,52 @@ import numpy as np
 import shapely
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
-from shiftsim.data import open_store
-from shiftsim.errors import ShiftsimError
-from shiftsim.geometry.boxes import boxes_to_corners, boxes_touch, turned, wrap_angles
-from shiftsim.kernels import BoolArray, FloatArray, IntArray
+from shiftsim.geometry.boxes import boxes_to_corners, boxes_touch, from_frame, to_frame, turned
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.learned import features
 from shiftsim.planners.learned.base import LearnedPlanner
+from shiftsim.planners.learned.diffusion import planner as diffusion
+from shiftsim.planners.learned.diffusion.features import Features as DiffusionFeatures
 from shiftsim.planners.learned.plantf import planner as plantf
 from shiftsim.planners.learned.pluto import planner as pluto
 from shiftsim.planners.learned.pluto.world import red_lights
-from shiftsim.sim.planner import History, Observation, observe_log, scene_info
+from shiftsim.sim.planner import History, Observation, observe_log, past_rows
 from shiftsim.world.layers import contains
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import PACIFICA, VX, VY, center_poses
 
 STEPS = features.PLAN_POSES  # of a target
-BATCH, PER_BLOCK = 32, 16  # samples; scenarios
-# share of iterations that are samples: those in whose 8 s the ego turns, drives on, stands
-DRAWN = (0.4, 0.15, 0.05)
-TURNING, STANDING = 0.35, 1.0  # rad from which it turns, m below which it stands
-PERTURBED = 0.5  # share of samples
+PERTURBED, SLOWED = 0.5, 0.5  # share of samples, and of these
+STEP = 0.1  # s
+# of the way back: acceleration and braking [m/s^2], seconds and metres to the recorded path, metres
+# that are looked ahead for the recorded speed
+HARDEST, TIME_BACK, NEAREST_BACK, AHEAD = (1.5, 2.0), 2.5, 8.0, 0.5
 # most that x, y [m], heading [rad], speed [m/s], acceleration [m/s^2], steering angle [rad] and
 # yaw rate [rad/s] are moved by
 NOISE = np.array([1.0, 0.75, 0.35, 1.0, 0.5, 0.2, 0.1])
-NEIGHBOURS = 10  # agents that the ego must not be moved into
+# Diffusion Planner reads the pose only; below the speed [m/s] it is not moved
+MOVED_POSE = NOISE * [0, 1, 1, 0, 0, 0, 0]
+MOVING = 2.0
+NEIGHBOURS = 10  # agents that the ego must not be moved into, and that Diffusion Planner predicts
 
+# a driven ego is a sample if it is this near to the path [m], and at most so many steps late
+MOST_AHEAD, MOST_ASIDE, MOST_LATE = 2.5, 1.5, 80
+
+_ELSEWHERE = "driven far from the recording"
 _SHORT = "less than 8 s recorded after it"
 _NO_ROAD = "no lane or crosswalk around it"
 _NO_LINE = "no reference line"
+_NO_LANE = "no lane within 100 m"
 
 
 class Sample(NamedTuple):
     """One sample. A rows of agents, the ego first."""
 
     features: Any  # of the planner
-    target: np.ndarray  # (A, 80, 3) of `targets`; of PLUTO (A, 80, 6) of `motion_targets`
+    # (A, 80, 3) of `targets`; of PLUTO (A, 80, 6) of `motion_targets`; of Diffusion Planner
+    # (11, 80, 3) poses in the frame of the ego, 0 where not recorded
+    target: np.ndarray
     valid: BoolArray  # (A, 80) steps that count
     projection: np.ndarray | None = None  # (R, 8, 2) of `projections`, of PLUTO only
 
@@ -82,29 +86,27 @@ class Batch(NamedTuple):
 
     def tensors(self) -> dict[str, Tensor]:
         """All by name; `counts` (parts, B) are how many rows of a part are not padding."""
-        labels = {name: value for name, value in self._asdict().items() if value is not None}
+        parts, labels = self._parts, self._asdict()
         del labels["inputs"]
-        return {**self._parts, "counts": torch.tensor(self.inputs.counts), **labels}
+        if "counts" in parts:
+            parts["counts"] = torch.tensor(parts["counts"])
+        return parts | {name: value for name, value in labels.items() if value is not None}
 
     @property
     def _parts(self) -> dict[str, Any]:
+        if isinstance(self.inputs, dict):
+            return dict(self.inputs)
         return {item.name: getattr(self.inputs, item.name) for item in fields(self.inputs)}
 
     def _map(self, change: Callable[[Any], Any]) -> "Batch":
         """The same with all changed that goes by scenes: tensors, and lists of counts."""
         parts = self._parts
-        counts = parts.pop("counts")
+        counts = parts.pop("counts", None)
         moved = {name: change(value) for name, value in parts.items()}
-        moved["counts"] = [change(by_scene) for by_scene in counts]
+        if counts is not None:
+            moved["counts"] = [change(by_scene) for by_scene in counts]
         labels: list[Any] = [None if value is None else change(value) for value in self[1:]]
         return Batch(type(self.inputs)(**moved), *labels)
-
-
-class Block(NamedTuple):
-    """What a worker hands over at once."""
-
-    batches: list[Batch]
-    failed: dict[str, int]  # how many samples could not be made, by reason
 
 
 def perturbed_state(state: FloatArray, noise: FloatArray) -> FloatArray:
@@ -165,6 +167,63 @@ def projections(lines: Sequence[FloatArray], ego: FloatArray) -> np.ndarray:
     return np.stack(both, axis=-1).astype(np.float32)
 
 
+def way_back(speed: float, path: FloatArray) -> FloatArray:
+    """(80, 3) poses that lead an ego that is elsewhere back to the recording, as a driver would.
+
+    Beside the recorded path the ego comes back to it within some metres; behind the recording it
+    gathers speed as a car does and drives as it did at the same place, and never ahead of it. The
+    targets of the authors of PlanTF and PLUTO are back at once.
+
+    Args:
+        speed: Of the ego [m/s].
+        path: (B + 81, 3) recorded poses in the frame of the ego, from where it is beside: those of
+            the B steps before now, if it is late, now, and of the 8 s after it.
+    """
+    path = path.copy()
+    path[:, 2] = np.unwrap(path[:, 2])
+    steps = np.hypot(*np.diff(path[:, :2], axis=0).T)
+    lengths = np.concatenate([[0.0], np.cumsum(steps)])
+    lon, lat, turn = to_frame(np.zeros(3), path[0])
+    along = caught_up(lengths, np.append(steps, steps[-1]) / STEP, lon, speed)
+    poses = np.column_stack([np.interp(along, lengths, column) for column in path.T])
+    outside = along - np.clip(along, 0.0, lengths[-1])  # behind the first pose, beyond the last
+    poses[:, 0] += outside * np.cos(poses[:, 2])
+    poses[:, 1] += outside * np.sin(poses[:, 2])
+    reach = max(NEAREST_BACK, TIME_BACK * max(speed, steps[0] / STEP))
+    place = np.minimum((along - lon) / reach, 1.0)  # a cubic from the offset and its slope to 0
+    slope, left = np.clip(np.tan(turn), -1.0, 1.0), 1.0 - place
+    aside = left**2 * (lat * (1.0 + 2.0 * place) + slope * reach * place)
+    change = left * (slope * (1.0 - 3.0 * place) - 6.0 * lat / reach * place)
+    poses[:, 0] -= aside * np.sin(poses[:, 2])
+    poses[:, 1] += aside * np.cos(poses[:, 2])
+    poses[:, 2] += np.arctan(change)
+    return poses
+
+
+@kernel
+def caught_up(lengths: FloatArray, speeds: FloatArray, place: float, speed: float) -> FloatArray:
+    """(80,) places on a recorded path [m] of an ego that begins elsewhere, or with another speed.
+
+    Args:
+        lengths: (B + 81,) recorded places [m], of which the last 80 are still to come.
+        speeds: (B + 81,) of the recording there [m/s].
+        place: Of the ego now [m].
+        speed: Of the ego now [m/s].
+    """
+    out, now = np.empty(STEPS), len(lengths) - STEPS - 1
+    ahead = max(place, 0.0) + max(speed - speeds[0], 0.0) ** 2 / (2.0 * HARDEST[1])
+    at = 0  # of the recording, where the ego is
+    for step in range(len(out)):
+        while at + 2 < len(lengths) and lengths[at + 1] < place + AHEAD:
+            at += 1
+        wanted = max(speeds[at], speeds[at + 1])
+        speed = max(min(speed + HARDEST[0] * STEP, wanted), speed - HARDEST[1] * STEP)
+        reached = max(min(place + speed * STEP, lengths[now + step + 1] + ahead), place)
+        speed, place = (reached - place) / STEP, reached
+        out[step] = place
+    return out
+
+
 class Future(NamedTuple):
     """What was recorded in the 8 s after a sample. A rows of agents, the ego first."""
 
@@ -180,6 +239,10 @@ class Moment(NamedTuple):
     scenario: Scenario
     row: int  # of the recording
     observation: Observation
+    state: FloatArray  # (7,) of the ego, in the frame that it was recorded in
+    # row from which on the ego goes `way_back`, the present one or one before it; None if it is
+    # there already, or at once
+    beside: int | None
 
     def future(self, near: IntArray) -> Future:
         """Of the ego from where it is now, and of some tracks."""
@@ -191,10 +254,15 @@ class Moment(NamedTuple):
             for values in (tracks.poses, tracks.velocities, tracks.valid)
         )
         cos, sin, vx, vy = np.cos(ego[:, 2]), np.sin(ego[:, 2]), ego[:, VX], ego[:, VY]
-        own = np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy])
+        own, drive = np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy]), ego[:, :3]
+        now = self.observation.history.ego[-1:, :3]
+        if self.beside is not None:
+            path = scenario.ego[self.beside : rows.stop : step, :3]
+            drive = from_frame(way_back(self.state[3], to_frame(path, now[0])), now[0])
+            own = np.diff(np.vstack([now, drive])[:, :2], axis=0) / STEP
         return Future(
-            np.vstack([self.observation.history.ego[-1:, :3], tracks.poses[self.row, near]]),
-            np.concatenate([ego[None, :, :3], poses.swapaxes(0, 1)]),
+            np.vstack([now, tracks.poses[self.row, near]]),
+            np.concatenate([drive[None], poses.swapaxes(0, 1)]),
             np.concatenate([own[None], velocities.swapaxes(0, 1)]),
             np.vstack([np.ones((1, STEPS), np.bool_), valid.T]),
         )
@@ -203,6 +271,7 @@ class Moment(NamedTuple):
 def _plantf_sample(planner: plantf.PlanTF, read: plantf.Features, now: Moment) -> Sample | str:
     if not len(read.road.objects):
         return _NO_ROAD
+    read.current_state[3:] = now.state[3:]
     future = now.future(read.agents.tracks)
     return Sample(read, targets(future.present, future.poses, future.present[0]), future.valid)
 
@@ -210,6 +279,7 @@ def _plantf_sample(planner: plantf.PlanTF, read: plantf.Features, now: Moment) -
 def _pluto_sample(planner: pluto.Pluto, read: pluto.SceneInputs, now: Moment) -> Sample | str:
     if not read.line_valid.any():
         return _NO_LINE
+    read.current_state[3:] = now.state[3:]
     seen = planner.surroundings
     future = now.future(seen.agents.tracks)
     future.valid[0, steps_before_red(planner, now, future.poses[0]) :] = False
@@ -228,6 +298,19 @@ def steps_before_red(planner: pluto.Pluto, now: Moment, ego: FloatArray) -> int:
     return STEPS
 
 
+def _diffusion_sample(
+    planner: diffusion.DiffusionPlanner, read: DiffusionFeatures, now: Moment
+) -> Sample | str:
+    if not len(read.edges):
+        return _NO_LANE
+    future = now.future(read.agents[:NEIGHBOURS])
+    poses = to_frame(future.poses, future.present[0])
+    target = np.zeros((1 + NEIGHBOURS, STEPS, 3), np.float32)
+    valid = np.zeros(target.shape[:2], np.bool_)
+    target[: len(poses)], valid[: len(poses)] = np.nan_to_num(poses), future.valid
+    return Sample(read, target, valid)
+
+
 class Kind(NamedTuple):
     """What of samples is a planner's own."""
 
@@ -235,11 +318,16 @@ class Kind(NamedTuple):
     tries: int  # of finding a free place for the moved ego
     label: Callable[[Any, Any, Moment], Sample | str]  # of a planner and its features
     make_inputs: Callable[..., Any]  # of its network, from features
+    noise: FloatArray = NOISE
+    slowest: float = 0.0  # m/s at which the ego is moved
 
 
 KINDS = {
     "plantf": Kind(plantf.PlanTF, 1, _plantf_sample, plantf.make_batch),
     "pluto": Kind(pluto.Pluto, 5, _pluto_sample, pluto.make_batch),
+    "diffusion-planner": Kind(
+        diffusion.DiffusionPlanner, 1, _diffusion_sample, diffusion.make_inputs, MOVED_POSE, MOVING
+    ),
 }
 
 
@@ -248,24 +336,65 @@ def make_sample(
     scenario: Scenario,
     iteration: int,
     random: np.random.Generator,
+    *,
+    as_published: bool = False,
+    driven: FloatArray | None = None,
 ) -> Sample | str:
-    """The sample of an iteration, or why there is none; `planner` was reset to the scenario."""
+    """The sample of an iteration, or why there is none; `planner` was reset to the scenario.
+
+    A moved ego of PlanTF and PLUTO is back at once `as_published`; otherwise, and of Diffusion
+    Planner always, it goes `way_back`, and half of them are slower by any share of their speed.
+
+    Args:
+        planner: Whose features.
+        scenario: The recording.
+        iteration: Of the scenario.
+        random: Draws what is random.
+        as_published: See above.
+        driven: (K, 11) states in which a planner has driven the ego, instead of those recorded.
+    """
     row, kind = int(scenario.iteration_rows[iteration]), KINDS[planner.name]
     if row + STEPS * scenario.row_step >= len(scenario.time_us):
         return _SHORT
+    if driven is not None:
+        return _driven_sample(planner, scenario, iteration, driven)
     observation = observe_log(scenario, iteration)
     # recordings know no steering angle and no yaw rate: they are derived, and not from a jump
     state = plantf.current_state(observation.history).astype(np.float64)
-    if random.random() < PERTURBED:
-        noise = random.uniform(-NOISE, NOISE)
+    moved = None
+    if random.random() < PERTURBED and state[3] >= kind.slowest:
+        noise = random.uniform(-kind.noise, kind.noise)
+        if kind.noise[3] and not as_published and random.random() < SLOWED:
+            noise[3] = -random.random() * state[3]
         moved = _perturb(observation.history, state, noise, kind.tries)
         if moved is not None:
             ego, state = observation.history.ego.copy(), moved
             ego[-1, :3] = features.map_poses(state[:3], ego[-1])
             observation = observe_log(scenario, iteration, ego=ego)
-    read = planner.features(observation)
-    read.current_state[3:] = state[3:]
-    return kind.label(planner, read, Moment(scenario, row, observation))
+    goes_back = moved is not None and not (as_published and kind.noise[3])
+    now = Moment(scenario, row, observation, state, row if goes_back else None)
+    return kind.label(planner, planner.features(observation), now)
+
+
+def _driven_sample(
+    planner: LearnedPlanner[Any, Any], scenario: Scenario, iteration: int, driven: FloatArray
+) -> Sample | str:
+    """Of an ego that a planner has driven near the recorded path, maybe late."""
+    row, step = int(scenario.iteration_rows[iteration]), scenario.row_step
+    if row + STEPS * step >= len(scenario.time_us):
+        return _SHORT
+    ego = scenario.ego[past_rows(scenario, iteration)].copy()
+    states = driven[max(iteration + 1 - len(ego), 0) : iteration + 1]
+    ego[len(ego) - len(states) :] = states
+    observation = observe_log(scenario, iteration, ego=ego)
+    before = np.arange(row, -1, -step)[: MOST_LATE + 1]
+    near = int(np.hypot(*(scenario.ego[before, :2] - ego[-1, :2]).T).argmin())
+    ahead, aside, turn = np.abs(to_frame(ego[-1, :3], scenario.ego[before[near], :3]))
+    if ahead > MOST_AHEAD or aside > MOST_ASIDE or turn > NOISE[2]:
+        return _ELSEWHERE
+    state = plantf.current_state(observation.history).astype(np.float64)
+    now = Moment(scenario, row, observation, state, int(before[near]))
+    return KINDS[planner.name].label(planner, planner.features(observation), now)
 
 
 def _perturb(
@@ -299,104 +428,3 @@ def make_batch(samples: Sequence[Sample], kind: Kind) -> Batch:
     inputs = kind.make_inputs([one.features for one in samples], "cpu")
     labels = [[value for value in one[1:] if value is not None] for one in samples]
     return Batch(inputs, *features.stack_scenes(labels, "cpu"))
-
-
-@dataclass(frozen=True, slots=True)
-class Stream:
-    """Which samples there are, in which order: the same for the same values."""
-
-    store: str  # by name or path
-    tokens: tuple[str, ...]  # scenarios, sorted
-    seed: int
-    batch: int = BATCH
-    planner: str = "plantf"  # one of `KINDS`
-
-    @property
-    def blocks(self) -> int:
-        """Number of blocks of an epoch."""
-        return -(-len(self.tokens) // PER_BLOCK)
-
-    def tokens_of(self, block: int) -> list[str]:
-        """Scenarios of a block; blocks are counted on from epoch to epoch."""
-        epoch, place = divmod(block, self.blocks)
-        order = np.random.default_rng([self.seed, 1, epoch]).permutation(len(self.tokens))
-        return [self.tokens[i] for i in order[place * PER_BLOCK : (place + 1) * PER_BLOCK]]
-
-
-class BlockMaker:
-    """Makes blocks of a stream."""
-
-    def __init__(self, stream: Stream) -> None:
-        self._stream, self._store = stream, open_store(stream.store)
-        self._kind = KINDS[stream.planner]
-        self._planner = self._kind.planner.asking(lambda scenes: ())
-
-    def __call__(self, block: int) -> Block:
-        """The samples of a block, in batches, the last of which may be short."""
-        failed: Counter[str] = Counter()
-        made: list[Sample] = []
-        tokens = self._stream.tokens_of(block)
-        for place, token in enumerate(tokens):
-            made += self._of_scenario(token, [self._stream.seed, 2, block, place], failed)
-        order = np.random.default_rng([self._stream.seed, 3, block]).permutation(len(made))
-        size = self._stream.batch
-        batches = [
-            make_batch([made[i] for i in order[first : first + size]], self._kind)
-            for first in range(0, len(order), size)
-        ]
-        return Block(batches, dict(failed))
-
-    def _of_scenario(self, token: str, key: list[int], failed: Counter[str]) -> list[Sample]:
-        """Samples of a scenario."""
-        made: list[Sample] = []
-        try:
-            scenario = self._store.read(token)
-            self._planner.reset(scene_info(scenario))
-        except ShiftsimError as error:
-            failed[type(error).__name__] += 1
-            return made
-        for iteration in _draw(scenario, key).tolist():
-            random = np.random.default_rng([*key, iteration + 1])
-            try:
-                one = make_sample(self._planner, scenario, iteration, random)
-            except ShiftsimError as error:
-                one = type(error).__name__
-            if isinstance(one, str):
-                failed[one] += 1
-            else:
-                made.append(one)
-        return made
-
-
-def _draw(scenario: Scenario, key: list[int]) -> IntArray:
-    """Some iterations of a scenario that have a future, most of those that are rare on a road."""
-    rows = scenario.iteration_rows
-    later = rows + STEPS * scenario.row_step
-    usable = np.flatnonzero(later < len(scenario.time_us))
-    changes = scenario.ego[later[usable], :3] - scenario.ego[rows[usable], :3]
-    turning = np.abs(wrap_angles(changes[:, 2])) > TURNING
-    standing = np.hypot(changes[:, 0], changes[:, 1]) < STANDING
-    share = np.select([turning, ~standing], DRAWN[:2], DRAWN[2])
-    drawn: IntArray = usable[np.random.default_rng([*key, 0]).random(len(usable)) < share]
-    return drawn
-
-
-class Blocks(IterableDataset[Block]):
-    """Blocks of a stream from `first` on, without end."""
-
-    def __init__(self, stream: Stream, first: int) -> None:
-        self.stream, self.first = stream, first
-
-    def __iter__(self) -> Iterator[Block]:
-        """The blocks of this worker, which are every so manyth."""
-        info = get_worker_info()
-        make, start = BlockMaker(self.stream), self.first + (info.id if info else 0)
-        for block in count(start, info.num_workers if info else 1):
-            yield make(block)
-
-
-def load_blocks(stream: Stream, first: int, workers: int) -> Iterator[Block]:
-    """Blocks from `first` on in their order, made by so many processes, or by this one for 0."""
-    options: dict[str, Any] = {"prefetch_factor": 2} if workers else {}
-    blocks = Blocks(stream, first)
-    return iter(DataLoader(blocks, batch_size=None, num_workers=workers, **options))

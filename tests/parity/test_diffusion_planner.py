@@ -48,6 +48,7 @@ from shiftsim.planners.learned.diffusion.planner import (  # noqa: E402
     INPUTS,
     NOISE_SHAPE,
     DiffusionPlanner,
+    make_inputs,
 )
 from shiftsim.sim.planner import Observation  # noqa: E402
 from shiftsim.verify.rollouts import tracks_of  # noqa: E402
@@ -213,7 +214,7 @@ def test_closed_loop(path: Path, scenes: Scenes, cases: Cases) -> None:
             ours |= {f"feature/{name}": value for name, value in limits.items()}
             loop.match(loop.stored, ours, {"": FEATURE, "prediction": bound})
         if "encoding" in loop.stored:
-            network, (inputs, _) = loop.planner.network, loop.planner.batch([loop.features])
+            network, inputs = loop.planner.network, make_inputs([loop.features], "cpu")
             with torch.no_grad():
                 encoding = network.encode(network.normalise(inputs))[0]
             loop.match(loop.stored, {"encoding": encoding}, ENCODED)

@@ -12,7 +12,7 @@ from shiftsim.data import open_store
 from shiftsim.errors import ConfigError, DataError, PlannerError
 from shiftsim.planners.learned.pluto.planner import Pluto
 from shiftsim.train.folder import FeatureSettings, write_features
-from shiftsim.train.samples import Stream, load_blocks
+from shiftsim.train.stream import Stream, load_blocks
 
 pytestmark = [pytest.mark.learned, pytest.mark.slow]
 

@@ -1,4 +1,4 @@
-"""PlanTF and PLUTO learn from a store: the same again, also when interrupted, and drivable."""
+"""Planners learn from a store: the same again, also when interrupted, and drivable."""
 
 import pyarrow.parquet as pq
 import pytest
@@ -7,15 +7,16 @@ from stores import write_toy_store
 
 import shiftsim
 from shiftsim.errors import ConfigError, DataError
+from shiftsim.planners.learned.checkpoint import network_module
 from shiftsim.train import folder, recipe
 from shiftsim.train.folder import BEST, LATEST, ImitationSettings, Preset
-from shiftsim.train.imitation import ImitationLearner
+from shiftsim.train.imitation import ImitationLearner, motion
 from shiftsim.train.recipe import ImitationTraining
-from shiftsim.train.samples import Stream, load_blocks
+from shiftsim.train.stream import Stream, load_blocks
 
 pytestmark = [pytest.mark.learned, pytest.mark.thorough]
 STEPS, BATCH = 6, 8
-both = pytest.mark.parametrize("planner", ["plantf", "pluto"])
+each = pytest.mark.parametrize("planner", ["plantf", "pluto", "diffusion-planner"])
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +30,8 @@ def small(road, tmp_path, monkeypatch):
     """Makes the settings of a training that takes seconds."""
     preset = Preset(samples=STEPS * BATCH, rounds=2, batch=BATCH, rate=5e-4)
     monkeypatch.setitem(folder.PRESETS, "laptop", preset)
-    monkeypatch.setitem(folder.COSTS, "pluto", 1.0)
+    for name in folder.COSTS:
+        monkeypatch.setitem(folder.COSTS, name, 1.0)
 
     def make(name, **changes):
         return ImitationSettings(
@@ -45,7 +47,7 @@ def train(settings, **options):
     return lines
 
 
-@both
+@each
 def test_the_same_seed_gives_the_same_network_for_any_number_of_workers(small, planner):
     one, two, other = (
         small(name, planner=planner, **changes)
@@ -57,7 +59,7 @@ def test_the_same_seed_gives_the_same_network_for_any_number_of_workers(small, p
     assert networks[0] == networks[1] != networks[2]
 
 
-@both
+@each
 def test_a_training_that_was_ended_goes_on_as_if_it_had_not(small, monkeypatch, planner):
     whole, ended = small("whole", planner=planner), small("ended", planner=planner)
     monkeypatch.setattr(recipe, "_WRITE_EVERY", 0.0)
@@ -79,7 +81,7 @@ def test_a_training_that_was_ended_goes_on_as_if_it_had_not(small, monkeypatch, 
     assert (ended.out / LATEST).read_bytes() == (whole.out / LATEST).read_bytes()
 
 
-@both
+@each
 def test_what_comes_out_drives_and_says_how_it_came(small, road, tmp_path, planner):
     settings = small("out", planner=planner)
     lines = train(settings)
@@ -102,7 +104,7 @@ def test_what_comes_out_drives_and_says_how_it_came(small, road, tmp_path, plann
     assert done.is_complete
 
 
-@both
+@each
 def test_the_loss_of_one_batch_falls(road, planner):
     tokens = tuple(sorted(shiftsim.open_store(road).tokens))
     learner = ImitationLearner(planner, "cpu", Preset(0, 1, BATCH, 3e-3), total=200, seed=0)
@@ -125,6 +127,36 @@ def test_the_published_schedule_goes_by_rounds_and_drives_with_the_last_weights(
     assert rates == pytest.approx([rate for rate in expected for _ in range(2)])
     state = learner.network.state_dict()
     assert all(torch.equal(state[name], value) for name, value in learner.driving().items())
+
+
+@pytest.mark.parametrize("planner", ["plantf", "pluto"])
+def test_files_have_metres_where_training_has_units(road, planner):
+    tokens = tuple(sorted(shiftsim.open_store(road).tokens))
+    learner = ImitationLearner(planner, "cpu", Preset(0, 1, BATCH, 1e-3), total=10, seed=0)
+    stream = Stream(str(road), tokens, seed=0, batch=BATCH, planner=planner)
+    batch = next(load_blocks(stream, 0, 0)).batches[0]
+    learner.learn(batch)
+    for name, value in learner.mean.items():  # what is trained is what drives, for once
+        value.copy_(learner.network.state_dict()[name])
+    plain = network_module(planner).build_network()
+    plain.load_state_dict(learner.driving())
+    with torch.no_grad():
+        ours, files = learner.network.eval()(batch.inputs), plain.eval()(batch.inputs)
+    for name, value in ours._asdict().items():
+        torch.testing.assert_close(getattr(files, name), value, atol=1e-4, rtol=1e-4)
+    assert float(ours.trajectory[..., -1, 0].mean()) == pytest.approx(36.0, abs=30.0)
+
+
+def test_diffusion_planner_begins_at_no_plan_and_draws_anew_each_step(road):
+    tokens = tuple(sorted(shiftsim.open_store(road).tokens))
+    learner = ImitationLearner("diffusion-planner", "cpu", Preset(0, 1, BATCH, 1e-3), 10, seed=0)
+    stream = Stream(str(road), tokens, seed=0, batch=BATCH, planner="diffusion-planner")
+    batch = next(load_blocks(stream, 0, 0)).batches[0]
+    states = motion(batch.target[:, 0])
+    states[..., :2] = (states[..., :2] - torch.tensor([10.0, 0.0])) / 20.0
+    first = learner.learn(batch).terms["ego_planning_loss"]
+    assert first == pytest.approx(float(states.square().sum(-1).mean()), rel=1e-4)
+    assert learner.optimiser.param_groups[0]["weight_decay"] == 0.01
 
 
 def test_too_few_scenarios_are_refused(small, tmp_path):

@@ -1,7 +1,7 @@
 """Samples of PlanTF and PLUTO: right by hand, and the same whoever makes them."""
 
 import hashlib
-from dataclasses import astuple, replace
+from dataclasses import asdict, replace
 from functools import partial
 from itertools import islice
 
@@ -14,9 +14,10 @@ from worlds import cruise_scenario
 from shiftsim.data import open_store
 from shiftsim.data.synthetic.store import write_towns
 from shiftsim.errors import PlannerError
-from shiftsim.geometry.boxes import from_frame
+from shiftsim.geometry.boxes import from_frame, to_frame
 from shiftsim.planners.basic import LogFuture
 from shiftsim.planners.learned import features
+from shiftsim.planners.learned.diffusion.planner import DiffusionPlanner
 from shiftsim.planners.learned.plantf.planner import Plans, PlanTF
 from shiftsim.planners.learned.pluto.planner import Pluto
 from shiftsim.runs.workers import map_unordered
@@ -25,14 +26,13 @@ from shiftsim.sim.planner import scene_info
 from shiftsim.train import samples
 from shiftsim.train.imitation import motion
 from shiftsim.train.samples import (
-    Stream,
     free_state,
-    load_blocks,
     make_sample,
     motion_targets,
     projections,
     targets,
 )
+from shiftsim.train.stream import Stream, load_blocks
 from shiftsim.world.state import PACIFICA, LightStatus, TrafficLights
 
 pytestmark = [pytest.mark.learned, pytest.mark.slow]
@@ -72,7 +72,10 @@ class Draws:
 
 
 def arrays_of(batch):
-    both = [*astuple(replace(batch.inputs, counts=None)), *batch[1:]]
+    inputs = batch.inputs
+    if not isinstance(inputs, dict):
+        inputs = asdict(replace(inputs, counts=None))
+    both = [*inputs.values(), *batch[1:]]
     return [value for value in both if value is not None]
 
 
@@ -106,10 +109,13 @@ def test_targets_are_as_recorded_and_0_where_nothing_was():
     np.testing.assert_allclose(made, [[[3.0, -2.0, 0.25], [0.0, 0.0, 0.0]]], atol=1e-6)
 
 
-def test_a_perturbed_target_leads_back_to_the_recording(asked):
+def test_as_published_a_moved_ego_is_back_at_once(asked):
     scenario, planner = asked
     noise = [0.5, -0.4, 0.2, 1.0, 0.3, 0.1, 0.05]
-    plain, moved = (make_sample(planner, scenario, 10, Draws(d, noise)) for d in (0.9, 0.1))
+    plain, moved = (
+        make_sample(planner, scenario, 10, Draws(draw, noise), as_published=True)
+        for draw in (0.9, 0.1)
+    )
     ego = scenario.expert[10, :3]
     frame = features.map_poses(np.array(noise[:3]), ego)
     for sample, origin in ((plain, ego), (moved, frame)):
@@ -119,6 +125,87 @@ def test_a_perturbed_target_leads_back_to_the_recording(asked):
     state = moved.features.current_state - plain.features.current_state
     np.testing.assert_allclose(state[3:], noise[3:], atol=1e-6)
     np.testing.assert_array_equal(moved.features.current_state[:3], 0.0)
+
+
+def drive_back(pose, speed, recorded=8.0):
+    """Poses by which an ego comes back to a straight drive along x, in the frame of that drive."""
+    future = np.zeros((81, 3))
+    future[:, 0] = 0.1 * recorded * np.arange(81)
+    moved = np.array(pose)
+    local = to_frame(future, moved)
+    return from_frame(samples.way_back(speed, local), moved)
+
+
+def test_an_ego_that_was_moved_comes_back_smoothly():
+    back = drive_back([0.5, 0.75, 0.2], 8.0)
+    assert np.abs(back[0, 1] - 0.75 - 0.8 * np.sin(0.2)) < 0.02  # goes on as it is turned
+    np.testing.assert_allclose(back[30:, 1:], 0.0, atol=1e-9)
+    moved = np.diff(np.vstack([[0.5, 0.75, 0.2], back]), axis=0)
+    turned = np.arctan2(moved[1:, 1], moved[1:, 0]) - back[:-1, 2]
+    assert np.abs(turned).max() < 0.06  # it drives where it looks
+    np.testing.assert_allclose(np.hypot(moved[:, 0], moved[:, 1]), 0.8, atol=0.05)
+
+
+def test_a_slow_ego_gathers_speed_and_stays_behind():
+    back = drive_back([0.0, 0.0, 0.0], 2.0)
+    speeds = np.diff(back[:, 0]) / 0.1
+    np.testing.assert_allclose(speeds[:35], 2.3 + 0.15 * np.arange(35), atol=1e-9)
+    np.testing.assert_allclose(speeds[45:], 8.0, atol=1e-9)
+
+
+def test_a_fast_ego_slows_down_to_the_recording():
+    back = drive_back([0.0, 0.0, 0.0], 9.0)
+    np.testing.assert_allclose(back[10:, 0] - 0.8 * np.arange(11, 81), 0.25, atol=0.06)
+
+
+def test_an_ego_that_stands_beside_a_standing_recording_stays():
+    back = drive_back([0.3, -0.5, 0.1], 0.0, recorded=0.0)
+    np.testing.assert_allclose(back, [[0.3, -0.5, 0.1]] * 80, atol=1e-9)
+
+
+def test_a_slow_ego_waits_where_the_recording_waits():
+    place = np.minimum(0.5 * np.arange(81), 10.0)
+    place[60:] = 10.0 + 0.5 * np.arange(21)  # it stands from 2 to 6 s
+    poses = np.stack([place, 0.0 * place, 0.0 * place], axis=-1)
+    back = samples.way_back(2.0, poses)
+    assert (back[:, 0] <= place[1:] + 1e-9).all()
+    np.testing.assert_allclose(back[50:59, 0], 10.0, atol=1e-9)
+    assert back[-1, 0] > 12.0
+
+
+def test_an_ego_that_was_driven_late_and_aside_follows_the_recording(asked):
+    scenario, planner = asked
+    driven = scenario.expert.copy()  # at 6 m/s, 4 s late, 1 m to the left, and slower
+    driven[40:] = driven[:-40]
+    driven[:, 1] += 1.0
+    driven[:, 3] = 3.0
+    one = make_sample(planner, scenario, 60, Draws(0.9), driven=driven)
+    np.testing.assert_allclose(one.features.current_state[3], 3.0)
+    target = one.target[0]
+    np.testing.assert_allclose(
+        np.diff(target[:10, 0]), 0.1 * (3.15 + 0.15 * np.arange(1, 10)), atol=5e-3
+    )
+    np.testing.assert_allclose(target[-1, :2], [target[-1, 0], -1.0], atol=1e-4)
+    assert 40.0 < target[-1, 0] < 48.0  # as fast as the recording, and still late
+    driven[:, 1] += 1.0
+    assert "far from" in make_sample(planner, scenario, 60, Draws(0.9), driven=driven)
+    driven[:, 0] -= 100.0
+    assert "far from" in make_sample(planner, scenario, 60, Draws(0.9), driven=driven)
+
+
+def test_targets_of_diffusion_planner_are_poses_of_the_ego_and_its_neighbours(asked):
+    planner = DiffusionPlanner.asking(lambda scenes: ())
+    planner.reset(scene_info(asked[0]))
+    plain = make_sample(planner, asked[0], 10, Draws(0.9))
+    assert plain.target.shape == (11, 80, 3)
+    np.testing.assert_allclose(plain.target[0, :, 0], 0.6 * np.arange(1, 81), atol=1e-5)
+    parked = plain.features.neighbor_agents_past[0, -1]
+    np.testing.assert_allclose(plain.target[1], [[*parked[:2], 0.0]] * 80, atol=1e-5)
+    assert plain.valid[:2].all()
+    assert not plain.valid[2:].any()
+    moved = make_sample(planner, asked[0], 10, Draws(0.1, [0.0, 0.5, 0.1, 0, 0, 0, 0]))
+    assert np.hypot(*moved.target[0, 0, :2]) < 0.65  # the authors' ego is moved 0.5 m at once
+    np.testing.assert_allclose(moved.target[0, 40:, 2], -0.1, atol=1e-5)
 
 
 def test_the_ego_is_not_moved_into_another(asked):
@@ -133,7 +220,9 @@ def test_the_ego_is_not_moved_into_another(asked):
 
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")
 @pytest.mark.thorough
-@pytest.mark.parametrize(("planner", "workers"), [("plantf", (1, 2, 3, 4)), ("pluto", (2,))])
+@pytest.mark.parametrize(
+    ("planner", "workers"), [("plantf", (1, 2, 3, 4)), ("pluto", (2,)), ("diffusion-planner", (2,))]
+)
 def test_batches_are_the_same_for_any_number_of_workers(stream, planner, workers):
     stream = replace(stream, planner=planner)
     alone = digest(stream, 0)
@@ -187,7 +276,7 @@ def test_an_iteration_without_8_s_after_it_is_no_sample(asked):
 def pluto_sample(scenario, iteration=10, draws=None):
     planner = Pluto.asking(lambda scenes: ())
     planner.reset(scene_info(scenario))
-    return make_sample(planner, scenario, iteration, draws or Draws(0.9))
+    return make_sample(planner, scenario, iteration, draws or Draws(0.9), as_published=True)
 
 
 def test_the_target_of_pluto_on_a_straight_road_is_its_speed(asked):

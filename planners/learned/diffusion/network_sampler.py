@@ -45,11 +45,11 @@ def make_schedule() -> Schedule:
     All of it is computed in single precision (nuPlan rule 340): near time 0, where alpha is about
     1, that moves lambda by 1e-4, and with it the times at which the network is called.
     """
-    ends = _half_snr(_log_alpha(torch.tensor([FIRST_TIME, LAST_TIME])))
+    ends = _half_snr(log_alpha_at(torch.tensor([FIRST_TIME, LAST_TIME])))
     wanted = torch.linspace(float(ends[0]), float(ends[1]), STEPS + 1)
     slope = 2.0 * (BETA_1 - BETA_0) * torch.logaddexp(-2.0 * wanted, torch.zeros(()))
     times = slope / (torch.sqrt(BETA_0**2 + slope) + BETA_0) / (BETA_1 - BETA_0)
-    log_alpha = _log_alpha(times)
+    log_alpha = log_alpha_at(times)
     alpha = torch.exp(log_alpha)
     sigma = torch.sqrt(1.0 - torch.exp(2.0 * log_alpha))
     half_snr = _half_snr(log_alpha)
@@ -58,7 +58,8 @@ def make_schedule() -> Schedule:
     return Schedule(times, log_alpha, alpha, sigma, half_snr, h, c_x, c_x0, r0)
 
 
-def _log_alpha(time: Tensor) -> Tensor:
+def log_alpha_at(time: Tensor) -> Tensor:
+    """Logarithm of the factor of the data at times."""
     return -0.25 * time**2 * (BETA_1 - BETA_0) - 0.5 * time * BETA_0
 
 

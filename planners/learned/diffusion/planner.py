@@ -4,7 +4,7 @@ The official planner draws its start noise from an unseeded generator; here it i
 scenario and iteration, so that a run can be repeated.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -62,14 +62,9 @@ class DiffusionPlanner(LearnedPlanner[Features, Single]):
         import torch
 
         with torch.inference_mode():
-            inputs, noise = self.batch(scenes)
+            inputs = make_inputs(scenes, self.device)
+            (noise,) = features.stack_scenes([[one.noise] for one in scenes], self.device)
             return list(self.network(inputs, noise).cpu().numpy())
-
-    def batch(self, scenes: Sequence[Features]) -> tuple[Mapping[str, Any], Any]:
-        """Tensors that the network reads, by name, and the start noise (B, 11, 80, 4)."""
-        rows = [[getattr(one, name) for name in (*INPUTS, "noise")] for one in scenes]
-        *inputs, noise = features.stack_scenes(rows, self.device)
-        return dict(zip(INPUTS, inputs, strict=True)), noise
 
     def decode(self, output: Single, observation: Observation) -> Trajectory:
         """The ego's trajectory in the map frame."""
@@ -78,3 +73,9 @@ class DiffusionPlanner(LearnedPlanner[Features, Single]):
         return features.plan_of_poses(
             from_frame(features.poses_of(output[0]), history.ego[-1]), history
         )
+
+
+def make_inputs(scenes: Sequence[Features], device: str) -> dict[str, Any]:
+    """Tensors that the network reads, by name."""
+    rows = [[getattr(one, name) for name in INPUTS] for one in scenes]
+    return dict(zip(INPUTS, features.stack_scenes(rows, device), strict=True))

@@ -17,6 +17,7 @@ from open_data_files import (
     WRITERS,
     demo_content,
     demo_map,
+    known_route,
     lit_lane,
     write_av2,
     write_commonroad,
@@ -25,7 +26,7 @@ from open_data_files import (
 
 from shiftsim.data.readers.av2 import Av2Reader
 from shiftsim.data.readers.convert import convert
-from shiftsim.data.readers.py123d import Py123dReader
+from shiftsim.data.readers.py123d import Py123dReader, read_starts
 from shiftsim.data.readers.scenarios import convert_recording
 from shiftsim.data.store.check import survey_store
 from shiftsim.data.store.reading import ScenarioStore
@@ -94,6 +95,36 @@ def test_with_vehicles_every_car_that_drives_is_an_ego(scenes, name):
     recording_car = {"av2": "AV", "py123d": "ego"}[name]
     assert egos - trucks == cars - {content["ego"]["id"]} | {recording_car}
     assert len(cars) > 3
+
+
+def test_the_route_of_py123d_is_that_of_the_log_from_its_begin_on(scenes):
+    scene = scenes["py123d"]
+    groups = known_route(demo_content())
+    wanted = {str(n["id"]) for n in demo_content()["lanes"] if n["group"] in groups}
+    (window,) = convert_recording(scene).windows  # it begins after 2 s
+    road = scene.map.road
+    edges = [i for i, b in enumerate(road.block_of) if road.blocks.ids[b] in window.route]
+    lanes = {part.piece.id for i in edges for part in scene.map.segments[road.edges.ids[i]]}
+    assert wanted <= lanes
+    assert len(window.route) == len(groups)
+    (found,) = convert_recording(replace(scene, routes=scene.routes[:1])).windows
+    assert set(found.route) != set(window.route)  # of no blocks: as of any other data
+
+
+def test_scenarios_of_py123d_are_found_by_log_and_time(tmp_path):
+    log = write_py123d(tmp_path / "data", site="avenue")
+    starts = tmp_path / "starts.csv"
+    starts.write_text(f"log_name,time_us\n{log.name},{START_US + 2_000_000}\n")
+    reader = Py123dReader(tmp_path / "data", starts=read_starts(starts))
+    (path,) = reader.recordings()
+    recording = reader.read(path)
+    assert recording.spans == []  # 11 s are too short for one
+    assert sum(recording.warnings.values()) == 1
+    with pytest.raises(ConversionError, match="1 logs are not there, such as another"):
+        Py123dReader(tmp_path / "data", starts={"another": [0]}).recordings()
+    starts.write_text("log,time\na,1\n")
+    with pytest.raises(ConversionError, match="columns log_name and time_us"):
+        read_starts(starts)
 
 
 def test_lights_of_py123d_are_those_of_the_connector_of_their_lane(scenes):

@@ -11,7 +11,7 @@ from worlds import standing_tracks, straight_road
 from shiftsim.geometry.boxes import boxes_to_corners, wrap_angles
 from shiftsim.geometry.polylines import vertex_headings
 from shiftsim.kernels import readonly
-from shiftsim.sim.traffic.idm.agents import make_fleet, place_agents
+from shiftsim.sim.traffic.idm.model import make_fleet, place_agents
 from shiftsim.sim.traffic.idm.paths import (
     append_baseline,
     choose_successor,

@@ -1,0 +1,158 @@
+"""Streams of samples: which there are, in which order, and who makes them.
+
+That, and what is random in a sample, depends on a seed and on places in the stream only. A stream
+is cut into blocks of some scenarios; a worker makes whole blocks, which come in their order whoever
+makes them.
+"""
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import count
+from typing import Any, NamedTuple
+
+import numpy as np
+from torch.utils.data import DataLoader, IterableDataset, get_worker_info
+
+from shiftsim.data import open_store
+from shiftsim.errors import ShiftsimError
+from shiftsim.geometry.boxes import wrap_angles
+from shiftsim.kernels import FloatArray, IntArray
+from shiftsim.runs.results import Run, open_run
+from shiftsim.runs.task import Task
+from shiftsim.sim.planner import scene_info
+from shiftsim.train.samples import KINDS, STEPS, Batch, Sample, make_batch, make_sample
+from shiftsim.world.scenario import Scenario
+
+BATCH, PER_BLOCK = 32, 64  # samples; scenarios, enough that batches differ little
+# share of iterations that are samples: those in whose 8 s the ego turns, drives on, stands
+DRAWN = (0.2, 0.08, 0.025)
+DRIVEN = 0.4  # share of those that a planner has driven
+TURNING, STANDING = 0.35, 1.0  # rad from which it turns, m below which it stands
+
+
+class Block(NamedTuple):
+    """What a worker hands over at once."""
+
+    batches: list[Batch]
+    failed: dict[str, int]  # how many samples could not be made, by reason
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """Which samples there are, in which order: the same for the same values."""
+
+    store: str  # by name or path
+    tokens: tuple[str, ...]  # scenarios, sorted
+    seed: int
+    batch: int = BATCH
+    planner: str = "plantf"  # one of `KINDS`
+    as_published: bool = False  # of `make_sample`
+    driven: tuple[str, ...] = ()  # folders of runs in which a planner drove some of the scenarios
+
+    @property
+    def blocks(self) -> int:
+        """Number of blocks of an epoch."""
+        return -(-len(self.tokens) // PER_BLOCK)
+
+    def tokens_of(self, block: int) -> list[str]:
+        """Scenarios of a block; blocks are counted on from epoch to epoch."""
+        epoch, place = divmod(block, self.blocks)
+        order = np.random.default_rng([self.seed, 1, epoch]).permutation(len(self.tokens))
+        return [self.tokens[i] for i in order[place * PER_BLOCK : (place + 1) * PER_BLOCK]]
+
+
+class BlockMaker:
+    """Makes blocks of a stream."""
+
+    def __init__(self, stream: Stream) -> None:
+        self._stream, self._store = stream, open_store(stream.store)
+        self._kind = KINDS[stream.planner]
+        self._planner = self._kind.planner.asking(lambda scenes: ())
+        self._driven: dict[str, list[tuple[Run, Task]]] = {}
+        for run in map(open_run, stream.driven):
+            for task, place in run.rollout_places.items():
+                if place is not None:
+                    self._driven.setdefault(task.token, []).append((run, task))
+
+    def __call__(self, block: int) -> Block:
+        """The samples of a block, in batches, the last of which may be short."""
+        failed: Counter[str] = Counter()
+        made: list[Sample] = []
+        tokens = self._stream.tokens_of(block)
+        for place, token in enumerate(tokens):
+            made += self._of_scenario(token, [self._stream.seed, 2, block, place], failed)
+        order = np.random.default_rng([self._stream.seed, 3, block]).permutation(len(made))
+        size = self._stream.batch
+        batches = [
+            make_batch([made[i] for i in order[first : first + size]], self._kind)
+            for first in range(0, len(order), size)
+        ]
+        return Block(batches, dict(failed))
+
+    def _of_scenario(self, token: str, key: list[int], failed: Counter[str]) -> list[Sample]:
+        """Samples of a scenario."""
+        made: list[Sample] = []
+        try:
+            scenario = self._store.read(token)
+            self._planner.reset(scene_info(scenario))
+        except ShiftsimError as error:
+            failed[type(error).__name__] += 1
+            return made
+        as_recorded = None, _draw(scenario, key)
+        driven = [self._drive(*one, scenario, key) for one in self._driven.get(token, ())]
+        for states, iterations in (as_recorded, *driven):
+            for iteration in iterations.tolist():
+                random = np.random.default_rng([*key, iteration + 1])
+                how: dict[str, Any] = {"as_published": self._stream.as_published, "driven": states}
+                try:
+                    one = make_sample(self._planner, scenario, iteration, random, **how)
+                except ShiftsimError as error:
+                    one = type(error).__name__
+                if isinstance(one, str):
+                    failed[one] += 1
+                else:
+                    made.append(one)
+        return made
+
+    def _drive(
+        self, run: Run, task: Task, scenario: Scenario, key: list[int]
+    ) -> tuple[FloatArray, IntArray]:
+        """States of a rollout (K, 11), and some iterations of it."""
+        states = run.rollout(task, scenario).ego
+        drawn = np.random.default_rng([*key, 0, task.seed]).random(len(states)) < DRIVEN
+        return states, np.flatnonzero(drawn)
+
+
+def _draw(scenario: Scenario, key: list[int]) -> IntArray:
+    """Some iterations of a scenario that have a future, most of those that are rare on a road."""
+    rows = scenario.iteration_rows
+    later = rows + STEPS * scenario.row_step
+    usable = np.flatnonzero(later < len(scenario.time_us))
+    changes = scenario.ego[later[usable], :3] - scenario.ego[rows[usable], :3]
+    turning = np.abs(wrap_angles(changes[:, 2])) > TURNING
+    standing = np.hypot(changes[:, 0], changes[:, 1]) < STANDING
+    share = np.select([turning, ~standing], DRAWN[:2], DRAWN[2])
+    drawn: IntArray = usable[np.random.default_rng([*key, 0]).random(len(usable)) < share]
+    return drawn
+
+
+class Blocks(IterableDataset[Block]):
+    """Blocks of a stream from `first` on, without end."""
+
+    def __init__(self, stream: Stream, first: int) -> None:
+        self.stream, self.first = stream, first
+
+    def __iter__(self) -> Iterator[Block]:
+        """The blocks of this worker, which are every so manyth."""
+        info = get_worker_info()
+        make, start = BlockMaker(self.stream), self.first + (info.id if info else 0)
+        for block in count(start, info.num_workers if info else 1):
+            yield make(block)
+
+
+def load_blocks(stream: Stream, first: int, workers: int) -> Iterator[Block]:
+    """Blocks from `first` on in their order, made by so many processes, or by this one for 0."""
+    options: dict[str, Any] = {"prefetch_factor": 2} if workers else {}
+    blocks = Blocks(stream, first)
+    return iter(DataLoader(blocks, batch_size=None, num_workers=workers, **options))
