@@ -18,7 +18,7 @@ from shiftsim.kernels import FloatArray
 from shiftsim.sim.dynamics.bicycle import command_and_step
 from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
 from shiftsim.sim.dynamics.perfect import KEPT_US, follow_perfectly, sample_poses
-from shiftsim.sim.log import SimulationLog
+from shiftsim.sim.log import SimulationLog, Snapshot
 from shiftsim.sim.noise import NoiseModel, sample_noise
 from shiftsim.sim.plan_check import contiguous, find_fault, find_warning
 from shiftsim.sim.planner import (
@@ -205,6 +205,44 @@ class Rollout:
             )
         else:
             follow_perfectly(plan, next_us, after)
+
+    def snapshot(self, action: Any = None) -> Snapshot:
+        """What a rollout can go on from as this one would; `action` is kept with it.
+
+        Raises:
+            DataError: The rollout has ended.
+        """
+        if self.done:
+            raise DataError(f"the rollout of {self.scenario.token!r} has ended")
+        # views: nobody writes to the rows that lie behind
+        past, end = slice(self.iteration), self._start + self.iteration + 1
+        noise, traffic = self.setting.noise, self.setting.traffic
+        named = replace(
+            self.setting,
+            noise=noise if isinstance(noise, str) else noise.name,
+            traffic=traffic if isinstance(traffic, str) else type(traffic).__name__,
+        )
+        parts = (part[past] for part in (self._commands, self._seconds, self._degraded))
+        ego = self._ego[self._start : end]
+        return Snapshot(self.scenario.token, named, ego, *parts, action, self.scenario)
+
+    def resume(self, snapshot: Snapshot) -> None:
+        """Come to where another rollout of the scenario was; this one is fresh.
+
+        The planner is not asked before, so it remembers nothing, and its plans are not there.
+
+        Raises:
+            DataError: The snapshot is of another scenario, or the scenario has ended before.
+        """
+        if snapshot.token != self.scenario.token or snapshot.iteration >= self.num_samples:
+            raise DataError(f"{snapshot!r} is none of scenario {self.scenario.token!r}")
+        past = slice(snapshot.iteration)
+        self._ego[self._start : self._start + snapshot.iteration + 1] = snapshot.ego
+        self._commands[past], self._seconds[past] = snapshot.commands, snapshot.planning_seconds
+        self._degraded[past] = snapshot.degraded
+        for row in range(self._start, self._start + snapshot.iteration):
+            self._traffic.step(self.iteration, self._ego[row], self._tracks, row + 1)
+            self._go_on()
 
     def log(self) -> SimulationLog:
         """The finished rollout."""
