@@ -7,6 +7,7 @@ times; its last answer is never executed, and the state at T - 1 is neither reac
 
 import warnings
 from collections.abc import Callable, Sequence
+from copy import copy, deepcopy
 from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any, ParamSpec, TypeAlias, TypeVar, cast
@@ -105,7 +106,7 @@ class Rollout:
         traffic = setting.traffic
         self._traffic = make_traffic(traffic) if isinstance(traffic, str) else traffic
         if scenario.script is not None and scenario.script.has_pedestrians:
-            from shiftsim.sim.traffic.scripted import Scripted  # few scenarios need it
+            from shiftsim.sim.traffic.mixed import Scripted  # few scenarios need it
 
             self._traffic = Scripted(self._traffic)
         self._traffic.start(scenario, self._tracks, start)
@@ -119,7 +120,7 @@ class Rollout:
         self._seconds = np.zeros(self.num_samples)
         self._degraded = np.zeros(self.num_samples, np.bool_)
         if planner is not None:
-            planner.reset(scene_info(scenario, setting.seed, planner))
+            self.drive_by(planner)
 
     @property
     def done(self) -> bool:
@@ -227,7 +228,7 @@ class Rollout:
         return Snapshot(self.scenario.token, named, ego, *parts, action, self.scenario)
 
     def resume(self, snapshot: Snapshot) -> None:
-        """Come to where another rollout of the scenario was; this one is fresh.
+        """Come to where another rollout was that has been where this one is, or is fresh.
 
         The planner is not asked before, so it remembers nothing, and its plans are not there.
 
@@ -240,9 +241,25 @@ class Rollout:
         self._ego[self._start : self._start + snapshot.iteration + 1] = snapshot.ego
         self._commands[past], self._seconds[past] = snapshot.commands, snapshot.planning_seconds
         self._degraded[past] = snapshot.degraded
-        for row in range(self._start, self._start + snapshot.iteration):
+        for row in range(self._start + self.iteration, self._start + snapshot.iteration):
             self._traffic.step(self.iteration, self._ego[row], self._tracks, row + 1)
             self._go_on()
+
+    def fork(self) -> "Rollout":
+        """Another rollout that has come as far, without a planner."""
+        other, scenario = copy(self), self.scenario
+        for name in ("_ego", "_tracks", "_commands", "_plans", "_seconds", "_degraded"):
+            setattr(other, name, getattr(self, name).copy())
+        arrays = other._time_us, other._ego, other._tracks, other._lights
+        other._observations, other.planner = ObservationBuilder(*arrays), None
+        shared = {id(one): one for one in (scenario, scenario.map)}
+        other._traffic = deepcopy(self._traffic, shared)
+        return other
+
+    def drive_by(self, planner: Planner) -> None:
+        """Have a planner drive from here on."""
+        self.planner = planner
+        planner.reset(scene_info(self.scenario, self.setting.seed, planner))
 
     def log(self) -> SimulationLog:
         """The finished rollout."""
@@ -345,17 +362,21 @@ def drive(rollout: Rollout) -> SimulationLog:
     return rollout.log()
 
 
-def simulate_together(rollouts: Sequence[Rollout]) -> list[SimulationLog | Exception]:
+def simulate_together(
+    rollouts: Sequence[Rollout], steps: int | None = None
+) -> list[SimulationLog | Exception]:
     """Drive several scenarios in lock step, so that their planners share one forward pass.
 
-    The rollouts are fresh. Planners that are forks of one `BatchPlanner` are asked together, and so
-    is traffic that is forks of one `BatchTraffic`; others one by one.
+    Each goes to its end, or as many steps as are given. Planners that are forks of one
+    `BatchPlanner` are asked together, and so is traffic that is forks of one `BatchTraffic`; others
+    one by one.
 
     Returns:
         Per rollout its log, or the error that ended it; the others go on.
     """
     ended: dict[int, SimulationLog | Exception] = {}
-    while len(ended) < len(rollouts):
+    while len(ended) < len(rollouts) and steps != 0:
+        steps = None if steps is None else steps - 1
         active = [i for i in range(len(rollouts)) if i not in ended]
         plans, seconds = _plans([rollouts[i] for i in active])
         moves: dict[int, Move] = {}
@@ -378,7 +399,7 @@ def simulate_together(rollouts: Sequence[Rollout]) -> list[SimulationLog | Excep
             rollouts[index]._go_on()
             if rollouts[index].done:
                 ended[index] = rollouts[index].log()
-    return [ended[i] for i in range(len(rollouts))]
+    return [ended.get(i) or rollout.log() for i, rollout in enumerate(rollouts)]
 
 
 def _plans(rollouts: Sequence[Rollout]) -> tuple[list[Plan | Exception], list[float]]:
