@@ -62,6 +62,12 @@ class SimulationLog:
     planning_seconds: FloatArray
     degraded: BoolArray
 
+    def snapshot(self, iteration: int, setting: "Setting") -> "Snapshot":
+        """Where the rollout was at an iteration, driven as a setting says."""
+        past, ego = slice(iteration), self.ego[: iteration + 1]
+        commands, seconds = self.commands[past], self.planning_seconds[past]
+        return Snapshot(self.token, setting, ego, commands, seconds, self.degraded[past])
+
     def __repr__(self) -> str:
         gone = np.hypot(*np.diff(self.ego[:, :2], axis=0).T).sum()
         return (

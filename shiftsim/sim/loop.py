@@ -223,9 +223,16 @@ class Rollout:
             noise=noise if isinstance(noise, str) else noise.name,
             traffic=traffic if isinstance(traffic, str) else type(traffic).__name__,
         )
-        parts = (part[past] for part in (self._commands, self._seconds, self._degraded))
-        ego = self._ego[self._start : end]
-        return Snapshot(self.scenario.token, named, ego, *parts, action, self.scenario)
+        return Snapshot(
+            token=self.scenario.token,
+            setting=named,
+            ego=self._ego[self._start : end],
+            commands=self._commands[past],
+            planning_seconds=self._seconds[past],
+            degraded=self._degraded[past],
+            action=action,
+            scenario=self.scenario,
+        )
 
     def resume(self, snapshot: Snapshot) -> None:
         """Come to where another rollout was that has been where this one is, or is fresh.

@@ -6,7 +6,7 @@ those of NAVSIM's EPDMS over all that it has driven, among what the others reall
 Array axes: N snapshots, K plans of each, H poses of a plan, T = steps + 1 states.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,6 +19,7 @@ from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.metrics import navsim
 from shiftsim.planners.basic import ConstantVelocity
 from shiftsim.planners.pdm.planner import PdmClosed
+from shiftsim.planners.pdm.scorer import TTC_STEPS
 from shiftsim.planners.proposals import contacts, places
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.dynamics.bicycle import step_bicycle, step_seconds
@@ -40,6 +41,7 @@ from shiftsim.sim.dynamics.perfect import interpolate
 from shiftsim.sim.log import Snapshot
 from shiftsim.sim.loop import Rollout, Setting, simulate_together
 from shiftsim.sim.planner import BatchPlanner, Planner, scene_info
+from shiftsim.sim.traffic import traffic_name
 from shiftsim.world.state import (
     HEADING,
     LAST_AGENT_KIND,
@@ -52,8 +54,15 @@ from shiftsim.world.state import (
 )
 
 _PAST = 15  # states before the present that comfort looks back on
-_TTC = navsim.TTC_STEPS[-1]  # steps that the time to collision looks ahead
-_NO_PARTS = {"states", "flags", "collision_index", "ttc_index"}
+_TTC = TTC_STEPS[-1]  # steps that the time to collision looks ahead
+PARTS = (
+    *navsim.VERSIONS["v2"].multipliers,
+    "time_to_collision_within_bound",
+    "lane_keeping",
+    "history_comfort",
+    "progress_m",
+)
+FIRST = PARTS[:5]  # those that are violated at a step
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,6 +116,18 @@ def branch(
     Raises:
         ConfigError: Plans do not fit or are too short, or the controller is not `lqr`.
         DataError: The scenario is not there, or ends before.
+
+    Example:
+        ```python
+        from shiftsim.sim.loop import Rollout
+
+        scenario = shiftsim.open_store("demo")["01f13e"]
+        rollout = Rollout(scenario, shiftsim.load_planner("idm"))
+        ahead = 0.6 * np.arange(1, 41)  # m, at 6 m/s
+        plans = np.stack([np.stack([ahead, by * ahead, 0.0 * ahead], -1) for by in (0.0, 0.1)])
+        found = shiftsim.branch(rollout.snapshot(), plans, steps=40)
+        print(found.parts["progress_m"], found.first["drivable_area_compliance"])
+        ```
     """
     plans = np.asarray(plans, np.float64)
     if isinstance(snapshot, Snapshot):
@@ -120,14 +141,14 @@ def branch(
 
 
 def _joined(found: Sequence[Branches], *, squeeze: bool = False) -> Branches:
-    def join(get: Callable[[Branches], Any]) -> Any:
-        return get(found[0]) if squeeze else np.stack([get(one) for one in found])
+    def join(arrays: list[np.ndarray]) -> Any:
+        return arrays[0] if squeeze else np.stack(arrays)
 
     return Branches(
-        states=join(lambda one: one.states),
-        parts={name: join(lambda one, name=name: one.parts[name]) for name in found[0].parts},
-        first={name: join(lambda one, name=name: one.first[name]) for name in found[0].first},
-        errors=join(lambda one: one.errors),
+        states=join([one.states for one in found]),
+        parts={name: join([one.parts[name] for one in found]) for name in PARTS},
+        first={name: join([one.first[name] for one in found]) for name in FIRST},
+        errors=join([one.errors for one in found]),
     )
 
 
@@ -149,6 +170,10 @@ class _Start:
             raise ConfigError(f"branches need the controller 'lqr', not {self.setting.controller}")
         self.rollout = Rollout(scenario, ConstantVelocity(), self.setting)
         self.rollout.resume(snapshot)
+        # whether the others do the same whatever the ego does
+        named, script = self.setting.traffic, scenario.script
+        is_replayed = isinstance(named, str) and traffic_name(named) == "nonreactive"
+        self.is_replayed = is_replayed and not (script is not None and script.has_pedestrians)
 
     def branch(
         self,
@@ -166,23 +191,25 @@ class _Start:
         plan_us = log.time_us[now] + np.rint(1e6 * spacing * np.arange(plans.shape[1] + 1))
         states = np.zeros((len(plans), plans.shape[1] + 1, NUM_STATE))
         states[:, 0, :3], states[:, 1:, :3] = ego[:3], from_frame(plans, ego[:3])
-        driven = np.full((len(plans), steps + 1, NUM_STATE), np.nan)
-        driven[:, 0] = ego
         commands = np.empty((len(plans), follow, 2))
+        driven = np.empty((len(plans), follow + 1, NUM_STATE))
+        driven[:, 0] = ego
         times = log.time_us[now : now + follow + 1], plan_us.astype(np.int64)
         noise = log.noise[now : now + follow]
-        status = follow_plans(*times, states, noise, NUPLAN, driven[:, : follow + 1], commands)
+        status = follow_plans(*times, states, noise, NUPLAN, driven, commands)
         raise_for_status(int(status), int(times[0][0]), times[1])
-        if self.setting.traffic == "nonreactive" and follow == steps:
-            errors = np.full(len(plans), "", object)
-            return self._rated(driven, [self.rollout], errors)
-        forks, errors = self._forks(driven[:, 1 : follow + 1], commands)
+        if self.is_replayed and follow == steps:
+            return self._rated(driven, [self.rollout], np.full(len(plans), "", object))
+        forks, errors = self._forks(driven[:, 1:], commands)
         if follow < steps:
             self._drive_on(forks, errors, planner, steps - follow)
+        out = np.full((len(plans), steps + 1, NUM_STATE), np.nan)
         for number, fork in enumerate(forks):
-            if not errors[number]:
-                driven[number] = fork.log().ego[now : now + steps + 1]
-        return self._rated(driven, forks, errors)
+            states = fork.log().ego[now : now + steps + 1]
+            out[number, : len(states)] = states
+            if len(states) <= steps and not errors[number]:
+                errors[number] = "the scenario has ended"
+        return self._rated(out, forks, errors)
 
     def _require(self, plans: FloatArray, steps: int, spacing: float, follow: int) -> None:
         left = self.rollout.num_samples - 1 - self.snapshot.iteration
@@ -240,10 +267,12 @@ class _Start:
         ego, lights = observation.history.ego, self.scenario.iteration_rows[now : now + count]
         dark = _around(self.rollout.log().tracks.rows(slice(now, now + 1)), ego[-1])
         lit = navsim.with_lights(dark, self.scenario, lights, 1)
-        out = Branches(states=driven, parts={}, first={}, errors=errors)
+        tables = [
+            {name: np.full(len(driven), np.nan) for name in names} for names in (PARTS, FIRST)
+        ]
+        # beyond what was driven only a recording is known
+        known = count + (_TTC if self.is_replayed else 0)
         for number, world in enumerate(worlds):
-            # beyond what was driven only a recording is known
-            known = count + (_TTC if world is self.rollout else 0)
             rows = slice(None) if world is self.rollout else slice(number, number + 1)
             if any(errors[rows]):
                 continue
@@ -251,12 +280,11 @@ class _Start:
             around = around._replace(connectors=lit.connectors, red=lit.red)
             past = np.ascontiguousarray(ego[-1 - _PAST : -1])
             parts = navsim.evaluate(driven[rows], ground, around, "v2", past)
-            first = _first_steps(parts, around)
-            for table, found in ((out.parts, parts), (out.first, first)):
-                for name in set(found) - _NO_PARTS:
-                    table.setdefault(name, np.full(len(driven), np.nan))[rows] = found[name]
+            for table, found in zip(tables, (parts, _first_steps(parts, around)), strict=True):
+                for name, column in table.items():
+                    column[rows] = found[name]
         driven[errors != ""] = np.nan
-        return out
+        return Branches(states=driven, parts=tables[0], first=tables[1], errors=errors)
 
 
 def _around(tracks: Tracks, ego: FloatArray) -> navsim.Surroundings:

@@ -165,8 +165,8 @@ def _copied(scene: Scene) -> Scene:
     written = {name: getattr(yielding, name).copy() for name in ("num_drawn", "ego_block")}
     return scene._replace(
         graph=scene.graph._replace(lights=scene.graph.lights.copy()),
-        fleet=Fleet(*(array.copy() for array in scene.fleet)),
-        footprints=Footprints(*(a if a is curve else a.copy() for a in scene.footprints)),
+        fleet=Fleet._make(array.copy() for array in scene.fleet),
+        footprints=Footprints._make(a if a is curve else a.copy() for a in scene.footprints),
         yielding=yielding._replace(**written),
     )
 
