@@ -13,7 +13,7 @@ from itertools import product
 
 import numpy as np
 
-from shiftsim.errors import PlannerError
+from shiftsim.errors import DataError, PlannerError
 from shiftsim.geometry.boxes import to_frame
 from shiftsim.kernels import FloatArray
 from shiftsim.metrics import navsim
@@ -54,7 +54,7 @@ def metric_rows(log: SimulationLog, scenario: Scenario) -> list[MetricRow]:
     """Means over the frames of a rollout; a mode that nothing is known of has no rows.
 
     Where the planner returned commands there are no plans. Frames where PDM-Closed finds no way
-    along the route are left out.
+    along the route, or with less than 1.5 s before them, are left out.
     """
     found, driven = defaultdict[str, list[float]](list), driven_scenario(log, scenario)
     frames = range(0, len(log.ego) - SCORED, STRIDE)
@@ -64,7 +64,7 @@ def metric_rows(log: SimulationLog, scenario: Scenario) -> list[MetricRow]:
         for iteration in (one for one in frames if one + ahead < len(log.ego)):
             try:
                 world = navsim.frame_world(driven, iteration, version)
-            except PlannerError:
+            except (DataError, PlannerError):  # no past, no way
                 before = None
                 continue
             plan = plan_at(log, iteration)
