@@ -14,8 +14,7 @@ from time import perf_counter
 
 from shiftsim.benchmarks.bench import Plan
 from shiftsim.runs.prepare import RunPlan
-from shiftsim.runs.rollouts.columns import decode_rows
-from shiftsim.runs.rollouts.files import write_rollouts
+from shiftsim.runs.rollouts.files import decode_rows, write_rollouts
 from shiftsim.runs.task import Batch, TaskRunner
 
 _SECONDS = 2.0  # spent on each planner of each run, as long as it has done a task in that time

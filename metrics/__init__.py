@@ -6,6 +6,7 @@ any number of threshold profiles can be applied to it.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 from shiftsim.errors import ConfigError
 from shiftsim.files import load_attribute
@@ -32,6 +33,7 @@ from shiftsim.world.scenario import Scenario
 
 METRIC_VERSION = "1"  # raised with any change of a definition
 CustomMetric = Callable[[SimulationLog, VectorMap], float | MetricRow]
+NAMED = {"navsim": "shiftsim.metrics.navsim_rollouts:metric_rows"}  # further ones that come with it
 
 
 def compute_metrics(
@@ -47,8 +49,8 @@ def compute_metrics(
         log: The rollout.
         road: Map it was driven on, or the scenario with that map.
         thresholds: Profile name, or thresholds of your own.
-        own: Metrics of your own, as callables or `module:attribute`; they are reported in
-            `extra` and never enter the score.
+        own: Metrics of your own, as callables or `module:attribute`, or `navsim`, which needs the
+            scenario; they are reported in `extra` and never enter the score.
 
     Raises:
         DataError: The rollout is too short or not finite.
@@ -61,8 +63,7 @@ def compute_metrics(
         print(result.score, result.scores)
         ```
     """
-    road = road.map if isinstance(road, Scenario) else road
-    result = evaluate(measure(log, road), thresholds)
+    result = evaluate(measure(log, road.map if isinstance(road, Scenario) else road), thresholds)
     return add_metrics(result, log, road, own) if own else result
 
 
@@ -74,6 +75,7 @@ def load_metric(spec: str | CustomMetric) -> CustomMetric:
     """
     if not isinstance(spec, str):
         return spec
+    spec = NAMED.get(spec, spec)
     module_name, _, attribute = spec.partition(":")
     hint = "name it as module:attribute, for example my_package.metrics:min_gap"
     if not module_name or not attribute:
@@ -86,14 +88,17 @@ def load_metric(spec: str | CustomMetric) -> CustomMetric:
 
 
 def add_metrics(
-    result: MetricResult, log: SimulationLog, road: VectorMap, metrics: Sequence[str | CustomMetric]
+    result: MetricResult,
+    log: SimulationLog,
+    road: VectorMap | Scenario,
+    metrics: Sequence[str | CustomMetric],
 ) -> MetricResult:
     """The same result with the rows of custom metrics in `extra`; the score stays as it is.
 
     Raises:
         ConfigError: A metric cannot be loaded, or two rows have the same name.
     """
-    rows = [_run(load_metric(metric), log, road) for metric in metrics]
+    rows = [row for metric in metrics for row in _run(load_metric(metric), log, road)]
     taken = {*result.scores, *SHORT_NAMES}
     for row in rows:
         if row.metric in taken:
@@ -102,18 +107,25 @@ def add_metrics(
     return replace(result, extra=tuple(rows))
 
 
-def _run(metric: CustomMetric, log: SimulationLog, road: VectorMap) -> MetricRow:
-    name = getattr(metric, "__name__", type(metric).__name__)
-    value = metric(log, road)
+def _run(metric: Any, log: SimulationLog, road: VectorMap | Scenario) -> list[MetricRow]:
+    name, map = getattr(metric, "__name__", type(metric).__name__), road
+    if isinstance(road, Scenario):
+        map = road.map
+    if getattr(metric, "of_scenario", False):
+        if not isinstance(road, Scenario):
+            raise ConfigError(f"metric {name!r} needs the scenario", "give it instead of its map")
+        found: list[MetricRow] = metric(log, road)
+        return found
+    value = metric(log, map)
     if isinstance(value, MetricRow):
-        return value
+        return [value]
     try:
         number = float(value)
     except (TypeError, ValueError) as error:
         raise ConfigError(
             f"metric {name!r} returned {value!r}", "return a number or a MetricRow"
         ) from error
-    return MetricRow(name, None, number, "", None, None)
+    return [MetricRow(name, None, number, "", None, None)]
 
 
 if __name__ == "metrics":  # pragma: no cover

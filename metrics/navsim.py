@@ -148,7 +148,7 @@ def frame_world(scenario: Scenario, iteration: int = 0, version: str = "v2") -> 
         footprint = boxes_to_corners(state.center_poses(ego[:3]), np.array(SIZE[:2]))
         others, touching = around.others, contacts.touches_boxes(footprint, around.others.boxes[0])
         others.ignored[:] = touching & np.isfinite(others.centers[0, :, 0])
-        around = _with_lights(around, scenario, after)
+        around = with_lights(around, scenario, after, FRAMES)
     ground, plan = _reference_plan(scenario, iteration, version)
     human = to_frame(scenario.ego[after[1:9], :3], ego[:3])[None]
     poses = [sample_plans(plan[None], time_us + STEP_US * np.arange(SCORED + 1), time_us)]
@@ -157,7 +157,7 @@ def frame_world(scenario: Scenario, iteration: int = 0, version: str = "v2") -> 
     past = past_states(scenario.time_us[before], scenario.ego[before])
     pairs = (states[:1], past), (states[1:], past[:0])
     parts = (evaluate(driven, ground, around, version, before) for driven, before in pairs)
-    scores = (_scored(part, version, time_us, None) for part in parts)
+    scores = (total(part, version, time_us, None) for part in parts)
     return FrameWorld(version, time_us, ego, past, ground, around, plan, *scores)
 
 
@@ -197,7 +197,7 @@ def score(
         parts["two_frame_extended_comfort"] = 1.0 * (differences <= EXTENDED_LIMITS).all(axis=1)
     human = world.human if human_filter and world.version == "v2" else None
     reach = world.reference.progress_m * world.reference.multiplicative_metrics_prod
-    return _scored(parts, world.version, world.time_us, human, reach)
+    return total(parts, world.version, world.time_us, human, reach)
 
 
 def evaluate(
@@ -217,16 +217,17 @@ def evaluate(
     off_road = flags[..., places.OFF_ROAD] = on_road.flags[..., places.OFF_ROAD]
     at = on_lanes._replace(flags=flags, off_lane=flags[..., places.MULTIPLE] | off_road)
     near = contacts.near_others(at, others, int(rows[-1]) + 1, AHEAD_SECONDS)
-    fault, fault_index = contacts.first_faults(at, others, near, rows[: SCORED + 1], True)
+    fault, fault_index = contacts.first_faults(at, others, near, rows[: states.shape[1]], True)
     ttc_index = first_violations(at, others, near, rows, around.reaches, SIZE, crossings)
     points = shapely.points(at.centers)
     along = shapely.line_locate_point(ground.centerline, points[:, [0, -1]])
     # nuPlan rule 743: v2 has no wrong direction within intersections
     wrong_way = flags[..., places.OFF_ROUTE] & ~(crosses & (version == "v2"))
+    most = way_off_route(at.centers, wrong_way).max(axis=1)
     parts = {
         "no_at_fault_collisions": fault,
         "drivable_area_compliance": 1.0 * ~off_road.any(axis=1),
-        "driving_direction_compliance": _direction(at.centers, wrong_way),
+        "driving_direction_compliance": 0.5 * sum(1.0 * (most < m) for m in DIRECTION_LIMITS),
         "time_to_collision_within_bound": 1.0 * (ttc_index == contacts.NEVER),
         "progress_m": np.maximum(along[:, 1] - along[:, 0], 0.0),
         "collision_index": fault_index,
@@ -236,7 +237,7 @@ def evaluate(
     }
     if version == "v1":
         return {**parts, "comfort": comfort(states, ComfortBounds()).score}
-    parts["traffic_light_compliance"] = 1.0 * ~_touches_red(at.corners, around)
+    parts["traffic_light_compliance"] = 1.0 * ~touches_red(at.corners, around).any(axis=1)
     # nuPlan rule 744: intersections are left out, as if they took no time
     outside = (row[~inside] for row, inside in zip(points, crosses, strict=True))
     leaves = [_leaves_line(row, ground.centerline) for row in outside]
@@ -247,13 +248,12 @@ def evaluate(
     return {**parts, "history_comfort": np.array(calm or [True] * len(states), np.float64)}
 
 
-def _direction(centers: FloatArray, wrong_way: BoolArray) -> FloatArray:
-    """(P,) factors from centres (P, T, 2), and whether they are off the route (P, T)."""
+def way_off_route(centers: FloatArray, wrong_way: BoolArray) -> FloatArray:
+    """(P, T) way off the route in the last second [m], from centres (P, T, 2) and flags (P, T)."""
     step = np.hypot(*np.moveaxis(np.diff(centers, axis=1), -1, 0))
-    way = np.zeros(wrong_way.shape)
-    np.cumsum(np.where(wrong_way[:, 1:], step, 0.0), axis=1, out=way[:, 1:])
-    longest = (way[:, DIRECTION_STEPS:] - way[:, :-DIRECTION_STEPS]).max(axis=1)
-    return 0.5 * ((longest < DIRECTION_LIMITS[0]) + 1.0 * (longest < DIRECTION_LIMITS[1]))
+    way = np.zeros((len(centers), DIRECTION_STEPS + centers.shape[1]))
+    np.cumsum(np.where(wrong_way[:, 1:], step, 0.0), axis=1, out=way[:, DIRECTION_STEPS + 1 :])
+    return way[:, DIRECTION_STEPS:] - way[:, :-DIRECTION_STEPS]
 
 
 def _leaves_line(points: np.ndarray, line: shapely.LineString) -> bool:
@@ -265,14 +265,14 @@ def _leaves_line(points: np.ndarray, line: shapely.LineString) -> bool:
     return bool(np.diff(near, prepend=-1, append=len(points)).max() > each)
 
 
-def _touches_red(corners: FloatArray, around: Surroundings) -> BoolArray:
-    """(P,) whether the ego (P, T, 4, 2) ever touches a connector while it is red."""
-    touched = np.zeros(len(corners), np.bool_)
+def touches_red(corners: FloatArray, around: Surroundings) -> BoolArray:
+    """(P, T) whether the ego (P, T, 4, 2) touches a connector while it is red."""
+    touched = np.zeros(corners.shape[:2], np.bool_)
     if around.connectors:
         boxes = shapely.polygons(corners)
         shapely.prepare(around.connectors)
         for connector, red in zip(around.connectors, around.red.T, strict=True):
-            touched |= (shapely.intersects(connector, boxes) & red).any(axis=1)
+            touched |= shapely.intersects(connector, boxes) & red
     return touched
 
 
@@ -292,7 +292,7 @@ def _motion(states: FloatArray) -> FloatArray:
     return np.stack([signals.mag_accel, signals.mag_jerk, signals.yaw_rate, yaw_accel])
 
 
-def _scored(
+def total(
     parts: Parts, version: str, time_us: int, human: Scores | None, reach: FloatArray | float = 0.0
 ) -> Scores:
     """Compare progress with how far others get [m], and add up; what is 0 for the human is 1."""
@@ -394,15 +394,15 @@ def _centroids(boxes: FloatArray) -> FloatArray:
     return np.stack([sum_x / 3.0 / area, sum_y / 3.0 / area], axis=-1)
 
 
-def _with_lights(around: Surroundings, scenario: Scenario, rows: IntArray) -> Surroundings:
-    """The same with the red lights of the route, which are known at rows 0.5 s apart."""
+def with_lights(on: Surroundings, scenario: Scenario, rows: IntArray, each: int) -> Surroundings:
+    """The same with the red lights of the route, known at rows that are `each` steps apart."""
     edges, lights = scenario.map.edges, scenario.traffic_lights
     blocks = known_blocks(scenario.map, scenario.route, scenario.token, "navsim")
     listed = [set(lights.red(row)) for row in rows.tolist()]
     lanes = [e for e in scenario.map.lanes_of(blocks) if any(edges.ids[e] in red for red in listed)]
     red = np.array([[edges.ids[e] in ids for e in lanes] for ids in listed], np.bool_)
-    red = red.reshape(len(listed), len(lanes))[np.arange(SCORED + 1) // FRAMES]
-    return around._replace(connectors=[edges.shape(e) for e in lanes], red=red)
+    red = red.reshape(len(listed), len(lanes)).repeat(each, axis=0)[: each * (len(rows) - 1) + 1]
+    return on._replace(connectors=[edges.shape(e) for e in lanes], red=red)
 
 
 def _reference_plan(scenario: Scenario, iteration: int, version: str) -> tuple[Ground, FloatArray]:
@@ -418,17 +418,17 @@ def _reference_plan(scenario: Scenario, iteration: int, version: str) -> tuple[G
     steps, red = VERSIONS[version].ttc_steps, np.ones((SCORED + 1, len(lights)), np.bool_)
     reaches = (AHEAD_SECONDS + DT) * others.speeds[0]
     around = Surroundings(others, np.arange(steps) // 2, reaches, lights, red)
-    ground = _ground(scenario.map, seen.place, state.center_poses(ego[:3]))
+    ground = ground_around(scenario.map, seen.place, state.center_poses(ego[:3]))
     # nuPlan rule 750: proposals look for leads as far as they get in 5 s, and never brake at last
     proposals = roll_out(scene, ego, targets, LEAD_HORIZON).poses[:, :, : SCORED + 1]
     poses = np.ascontiguousarray(proposals).reshape(-1, SCORED + 1, 3)
     states = drive_proposals(poses, ego).states
     parts = evaluate(states, ground, around, version, states[0, :0])
     reach = (parts["progress_m"] * _factor(parts, version)).max()
-    return ground, poses[np.argmax(_scored(parts, version, 0, None, reach).score)]
+    return ground, poses[np.argmax(total(parts, version, 0, None, reach).score)]
 
 
-def _ground(road: VectorMap, place: Place, center: FloatArray) -> Ground:
+def ground_around(road: VectorMap, place: Place, center: FloatArray) -> Ground:
     """The map around a centre (3,); lanes and centerline are PDM-Closed's."""
     square = layers.square_around(center[0], center[1], RADIUS)
     parts = (road.blocks, road.intersections, road.car_parks)

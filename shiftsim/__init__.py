@@ -23,6 +23,7 @@ _PUBLIC = {
     "Tracks": "shiftsim.world.state:Tracks",
     "Trajectory": "shiftsim.world.state:Trajectory",
     "bench": "shiftsim.api:bench",
+    "branch": "shiftsim.runs.rollouts.branches:branch",
     "check_planner": "shiftsim.planners.contract:check_planner",
     "convert_dataset": "shiftsim.api.stores:convert_dataset",
     "convert_dsc3d": "shiftsim.api.stores:convert_dsc3d",
@@ -59,6 +60,7 @@ _DEPRECATED = {
     "shiftsim.data.tracks": "shiftsim.data.readers.tracks",
     "shiftsim.data.tracks.build": "shiftsim.data.readers.build",
     "shiftsim.sim.traffic.constant_velocity": "shiftsim.sim.traffic.mixed",
+    "shiftsim.sim.traffic.scripted": "shiftsim.sim.traffic.mixed",
     "shiftsim.data.tracks.scenarios": "shiftsim.data.readers.scenarios",
 }
 

@@ -21,6 +21,7 @@ from shiftsim.env.policy import policy_planner as policy_planner
 from shiftsim.errors import ShiftsimError as ShiftsimError
 from shiftsim.metrics import compute_metrics as score
 from shiftsim.planners.contract import check_planner as check_planner
+from shiftsim.runs.rollouts.branches import branch as branch
 from shiftsim.runs.rollouts.elsewhere import score_rollout as score_rollout
 from shiftsim.sim.log import SimulationLog as SimulationLog
 from shiftsim.sim.noise import NoiseModel as NoiseModel
@@ -48,6 +49,7 @@ __all__ = [
     "Tracks",
     "Trajectory",
     "bench",
+    "branch",
     "check_planner",
     "convert_dataset",
     "convert_dsc3d",

@@ -153,8 +153,8 @@ class Straight:
 
 @pytest.fixture(scope="module")
 def pair(store, tmp_path_factory):
-    """A run of two labelled planners, with open-loop scores."""
-    settings = {"store": str(store.path), "workers": 1, "open_loop": True}
+    """A run of two labelled planners, with open-loop scores and NAVSIM's."""
+    settings = {"store": str(store.path), "workers": 1, "open_loop": True, "metrics": ["navsim"]}
     out = str(tmp_path_factory.mktemp("pair") / "out")
     return shiftsim.run({"fast": Straight(), "slow": Straight(0.9)}, out=out, **settings)
 

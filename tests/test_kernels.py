@@ -34,7 +34,8 @@ from shiftsim.kernels import _is_trusted
 from shiftsim.metrics import compute_metrics
 from shiftsim.planners.registry import load_planner
 from shiftsim.planners.table import PLANNERS
-from shiftsim.sim.loop import simulate
+from shiftsim.runs.rollouts.branches import branch
+from shiftsim.sim.loop import Rollout, simulate
 from shiftsim.sim.planner import Planner, scene_info
 from shiftsim.sim.traffic import _MODELS
 from shiftsim.train.traffic.realism import compare
@@ -118,6 +119,9 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
     drives = {f"{name}, {mode}": partial(drive, name, mode) for name in names for mode in _MODELS}
     return {
         **drives,
+        "branches": lambda: branch(
+            Rollout(scenario, load("constant-velocity")).snapshot(), np.zeros((2, 8, 3)), 5
+        ),
         "environment": compile_environment,
         "edited": drive_edited,
         "conversion": convert,

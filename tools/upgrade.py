@@ -29,8 +29,13 @@ from shiftsim.kernels import readonly
 from shiftsim.runs.filter import RESULTS, SCHEMA
 from shiftsim.runs.results import FORMAT_VERSION, Run
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.rollouts.columns import COMMAND_COLUMNS, NOISE_COLUMNS, rollout_rows
-from shiftsim.runs.rollouts.files import FOLDER, write_rollouts
+from shiftsim.runs.rollouts.files import (
+    COMMAND_COLUMNS,
+    FOLDER,
+    NOISE_COLUMNS,
+    rollout_rows,
+    write_rollouts,
+)
 from shiftsim.runs.scenarios import open_run_store
 from shiftsim.sim.log import NUM_KEPT, SimulationLog
 from shiftsim.world.layers import Layer, Lists, Polylines, index_polygons

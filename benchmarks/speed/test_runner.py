@@ -26,7 +26,7 @@ from shiftsim.runs.config import make_config
 from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.results import FORMAT_VERSION
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.rollouts.columns import encode_rows, rollout_rows
+from shiftsim.runs.rollouts.files import encode_rows, rollout_rows
 from shiftsim.runs.tables import TaskResult
 from shiftsim.runs.task import score_rollout
 from shiftsim.runs.workers import map_unordered

@@ -212,6 +212,20 @@ class Run(results.Run):
         made = rescore(self, thresholds=thresholds, **settings)
         return Run(made.path, made.manifest)
 
+    def mine(self, kind: str = "collision", **settings: Any) -> Path:
+        """Write what went wrong as edits, which begin shortly before; the file.
+
+        Kinds are `collision`, `off-road`, `wrong-way`, `ttc` and `speeding`. Settings are `before`
+        (3 s), `window` (duration), `planner`, and `out` (`mined.toml`), which `edits=` of a run and
+        of a benchmark then names.
+
+        Raises:
+            ConfigError: There is nothing of that kind, or the run drove edited scenarios.
+        """
+        from shiftsim.runs.rollouts.mining import mine
+
+        return mine(self, kind, **settings)
+
     def bundle(self, store: str | None = None) -> "Run":
         """Copy the scenarios and maps of the run into its folder, which then needs no store.
 

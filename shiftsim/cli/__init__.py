@@ -291,6 +291,7 @@ _COMMANDS = {
     "inspect": "view:inspect",
     "split": "store:make_split",
     "edits": "edits:app",
+    "mine": "edits:mine",
     "export": "store:export",
     "train": "training:app",
     "features": "training:features",

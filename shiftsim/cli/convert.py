@@ -246,7 +246,7 @@ def tracks(
 
 def _draw_tracks(path: Path, inspection: "TracksReader", store: Path | None) -> None:
     """The picture of map, tracks and scenarios; without matplotlib a line how to get it."""
-    from shiftsim.view.tracks import save_tracks_picture
+    from shiftsim.view.drawing import save_tracks_picture
 
     try:
         save_tracks_picture(path, inspection, store)

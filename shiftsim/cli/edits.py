@@ -139,3 +139,30 @@ def sample(
     for name, number in sorted(Counter(edit["type"] for edit in edits).items()):
         echo(f"{name:20} {number}")
     echo(f"written: {path}")
+
+
+def mine(
+    run: Path = Argument(metavar="RUN", help="A run folder."),
+    kind: str = Option("collision", help="collision, off-road, wrong-way, ttc or speeding."),
+    before: str = Option("3s", help="How long before it the scenarios begin."),
+    window: float | None = Option(None, help="Duration of the scenarios [s]. [5 s more]"),
+    planner: str = Option("", "--planner", "-p", help="Only rollouts of this one."),
+    out: Path = Option(Path("mined.toml"), "--out", "-o", help="The .toml file of edits."),
+) -> None:
+    """Make scenarios of what went wrong in a run, for `run --edits` and `bench edits --edits`."""
+    from shiftsim.runs.edited import read_edits
+    from shiftsim.runs.results import open_run
+    from shiftsim.runs.rollouts import mining
+
+    try:
+        seconds = float(before.removesuffix("s"))
+    except ValueError:
+        raise ConfigError(f"--before {before!r} is no duration", "for example 3s") from None
+    given = {} if window is None else {"window": window}
+    path = mining.mine(open_run(run), kind, before=seconds, planner=planner, out=out, **given)
+    edits = read_edits(str(path)).edits
+    tokens = {token for edit in edits for token in edit.tokens}
+    echo(
+        f"{plural(len(edits), 'scenario')} of {len(tokens)} recorded, {edits[0].window_s:g} s each"
+    )
+    echo(f"written: {path}")

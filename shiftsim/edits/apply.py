@@ -1,9 +1,10 @@
 """Apply an edit to a recorded scenario: a pure function from a `Scenario` to another one.
 
-Order: window, remove, move, slow, stop, reroute, density, spawn, block_lane, walk, light, speed.
+Order: start, window, remove, move, slow, stop, reroute, density, spawn, block_lane, walk, light,
+speed.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -16,10 +17,18 @@ from shiftsim.edits.interplan.path import DrivenLanes
 from shiftsim.edits.places import require_on_map
 from shiftsim.edits.route import reroute
 from shiftsim.errors import ConfigError, ShiftsimError
+from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.events import CAUTIOUS, FOLLOW, OFF, STOPPED, ScriptedPedestrian
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import AgentKind, LightStatus, TrafficLights
+from shiftsim.world.state import (
+    HEADING,
+    NUM_STATE,
+    AgentKind,
+    LightStatus,
+    Tracks,
+    TrafficLights,
+)
 
 SIZES = {  # length, width [m]
     "vehicle": (4.6, 1.9),
@@ -30,20 +39,32 @@ SIZES = {  # length, width [m]
     "czone_sign": (0.7, 0.7),
     "generic_object": (1.0, 1.0),
 }
+NONREACTIVE = "nonreactive"
+_MIN_LEFT = 3  # iterations after the first that a scenario has
 _BEHAVIORS = {"idm": FOLLOW, "stopped": STOPPED, "cautious": CAUTIOUS}
 
 
+# tracks (i + 1, N) of a scenario's iterations in traffic, where the ego drives states (i + 1, 11)
+Replay = Callable[[Scenario, FloatArray, str], Tracks]
+
+
 def apply_edit(
-    scenario: Scenario, edit: spec.Edit, driven_lanes: DrivenLanes | None = None
+    scenario: Scenario,
+    edit: spec.Edit,
+    driven_lanes: DrivenLanes | None = None,
+    replay: Replay | None = None,
 ) -> Scenario:
     """The scenario that an edit makes of a recorded one.
 
-    Codes of interPlan need `driven_lanes`, such as `metrics.interplan.driven_lanes`.
+    Codes of interPlan need `driven_lanes`, such as `metrics.interplan.driven_lanes`, and what
+    begins in traffic that reacts needs a `replay` of it.
 
     Raises:
         ConfigError: It cannot be applied; the message names scenario, edit and reason.
     """
     try:
+        if edit.start is not None:
+            scenario = _begin_at(scenario, edit.start, replay)
         if not edit.code:
             return _apply_tables(scenario, edit)
         if driven_lanes is None:
@@ -211,6 +232,39 @@ def _ahead_of(pose: FloatArray, ahead: float, left: float) -> FloatArray:
     return np.array(
         [pose[0] + ahead * cos - left * sin, pose[1] + ahead * sin + left * cos, pose[2]]
     )
+
+
+def _begin_at(scenario: Scenario, start: spec.Start, replay: Replay | None) -> Scenario:
+    """The scenario from where a rollout had come; what that drove is its past."""
+    rows, driven = scenario.iteration_rows, np.array(start.ego)
+    known = rows[: len(driven)]
+    if driven.shape != (len(known), NUM_STATE) or len(known) + _MIN_LEFT > len(rows):
+        raise ConfigError(
+            f"start: {driven.shape} states of {NUM_STATE} numbers do not begin {len(rows)} "
+            "iterations",
+            hint="make the edit anew, with shiftsim mine",
+        )
+    past: IntArray = np.arange(known[0], known[-1] + 1)
+    ego, times, columns = np.array(scenario.ego), scenario.time_us - scenario.time_us[0], driven.T
+    columns = np.vstack([columns[:HEADING], np.unwrap(columns[HEADING]), columns[HEADING + 1 :]])
+    for column, values in enumerate(columns):
+        ego[past, column] = np.interp(times[past], times[known], values)
+    ego[past, HEADING] = wrap_angles(ego[past, HEADING])
+    ego[known], tracks = driven, scenario.tracks
+    if start.traffic != NONREACTIVE:
+        if replay is None:
+            raise ConfigError(
+                f"start: traffic {start.traffic!r} is driven in runs only",
+                hint="write the edit into a file, and run that",
+            )
+        seen, tracks = replay(scenario, driven, start.traffic), tracks.copy()
+        at = np.searchsorted(known, past, side="right") - 1
+        for name in ("valid", "poses", "velocities", "sizes"):
+            getattr(tracks, name)[past] = getattr(seen, name)[at]
+    left = float(times[rows[-1]] - times[known[-1]]) * 1e-6
+    mapping = (round(left, 1), *scenario.mapping[1:])
+    later = rows[len(driven) - 1 :]
+    return replace(scenario, ego=ego, tracks=tracks, iteration_rows=later, mapping=mapping)
 
 
 def _set_window(builder: ScenarioBuilder, seconds: float) -> None:

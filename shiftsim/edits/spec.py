@@ -32,7 +32,7 @@ _CHOICES: dict[str, Sequence[str]] = {
     "level": tuple(LEVELS),
     "command": COMMANDS,
 }
-_FREE_SIGN = ("ahead_m", "left_m", "turn", "pose", "near", "goal", "also_at", "from_s")
+_FREE_SIGN = ("ahead_m", "left_m", "turn", "pose", "near", "goal", "also_at", "from_s", "ego")
 _MAX_NAME = 60  # characters
 # of keys, in words
 _SIDES = {"ahead_m": ("ahead", "behind"), "left_m": ("left", "right")}
@@ -171,6 +171,14 @@ class Speed:
     ego_mps: float | None = None  # the ego's at the start
 
 
+@dataclass(frozen=True, slots=True)
+class Start:
+    """What a rollout drove: the scenario begins where that had come."""
+
+    ego: tuple[tuple[float, ...], ...]  # (i + 1, 11) states of the iterations until then
+    traffic: str = "nonreactive"  # beside which traffic
+
+
 @dataclass(frozen=True)
 class Edit:
     """Everything that makes one new scenario of each recorded one that it is for."""
@@ -197,11 +205,15 @@ class Edit:
     stop: tuple[Stop, ...] = ()
     light: tuple[Light, ...] = ()
     speed: Speed | None = None
+    start: Start | None = None
 
     @cached_property
     def digest(self) -> str:
         """What the new scenario depends on, beside the recorded one."""
-        return digest_of(asdict(self))
+        content = asdict(self)
+        if self.start is None:  # as before there was such a table
+            del content["start"]
+        return digest_of(content)
 
     @cached_property
     def words(self) -> tuple[str, ...]:
@@ -209,7 +221,9 @@ class Edit:
         if self.code:
             return (f"interPlan code {self.code}",)
         out = []
-        for item in fields(self)[11:]:
+        if self.start is not None:
+            out.append(f"start: {0.1 * (len(self.start.ego) - 1):.1f} s into a rollout")
+        for item in fields(self)[11:-1]:
             value = getattr(self, item.name)
             for table in value if isinstance(value, tuple) else filter(None, [value]):
                 out.append(f"{item.name.replace('_', ' ')}: {_words(table)}")

@@ -28,6 +28,7 @@ from shiftsim.geometry.boxes import from_frame
 from shiftsim.kernels import FloatArray
 from shiftsim.planners.learned.carl.planner import command_of
 from shiftsim.runs.scenarios import find_split
+from shiftsim.sim.log import Snapshot
 from shiftsim.sim.loop import Setting
 from shiftsim.sim.noise import NoiseModel, parse_noise
 from shiftsim.sim.traffic import Traffic, make_traffic, traffic_name
@@ -129,14 +130,13 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         self.observation_space = self.observer.space
         self.action_space = spaces.Box(-self._high, self._high)
         self._episode: Episode | None = None
-        self._begun: dict[str, Any] = {}  # token and noise seed of the episode
-        self._actions: list[Any] = []  # its actions so far
 
     def __reduce__(self) -> Any:
-        """Copies drive the episode again: its arrays are views of one another."""
+        """Copies come to the same iteration: the arrays of an episode are views of one another."""
         generator = {"_np_random": self._np_random, "_np_random_seed": self._np_random_seed}
-        state = {**generator, "spec": self.spec}
-        return _resume, (type(self), self._settings, self._begun, self._actions), state
+        state = {**generator, "spec": self.spec, "observer": self.observer}
+        snapshot = None if self._episode is None else self._episode.snapshot()
+        return _resume, (type(self), self._settings, snapshot), state
 
     @property
     def episode(self) -> Episode:
@@ -154,8 +154,11 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
     ) -> tuple[Any, dict[str, Any]]:
         """Begin a scenario, drawn at random; `options` may name its `token` and `noise_seed`.
 
+        Or they have a `snapshot` as steps return it: the episode goes on from there. The observer
+        then looks at the beginning and at the present.
+
         Raises:
-            ConfigError: There is another option.
+            ConfigError: There is another option, or the snapshot has another setting.
             DataError: The store has no scenario of that token.
         """
         super().reset(seed=seed)
@@ -163,16 +166,25 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
             "token": self._tokens[int(self.np_random.integers(len(self._tokens)))],
             "noise_seed": int(self.np_random.integers(2**31)),
         }
-        for name in options or {}:
-            one_of("option of reset", name, drawn)
-        chosen = drawn | (options or {})
-        self._begun, self._actions = chosen, []
+        chosen = dict(options or {})
+        for name in chosen:
+            one_of("option of reset", name, [*drawn, "snapshot"])
+        snapshot: Snapshot | None = chosen.pop("snapshot", None)
+        if snapshot is not None:
+            chosen |= {"token": snapshot.token, "noise_seed": snapshot.setting.seed}
+        chosen = drawn | chosen
         scenario = self._store.read(chosen["token"])
         setting = Setting(self._setting.noise, chosen["noise_seed"], self._setting.traffic)
         self._episode = episode = Episode(scenario, setting, np.zeros_like(self._high))
         self.observer.start(episode)
+        seen, first = self.observer.look(episode), episode.snapshot()
+        if snapshot is not None:
+            if snapshot.setting != first.setting:
+                raise ConfigError(f"the snapshot has {snapshot.setting}, this {first.setting}")
+            episode.resume(snapshot)
+            seen, first = self.observer.look(episode), snapshot
         info = {"scenario_type": scenario.scenario_type, "log_name": scenario.log_name}
-        return self.observer.look(episode), chosen | info
+        return seen, chosen | info | {"snapshot": first}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Drive one step of 0.1 s.
@@ -185,9 +197,9 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         episode = self.episode
         episode.action = given = bounded(action, self._high)
         episode.advance(plan_of(given, episode.log.ego[episode.iteration]))
-        self._actions.append(given)
         infraction, is_over = episode.infraction, episode.is_over
         info: dict[str, Any] = {"terms": episode.terms, "infraction": infraction}
+        info["snapshot"] = episode.snapshot()
         if is_over:
             info["scores"] = episode.scores
             info["error"] = episode.error
@@ -201,14 +213,12 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
 
 
 def _resume(
-    kind: type[DrivingEnv], settings: dict[str, Any], begun: dict[str, Any], actions: list[Any]
+    kind: type[DrivingEnv], settings: dict[str, Any], snapshot: Snapshot | None
 ) -> DrivingEnv:
     """An environment whose episode has come as far as another's."""
     env = kind(**settings)
-    if begun:
-        env.reset(options=begun)
-        for action in actions:
-            env.step(action)
+    if snapshot is not None:
+        env.reset(options={"snapshot": snapshot})
     return env
 
 

@@ -10,6 +10,7 @@ from gymnasium import Space, spaces
 from shiftsim.env.terms import Terms, compute_reward_terms, make_state
 from shiftsim.errors import PlannerError, ShiftsimError
 from shiftsim.metrics import SHORT_NAMES, compute_metrics
+from shiftsim.sim.log import Snapshot
 from shiftsim.sim.loop import Rollout, Setting
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.scenario import Scenario
@@ -54,12 +55,32 @@ class Episode:
 
     def __init__(self, scenario: Scenario, setting: Setting, action: np.ndarray) -> None:
         driver = _Driver()
+        self._made_of = scenario, setting
         self._rollout = Rollout(scenario, driver, setting)
         self.scenario, self.scene = scenario, driver.scene
         self.log = self._rollout.log()
         self.action = action
         self.state = make_state(self.log, scenario.map)
         self.terms: Terms = compute_reward_terms(self.state, self.log, 0)
+
+    def __reduce__(self) -> Any:
+        """Copies come to the same iteration: the arrays are views of one another."""
+        return _resumed, (*self._made_of, self.snapshot())
+
+    def snapshot(self) -> Snapshot:
+        """What another episode of the scenario can go on from."""
+        return self._rollout.snapshot(self.action)
+
+    def resume(self, snapshot: Snapshot) -> None:
+        """Come, from the start of the scenario, to where another episode was.
+
+        Raises:
+            DataError: The snapshot is of another scenario.
+        """
+        self._rollout.resume(snapshot)
+        self.action = self.action if snapshot.action is None else snapshot.action
+        for row in range(1, snapshot.iteration + 1):
+            self.terms = compute_reward_terms(self.state, self.log, row)
 
     @property
     def iteration(self) -> int:
@@ -98,6 +119,12 @@ class Episode:
             return {}
         found = {name: result.scores[name] for name in SHORT_NAMES if name != "score"}
         return {"cls": result.score, **{n: float(v) for n, v in found.items() if v is not None}}
+
+
+def _resumed(scenario: Scenario, setting: Setting, snapshot: Snapshot) -> Episode:
+    episode = Episode(scenario, setting, snapshot.action)
+    episode.resume(snapshot)
+    return episode
 
 
 Reward = Callable[[Episode], float]

@@ -36,6 +36,7 @@ TABLES = {
     "scenario-types": "clean scores by scenario type",
     "scores": "every planner, noise and metric",
     "open-loop": "nuPlan's open-loop scores, of runs with --open-loop",
+    "navsim": "PDMS and EPDMS of plans and of what was driven, of runs with --metric navsim",
     "planning-time": "how long planners think, steps on a fallback plan",
     "data-statistics": "what the scenarios hold",
     "benchmark-comparison": "the data beside that of other benchmarks",
@@ -120,6 +121,7 @@ def _makers(
         "scenario-types": lambda: details.scenario_types(groups),
         "scores": lambda: [scores(groups, by=options.by)],
         "open-loop": lambda: [details.open_loop_scores(groups)],
+        "navsim": lambda: [details.navsim_scores(groups)],
         "planning-time": lambda: [details.planning_times(groups)],
         "data-statistics": lambda: [dataset.data_statistics(statistics())],
         "benchmark-comparison": lambda: (

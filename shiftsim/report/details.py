@@ -1,14 +1,14 @@
 """Tables beyond the paper's: a ranking, planners compared, scenario types, edits, times."""
 
 from collections.abc import Sequence
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 import pyarrow.compute as pc
 
 from shiftsim.edits.sampling import GRADES, graded
 from shiftsim.kernels import FloatArray
-from shiftsim.metrics import MULTIPLIERS, open_loop
+from shiftsim.metrics import MULTIPLIERS, navsim_rollouts, open_loop
 from shiftsim.report.groups import COLUMNS, Group, by_set, distinct_sets
 from shiftsim.report.statistics import (
     FEW_CLUSTERS,
@@ -333,6 +333,39 @@ def _open_loop_record(group: Group) -> Record:
         "rollouts": Number(len(plans), 0),
         "plans": f"{counted:.0f} of {there:.0f}" if counted else None,
     }
+
+
+def navsim_scores(groups: Sequence[Group]) -> Table | None:
+    """NAVSIM's scores of rollouts, in both modes, of the runs that asked for them."""
+    asked = [one for one in groups if "navsim" in one.run.manifest["config"].get("metrics", ())]
+    records = list[Record]()
+    for group, mode in product(asked, navsim_rollouts.MODES):
+        labels = {"set": group.data.label, "traffic": group.traffic, "planner": group.planner}
+        means = _metric_means(group)
+        record: Record = {**labels, "noise": group.noise, "scored": mode, "CLS": group.estimate()}
+        for column in navsim_rollouts.COLUMNS:
+            value = means.get(navsim_rollouts.metric_name(mode, column))
+            scale, digits = (1.0, 0) if column == navsim_rollouts.FRAMES else (100.0, 2)
+            record[column] = None if value is None else Number(scale * value, digits)
+        records.append(record)
+    if not records:
+        return None
+    notes = (
+        "plans: the plan of each half second as a proposal; windows: the 4 s driven from there; "
+        "the world is that of the rollout, no human filter acts, and neither is NAVSIM's own score",
+        "means over the frames of a rollout, then over rollouts; frames: how many were scored",
+    )
+    return Table.of("navsim", "PDMS and EPDMS of rollouts, × 100", records, 5, notes=notes)
+
+
+def _metric_means(group: Group) -> dict[str, float]:
+    """Means over the rollouts of a group, by metric; NaN is left out."""
+    metrics = group.run.metrics
+    mine = pc.and_(
+        pc.equal(metrics["planner"], group.name), pc.equal(metrics["noise"], group.noise)
+    )
+    found = metrics.filter(mine).group_by("metric").aggregate([("value", "mean")])
+    return dict(zip(found["metric"].to_pylist(), found["value_mean"].to_pylist(), strict=True))
 
 
 def planning_times(groups: Sequence[Group]) -> Table:

@@ -120,7 +120,7 @@ class RunConfig:
         },
     )
     metrics: tuple[str, ...] = setting(
-        (), "Own metric as package.module:function; repeatable.", "--metric"
+        (), "Own metric as package.module:function, or navsim; repeatable.", "--metric"
     )
     checkpoints: tuple[str, ...] = setting(
         (), "PATH, official or shiftsim; or LABEL=…; repeatable.", "--checkpoint"

@@ -23,8 +23,8 @@ from shiftsim.runs.manifest import check_target, code_digest, difference, make_m
 from shiftsim.runs.prepare import RUNS, run_name
 from shiftsim.runs.results import Run, open_run
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.rollouts.columns import encode_rows, rollout_rows
 from shiftsim.runs.rollouts.elsewhere import Entry, Source
+from shiftsim.runs.rollouts.files import encode_rows, rollout_rows
 from shiftsim.runs.rollouts.poses import NEED_BOXES, POINTS, REAR_AXLE, rollout_of
 from shiftsim.runs.scenarios import open_run_store, split_name, token_hash
 from shiftsim.runs.tables import FAILED, MISSING, OK, TaskResult, stored_results

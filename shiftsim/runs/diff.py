@@ -17,7 +17,7 @@ from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import SHORT_NAMES
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.rollouts.columns import stored_plans, stored_tracks
+from shiftsim.runs.rollouts.files import stored_plans, stored_tracks
 from shiftsim.runs.tables import task_of
 from shiftsim.world.scenario import FULL_DURATION
 

@@ -10,13 +10,20 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from shiftsim.data.store.reading import ScenarioStore
-from shiftsim.edits.apply import apply_edit
+from shiftsim.edits.apply import NONREACTIVE, apply_edit
 from shiftsim.edits.spec import PROFILES, Edit, digest_of, edited_id, make_edit
 from shiftsim.errors import ConfigError, DataError, beginning, nearest
 from shiftsim.files import read_toml
+from shiftsim.kernels import FloatArray
 from shiftsim.metrics.interplan import driven_lanes
+from shiftsim.planners.basic import ConstantVelocity
+from shiftsim.sim.log import Snapshot
+from shiftsim.sim.loop import Rollout
 from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import Tracks
 
 FOLDER = "edits"  # below that of a store
 _FORMAT = 1
@@ -93,6 +100,11 @@ class EditSet:
         """
         for edit in self.edits:
             where = f"edits {self.name!r}, edit {edit.name!r}"
+            if edit.start is not None and edit.start.traffic not in (NONREACTIVE, traffic):
+                raise ConfigError(
+                    f"{where}: it begins in traffic {edit.start.traffic}, not {traffic}",
+                    hint=f"--traffic {edit.start.traffic}",
+                )
             moving = bool(edit.density) or any(
                 spawn.kind == "vehicle" and spawn.behavior != "stopped" for spawn in edit.spawn
             )
@@ -173,7 +185,16 @@ class EditedStore(ScenarioStore):
             ConfigError: The edit cannot be applied.
         """
         recorded = super().read(self.base(token), validate=validate)
-        return apply_edit(recorded, self.edited[token].edit, driven_lanes)
+        return apply_edit(recorded, self.edited[token].edit, driven_lanes, _replay)
+
+
+def _replay(scenario: Scenario, ego: FloatArray, traffic: str) -> Tracks:
+    """Tracks of the iterations in which the ego drives states (i + 1, 11)."""
+    rollout = Rollout(scenario, ConstantVelocity(), traffic=traffic)
+    steps = len(ego) - 1
+    blank = np.full((steps, 2), np.nan), np.zeros(steps), np.zeros(steps, np.bool_)
+    rollout.resume(Snapshot(scenario.token, rollout.setting, ego, *blank))
+    return rollout.log().tracks.rows(slice(0, len(ego)))
 
 
 def edit_words(manifest: Mapping[str, Any], token: str) -> list[str]:

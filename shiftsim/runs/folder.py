@@ -23,8 +23,7 @@ from shiftsim.files import atomic_write, safe_join
 from shiftsim.runs.journal import Journal
 from shiftsim.runs.results import JOURNAL, Run, open_run, write_manifest
 from shiftsim.runs.rollouts import Task, files
-from shiftsim.runs.rollouts.columns import decode_rows
-from shiftsim.runs.rollouts.files import RolloutLocation
+from shiftsim.runs.rollouts.files import RolloutLocation, decode_rows
 from shiftsim.runs.tables import MISSING, STATUSES, TABLES, TaskResult, stored_results
 
 _WRITE_OPTIONS: dict[str, Any] = {

@@ -13,8 +13,7 @@ import pyarrow.compute as pc
 from shiftsim.errors import ConfigError, DataError, listed, one_of
 from shiftsim.files import write_text
 from shiftsim.runs.rollouts import Task, describe
-from shiftsim.runs.rollouts.columns import complete_rollout
-from shiftsim.runs.rollouts.files import FOLDER, RolloutLocation, RolloutReader
+from shiftsim.runs.rollouts.files import FOLDER, RolloutLocation, RolloutReader, complete_rollout
 from shiftsim.runs.tables import LOCATION, OK, damaged, read_table, stored_location
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.scenario import Scenario

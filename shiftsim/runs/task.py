@@ -24,7 +24,7 @@ from shiftsim.metrics.score import without
 from shiftsim.planners.registry import RunPlanner
 from shiftsim.runs.config import RunConfig
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.rollouts.columns import encode_rows, rollout_rows
+from shiftsim.runs.rollouts.files import encode_rows, rollout_rows
 from shiftsim.runs.tables import FAILED, OK, TABLES, TaskResult
 from shiftsim.sim import loop
 from shiftsim.sim.log import SimulationLog
@@ -257,7 +257,7 @@ def score_rollout(
 
     Where metrics are undefined they have no row, and there is no total.
     """
-    result = compute_metrics(log, scenario.map, thresholds=config.thresholds, own=config.metrics)
+    result = compute_metrics(log, scenario, thresholds=config.thresholds, own=config.metrics)
     if scenario.script is not None and scenario.script.profile == "interplan":
         from shiftsim.metrics.interplan import add_interplan
 

@@ -1,16 +1,20 @@
-"""SimulationLog: the arrays of one finished rollout, nothing else.
+"""SimulationLog: the arrays of one finished rollout; Snapshot: those of one under way.
 
-Metrics, results and pages are made from it. It holds K = T - 1 samples for a scenario of T
+Metrics, results and pages are made from a log. It holds K = T - 1 samples for a scenario of T
 iterations: the state reached after the last planner call is never stored.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Tracks, TrafficLights
+
+if TYPE_CHECKING:
+    from shiftsim.sim.loop import Setting
 
 NUM_KEPT = 18  # poses of a plan
 
@@ -58,12 +62,72 @@ class SimulationLog:
     planning_seconds: FloatArray
     degraded: BoolArray
 
+    def snapshot(self, iteration: int, setting: "Setting") -> "Snapshot":
+        """Where the rollout was at an iteration, driven as a setting says."""
+        past, ego = slice(iteration), self.ego[: iteration + 1]
+        commands, seconds = self.commands[past], self.planning_seconds[past]
+        return Snapshot(self.token, setting, ego, commands, seconds, self.degraded[past])
+
     def __repr__(self) -> str:
         gone = np.hypot(*np.diff(self.ego[:, :2], axis=0).T).sum()
         return (
             f"<SimulationLog of {self.token}: {len(self.ego)} samples, {gone:.1f} m, "
             f"{self.tracks.num_tracks} tracks>"
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Snapshot:
+    """A rollout at iteration i: what others go on from, here or in another process.
+
+    Traffic is not in it: it does the same again where the ego does. Two snapshots are equal where
+    their contents are.
+
+    Attributes:
+        token: Id of the scenario.
+        setting: How it is driven; models of one's own stand there by name.
+        ego: (i + 1, 11) ego states of the iterations so far.
+        commands: (i, 2) as of `SimulationLog`.
+        planning_seconds: (i,) time the planner took for each call [s].
+        degraded: (i,) whether the plan was a fallback.
+        action: The last action, in the environment.
+        scenario: The scenario; None where the snapshot comes from another process.
+    """
+
+    token: str
+    setting: "Setting"
+    ego: FloatArray
+    commands: FloatArray
+    planning_seconds: FloatArray
+    degraded: BoolArray
+    action: Any = None
+    scenario: Scenario | None = None
+
+    @property
+    def iteration(self) -> int:
+        """The iteration i."""
+        return len(self.ego) - 1
+
+    def _content(self) -> tuple[Any, ...]:
+        return tuple(getattr(self, item.name) for item in fields(self)[:-1])
+
+    def _bytes(self) -> tuple[Any, ...]:
+        return *self._content()[:2], *(np.asarray(part).tobytes() for part in self._content()[2:-1])
+
+    def __reduce__(self) -> Any:
+        return Snapshot, self._content()
+
+    def __deepcopy__(self, memo: Any) -> "Snapshot":
+        return replace(self)  # nobody writes to its arrays
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Snapshot) and self._bytes() == other._bytes()
+
+    def __hash__(self) -> int:
+        return hash(self._bytes())
+
+    def __repr__(self) -> str:
+        return f"<Snapshot of {self.token} at iteration {self.iteration}>"
 
 
 def as_recorded(scenario: Scenario) -> SimulationLog:

@@ -7,6 +7,7 @@ times; its last answer is never executed, and the state at T - 1 is neither reac
 
 import warnings
 from collections.abc import Callable, Sequence
+from copy import copy, deepcopy
 from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any, ParamSpec, TypeAlias, TypeVar, cast
@@ -18,7 +19,7 @@ from shiftsim.kernels import FloatArray
 from shiftsim.sim.dynamics.bicycle import command_and_step
 from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
 from shiftsim.sim.dynamics.perfect import KEPT_US, follow_perfectly, sample_poses
-from shiftsim.sim.log import SimulationLog
+from shiftsim.sim.log import SimulationLog, Snapshot
 from shiftsim.sim.noise import NoiseModel, sample_noise
 from shiftsim.sim.plan_check import contiguous, find_fault, find_warning
 from shiftsim.sim.planner import (
@@ -105,7 +106,7 @@ class Rollout:
         traffic = setting.traffic
         self._traffic = make_traffic(traffic) if isinstance(traffic, str) else traffic
         if scenario.script is not None and scenario.script.has_pedestrians:
-            from shiftsim.sim.traffic.scripted import Scripted  # few scenarios need it
+            from shiftsim.sim.traffic.mixed import Scripted  # few scenarios need it
 
             self._traffic = Scripted(self._traffic)
         self._traffic.start(scenario, self._tracks, start)
@@ -119,7 +120,7 @@ class Rollout:
         self._seconds = np.zeros(self.num_samples)
         self._degraded = np.zeros(self.num_samples, np.bool_)
         if planner is not None:
-            planner.reset(scene_info(scenario, setting.seed, planner))
+            self.drive_by(planner)
 
     @property
     def done(self) -> bool:
@@ -205,6 +206,67 @@ class Rollout:
             )
         else:
             follow_perfectly(plan, next_us, after)
+
+    def snapshot(self, action: Any = None) -> Snapshot:
+        """What a rollout can go on from as this one would; `action` is kept with it.
+
+        Raises:
+            DataError: The rollout has ended.
+        """
+        if self.done:
+            raise DataError(f"the rollout of {self.scenario.token!r} has ended")
+        # views: nobody writes to the rows that lie behind
+        past, end = slice(self.iteration), self._start + self.iteration + 1
+        noise, traffic = self.setting.noise, self.setting.traffic
+        named = replace(
+            self.setting,
+            noise=noise if isinstance(noise, str) else noise.name,
+            traffic=traffic if isinstance(traffic, str) else type(traffic).__name__,
+        )
+        return Snapshot(
+            token=self.scenario.token,
+            setting=named,
+            ego=self._ego[self._start : end],
+            commands=self._commands[past],
+            planning_seconds=self._seconds[past],
+            degraded=self._degraded[past],
+            action=action,
+            scenario=self.scenario,
+        )
+
+    def resume(self, snapshot: Snapshot) -> None:
+        """Come to where another rollout was that has been where this one is, or is fresh.
+
+        The planner is not asked before, so it remembers nothing, and its plans are not there.
+
+        Raises:
+            DataError: The snapshot is of another scenario, or the scenario has ended before.
+        """
+        if snapshot.token != self.scenario.token or snapshot.iteration >= self.num_samples:
+            raise DataError(f"{snapshot!r} is none of scenario {self.scenario.token!r}")
+        past = slice(snapshot.iteration)
+        self._ego[self._start : self._start + snapshot.iteration + 1] = snapshot.ego
+        self._commands[past], self._seconds[past] = snapshot.commands, snapshot.planning_seconds
+        self._degraded[past] = snapshot.degraded
+        for row in range(self._start + self.iteration, self._start + snapshot.iteration):
+            self._traffic.step(self.iteration, self._ego[row], self._tracks, row + 1)
+            self._go_on()
+
+    def fork(self) -> "Rollout":
+        """Another rollout that has come as far, without a planner."""
+        other, scenario = copy(self), self.scenario
+        for name in ("_ego", "_tracks", "_commands", "_plans", "_seconds", "_degraded"):
+            setattr(other, name, getattr(self, name).copy())
+        arrays = other._time_us, other._ego, other._tracks, other._lights
+        other._observations, other.planner = ObservationBuilder(*arrays), None
+        shared = {id(one): one for one in (scenario, scenario.map)}
+        other._traffic = deepcopy(self._traffic, shared)
+        return other
+
+    def drive_by(self, planner: Planner) -> None:
+        """Have a planner drive from here on."""
+        self.planner = planner
+        planner.reset(scene_info(self.scenario, self.setting.seed, planner))
 
     def log(self) -> SimulationLog:
         """The finished rollout."""
@@ -307,17 +369,21 @@ def drive(rollout: Rollout) -> SimulationLog:
     return rollout.log()
 
 
-def simulate_together(rollouts: Sequence[Rollout]) -> list[SimulationLog | Exception]:
+def simulate_together(
+    rollouts: Sequence[Rollout], steps: int | None = None
+) -> list[SimulationLog | Exception]:
     """Drive several scenarios in lock step, so that their planners share one forward pass.
 
-    The rollouts are fresh. Planners that are forks of one `BatchPlanner` are asked together, and so
-    is traffic that is forks of one `BatchTraffic`; others one by one.
+    Each goes to its end, or as many steps as are given. Planners that are forks of one
+    `BatchPlanner` are asked together, and so is traffic that is forks of one `BatchTraffic`; others
+    one by one.
 
     Returns:
         Per rollout its log, or the error that ended it; the others go on.
     """
     ended: dict[int, SimulationLog | Exception] = {}
-    while len(ended) < len(rollouts):
+    while len(ended) < len(rollouts) and steps != 0:
+        steps = None if steps is None else steps - 1
         active = [i for i in range(len(rollouts)) if i not in ended]
         plans, seconds = _plans([rollouts[i] for i in active])
         moves: dict[int, Move] = {}
@@ -340,7 +406,7 @@ def simulate_together(rollouts: Sequence[Rollout]) -> list[SimulationLog | Excep
             rollouts[index]._go_on()
             if rollouts[index].done:
                 ended[index] = rollouts[index].log()
-    return [ended[i] for i in range(len(rollouts))]
+    return [ended.get(i) or rollout.log() for i, rollout in enumerate(rollouts)]
 
 
 def _plans(rollouts: Sequence[Rollout]) -> tuple[list[Plan | Exception], list[float]]:

@@ -1,7 +1,7 @@
 """The fork of a rollout: the last moment at which its collision could be avoided, and what follows.
 
-Until that moment the commands of the rollout are repeated; from there every planner drives on, and
-a driver who brakes on the path of the rollout, in the same traffic and with the same noise. As in
+Until that moment the ego does what the rollout did; from there every planner drives on, and a
+driver who brakes on the path of the rollout, in the same traffic and with the same noise. As in
 `shiftsim edits check --avoidable`, a collision can be avoided where braking or PDM-Closed does.
 """
 
@@ -12,7 +12,6 @@ from typing import Any
 
 from shiftsim.edits.sampling import HARDEST
 from shiftsim.errors import ConfigError
-from shiftsim.kernels import FloatArray
 from shiftsim.planners.pdm.planner import PdmClosed
 from shiftsim.planners.registry import load_planner
 from shiftsim.report.words import COLLISIONS
@@ -20,10 +19,10 @@ from shiftsim.runs.avoidable import REACTION_US, Braking, at_fault
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import Rollout
 from shiftsim.sim.noise import NoiseModel
-from shiftsim.sim.planner import Observation, Planner, SceneInfo
+from shiftsim.sim.planner import Planner
 from shiftsim.view.scene import Branch, Fork, ShownRollout
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import Command, Trajectory
+from shiftsim.world.state import Command
 
 BRAKING, PDM = "braking", "pdm-closed"
 _BACK, _STRIDE = 50, 5  # iterations that are looked back, and between two looks
@@ -57,30 +56,6 @@ def find_fork(scenario: Scenario, item: ShownRollout, manifest: Mapping[str, Any
     }
     iteration = first["first_violation_iteration"]
     return _Search(scenario, item.log, item.seed, made_with["traffic"], iteration).fork(planners)
-
-
-class _Repeated:
-    """Repeats the commands of a rollout up to an iteration, and leaves the rest to a planner.
-
-    The planner is asked from the start on; commands are repeated for as long as it takes to react.
-    """
-
-    def __init__(self, commands: FloatArray, start: int, planner: Planner) -> None:
-        self._commands, self._start, self._planner = commands, start, planner
-        self._acts = start + (_REACTION if isinstance(planner, Braking) else 0)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._planner, name)  # what it declares
-
-    def reset(self, scene: SceneInfo) -> None:
-        self._planner.reset(scene)
-
-    def plan(self, observation: Observation) -> Trajectory | Command:
-        now = observation.iteration
-        plan = self._planner.plan(observation) if now >= self._start else None
-        if plan is None or (now < self._acts and now < len(self._commands) - 1):
-            return Command(*self._commands[now].tolist())
-        return plan
 
 
 @dataclass(frozen=True)
@@ -121,13 +96,16 @@ class _Search:
     def _branch(self, name: str, start: int, planner: Planner) -> Branch:
         """What a planner drives from an iteration on, to the first collision at fault."""
         noise = NoiseModel("custom", function=lambda *_: self.log.noise, name="as driven")
-        repeated = _Repeated(self.log.commands, start, planner)
-        rollout = Rollout(
-            self.scenario, repeated, noise=noise, seed=self.seed, traffic=self.traffic
-        )
+        rollout = Rollout(self.scenario, planner, noise=noise, seed=self.seed, traffic=self.traffic)
+        rollout.resume(self.log.snapshot(start, rollout.setting))
         stop = min(self.iteration + _AFTER, rollout.num_samples - 1)
+        # commands are repeated for as long as it takes to react
+        acts = start + (_REACTION if isinstance(planner, Braking) else 0)
         while rollout.iteration < stop and not rollout.done:
-            rollout.advance(repeated.plan(rollout.observe()))
+            plan = planner.plan(rollout.observe())
+            if rollout.iteration < min(acts, len(self.log.commands) - 1):
+                plan = Command(*self.log.commands[rollout.iteration].tolist())
+            rollout.advance(plan)
         log = rollout.log()
         hits = at_fault(log, rollout.iteration + 1)
         hit = next((one for one in hits if one.iteration > start), None)

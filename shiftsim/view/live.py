@@ -17,7 +17,7 @@ from shiftsim.report.palette import planner_styles
 from shiftsim.report.statistics import bootstrap_interval
 from shiftsim.report.words import noise_order, violations
 from shiftsim.runs.execute import Progress
-from shiftsim.runs.rollouts.columns import complete_rollout, decode_rows
+from shiftsim.runs.rollouts.files import complete_rollout, decode_rows
 from shiftsim.runs.tables import OK, TaskResult
 from shiftsim.view.page import framed, replay_page
 from shiftsim.view.scene import ShownRollout

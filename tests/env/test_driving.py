@@ -302,3 +302,46 @@ def test_a_copy_before_the_first_episode_has_none(toy):
     twin = copy.deepcopy(DrivingEnv(store=str(toy)))
     with pytest.raises(ConfigError, match="no episode is under way"):
         twin.step(COAST)
+
+
+def test_an_episode_goes_on_from_the_snapshot_of_a_step(toy):
+    env = DrivingEnv(store=str(toy), noise="ou-high", traffic="reactive")
+    other = DrivingEnv(store=str(toy), noise="ou-high", traffic="reactive")
+    _, info = env.reset(options={"token": TOKEN, "noise_seed": 4})
+    assert info["snapshot"].iteration == 0
+    action = np.zeros(2, np.float32)
+    for action[:] in weave(7):
+        seen, *_, info = env.step(action)
+    seen_by_other, begun = other.reset(options={"snapshot": info["snapshot"]})
+    np.testing.assert_array_equal(seen_by_other, seen)
+    assert begun["snapshot"] == info["snapshot"]
+    assert other.episode.terms == env.episode.terms
+    for action[:] in weave(5):
+        (seen, *step, info), (seen_by_other, *step_of_other, told) = (
+            env.step(action),
+            other.step(action),
+        )
+        np.testing.assert_array_equal(seen_by_other, seen)
+        assert (step_of_other, told) == (step, info)
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
+def test_an_episode_can_be_copied(toy, duplicate):
+    env = DrivingEnv(store=str(toy), observation="none")
+    env.reset(options={"token": TOKEN})
+    env.step(COAST)
+    twin = duplicate(env.episode)
+    assert (twin.iteration, twin.terms) == (1, env.episode.terms)
+    assert twin.snapshot() == env.episode.snapshot()
+
+
+def test_a_snapshot_of_another_setting_is_refused(toy):
+    env = DrivingEnv(store=str(toy), observation="none")
+    _, info = env.reset(options={"token": TOKEN})
+    with pytest.raises(ConfigError, match="the snapshot has"):
+        DrivingEnv(store=str(toy), traffic="reactive").reset(options=info_of(info))
+
+
+def info_of(info):
+    """The options that go on from a step."""
+    return {"snapshot": info["snapshot"]}

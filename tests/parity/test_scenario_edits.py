@@ -32,7 +32,7 @@ from shiftsim.metrics.interplan import (
 from shiftsim.planners.idm import Idm
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.traffic.idm.model import IdmTraffic
-from shiftsim.sim.traffic.scripted import Scripted, share_walked
+from shiftsim.sim.traffic.mixed import Scripted, share_walked
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import LAST_AGENT_KIND, AgentKind
 

@@ -12,7 +12,7 @@ from shiftsim.errors import ConfigError, DataError
 from shiftsim.runs.diff import diff_lines, diff_runs, find_departure
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.rollouts.columns import rollout_rows
+from shiftsim.runs.rollouts.files import rollout_rows
 
 
 class Coast:

@@ -11,7 +11,7 @@ from shiftsim.planners.registry import load_planner
 from shiftsim.runs.config import make_config
 from shiftsim.runs.derive import rescore
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.rollouts.columns import (
+from shiftsim.runs.rollouts.files import (
     STATES,
     complete_rollout,
     decode_rows,

@@ -17,14 +17,16 @@ from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.results import FORMAT_VERSION
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.rollouts import files as rollout_files
-from shiftsim.runs.rollouts.columns import (
+from shiftsim.runs.rollouts.files import (
     TRACKS,
+    RolloutLocation,
+    RolloutReader,
     encode_rows,
     rollout_rows,
     stored_plans,
     stored_tracks,
+    write_rollouts,
 )
-from shiftsim.runs.rollouts.files import RolloutLocation, RolloutReader, write_rollouts
 from shiftsim.runs.tables import TaskResult
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.state import Tracks, TrafficLights

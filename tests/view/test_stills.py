@@ -14,9 +14,9 @@ from shiftsim.errors import ConfigError
 from shiftsim.planners.registry import load_planner
 from shiftsim.report.palette import ALARM, RECORDED, FigureFormat, planner_styles
 from shiftsim.sim.loop import simulate
+from shiftsim.view.drawing import save_tracks_picture
 from shiftsim.view.scene import ShownRollout
 from shiftsim.view.still import map_picture, picture, save_figure
-from shiftsim.view.tracks import save_tracks_picture
 from shiftsim.world.state import AgentKind
 
 pytest.importorskip("matplotlib")
@@ -160,7 +160,7 @@ def test_words_do_not_cover_those_of_the_scale(scenario):
 
 
 def test_the_picture_of_tracks_says_where_it_draws_one_row_in_several(tmp_path, monkeypatch):
-    monkeypatch.setattr("shiftsim.view.tracks._MAX_POINTS", 100)
+    monkeypatch.setattr("shiftsim.view.drawing._MAX_POINTS", 100)
     xy = np.stack([np.linspace(0.0, 80.0, 600), np.zeros(600)], axis=1)
     table = SimpleNamespace(name="rec", xy=xy, track=np.zeros(600, int), track_ids=["a"])
     table.category, table.categories = np.zeros(600, int), ["car"]

@@ -1,6 +1,6 @@
 """Rollouts on disk, and the task that names one.
 
-`columns` says what a row holds, `files` how many rollouts share files.
+`files` says what a row holds and how many rollouts share files; `branches` drives others from one.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,9 @@
-"""Files of rollouts: rows of many of them in Parquet.
+"""Rollouts on disk: a row per sample, and rows of many rollouts in Parquet files.
+
+Rows have what the scenario does not hold already. Recorded tracks (unless the traffic reacts),
+lights, route and expert come back from the store when a rollout is read, and noise from its key.
+Everything is stored to the last bit but plans, on which no score depends: they are less the pose of
+the ego, in single precision.
 
 A worker sends the rows of a rollout as bytes, which wait in the journal; when the run ends they go
 into files `part-*.parquet`. Most of the time of writing a small Parquet file goes into headers,
@@ -8,19 +13,233 @@ task, for readers that know nothing of locations.
 """
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from itertools import chain, islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from shiftsim.data.store.schema import BOX, EGO_COLUMNS, list_of
 from shiftsim.data.store.tables import write_blocks
 from shiftsim.errors import DataError
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.rollouts.columns import NOISE_COLUMNS, STATES, TRACKS
+from shiftsim.sim.log import NUM_KEPT, SimulationLog
+from shiftsim.sim.noise import sample_noise
+from shiftsim.world.ranges import RUN, require
+from shiftsim.world.scenario import Scenario
+
+COMMAND_COLUMNS = ("command_accel_mps2", "command_steering_rate_radps")
+NOISE_COLUMNS = ("noise_accel_mps2", "noise_steering_rate_radps")
+_PLAN_COLUMNS = ("plan_dx_m", "plan_dy_m", "plan_dheading_rad")
+
+
+def _schema(columns: dict[str, pa.DataType]) -> pa.Schema:
+    return pa.schema(
+        [pa.field(name, kind, nullable=name in NOISE_COLUMNS) for name, kind in columns.items()]
+    )
+
+
+STATES = _schema(
+    {
+        "time_us": pa.int64(),
+        **dict.fromkeys((*EGO_COLUMNS, *COMMAND_COLUMNS, *NOISE_COLUMNS), pa.float64()),
+        "planning_seconds": pa.float32(),
+        "degraded": pa.bool_(),
+        **dict.fromkeys(_PLAN_COLUMNS, list_of(pa.float32())),
+    }
+)
+TRACKS = _schema(
+    {
+        "track_tokens": list_of(pa.string()),
+        **dict.fromkeys((f"track_{name}" for name in BOX), list_of(pa.float64())),
+    }
+)
+
+
+KINDS = "track_kinds"  # beside `TRACKS` where there are other tracks than in the scenario
+
+
+def rollout_rows(
+    log: SimulationLog, *, with_tracks: bool, with_noise: bool = True, with_kinds: bool = False
+) -> pa.RecordBatch:
+    """Columns of `STATES`, and of `TRACKS` where tracks are not the recorded ones.
+
+    Noise that `complete_rollout` can make again from the task is left out: null. Kinds are needed
+    of tracks that the scenario has not.
+    """
+    columns = [pa.array(log.time_us)]
+    for values in (log.ego, log.commands):
+        columns += map(pa.array, np.ascontiguousarray(values.T))
+    empty = [pa.nulls(len(log.time_us), pa.float64())] * len(NOISE_COLUMNS)
+    columns += map(pa.array, np.ascontiguousarray(log.noise.T)) if with_noise else empty
+    columns += [pa.array(log.planning_seconds.astype(np.float32)), pa.array(log.degraded)]
+    # poses behind the first that is unknown are left out
+    known = np.logical_and.accumulate(~np.isnan(log.plans[..., 0]), axis=1)
+    offsets = (log.plans - log.ego[:, None, :3])[known].astype(np.float32)
+    columns += [_lists(known.sum(axis=1), of) for of in offsets.T]
+    if not with_tracks:
+        return pa.RecordBatch.from_arrays(columns, schema=STATES)
+    tracks = log.tracks
+    row, track = np.nonzero(tracks.valid)
+    lengths = tracks.valid.sum(axis=1)
+    columns.append(_lists(lengths, pa.array(tracks.tokens, pa.string()).take(pa.array(track))))
+    for values in (tracks.poses, tracks.velocities, tracks.sizes):
+        columns += [_lists(lengths, of) for of in values[row, track].T]
+    schema = pa.schema([*STATES, *TRACKS])
+    if with_kinds:
+        columns.append(_lists(lengths, pa.array(tracks.kinds[track], pa.int8())))
+        schema = schema.append(pa.field(KINDS, list_of(pa.int8()), nullable=False))
+    return pa.RecordBatch.from_arrays(columns, schema=schema)
+
+
+def _lists(lengths: np.ndarray, items: np.ndarray | pa.Array) -> pa.Array:
+    offsets = pa.array(np.append(0, np.cumsum(lengths)).astype(np.int32))
+    values = items if isinstance(items, pa.Array) else pa.array(np.ascontiguousarray(items))
+    return pa.ListArray.from_arrays(offsets, values, type=list_of(values.type))
+
+
+def complete_rollout(
+    rows: pa.RecordBatch, scenario: Scenario, task: Task, *, is_partial: bool = False
+) -> SimulationLog:
+    """The stored rollout of a task, completed by its noise and what its scenario holds already.
+
+    The rows have columns of `STATES`, and of `TRACKS` where they are not those of the log. Where
+    they may end before the scenario, the expert ends with them.
+
+    Raises:
+        DataError: The scenario is not the one that was driven, or the rows are damaged.
+    """
+    time_us = rows["time_us"].to_numpy()
+    if is_partial:
+        shown = scenario.iteration_rows[: len(time_us) + 1]
+        scenario = replace(scenario, iteration_rows=shown)
+    samples = scenario.iteration_rows[:-1]
+    if scenario.script is not None and scenario.script.termination is not None:
+        samples = samples[: len(time_us)]  # it may have ended before its time
+    if not np.array_equal(time_us, scenario.time_us[samples]):
+        raise DataError(
+            f"scenario {scenario.token!r} in the store is not the one that was driven",
+            hint="use the store that the manifest names",
+        )
+    ego = stack(rows, EGO_COLUMNS)
+    where = f"the rollout of scenario {scenario.token!r}"
+    require(RUN, "state", ego, f"{where}: an ego")
+    tracks = scenario.tracks.rows(samples)
+    try:
+        plans = stored_plans(rows)
+        if KINDS in rows.schema.names:
+            names = (rows[name].flatten().to_pylist() for name in (TRACKS.names[0], KINDS))
+            kinds = dict(zip(*names, strict=True))  # in order of appearance
+            codes = np.array([*kinds.values()], np.int64)
+            tracks = replace(tracks, tokens=tuple(kinds), kinds=codes)
+        if "track_tokens" in rows.schema.names:
+            stored: dict[str, Any] = stored_tracks(rows, tracks.tokens)
+            tracks = replace(tracks, **stored)
+    except ValueError as error:
+        raise DataError(f"{where} is damaged: {error}", hint="make the run again") from error
+    if rows[NOISE_COLUMNS[0]].null_count:
+        noise = sample_noise(task.noise, seed=task.seed, token=task.token, num_steps=len(rows))
+    else:
+        noise = stack(rows, NOISE_COLUMNS)
+    return SimulationLog(
+        token=scenario.token,
+        time_us=scenario.time_us[samples],
+        ego=ego,
+        tracks=tracks,
+        traffic_lights=scenario.traffic_lights.rows(samples),
+        expert_time_us=scenario.iteration_times,
+        expert_ego=scenario.expert,
+        route=scenario.route,
+        commands=stack(rows, COMMAND_COLUMNS),
+        noise=noise,
+        plans=plans,
+        planning_seconds=rows["planning_seconds"].to_numpy().astype(np.float64),
+        degraded=np.array(rows["degraded"].to_numpy(zero_copy_only=False)),
+    )
+
+
+def _cells(column: pa.Array, lengths: np.ndarray, name: str) -> pa.Array:
+    """The items of lists that have these lengths (K,).
+
+    Raises:
+        ValueError: They have others.
+    """
+    if not np.array_equal(np.diff(column.offsets.to_numpy()), lengths):
+        raise ValueError(f"the lists of {name!r} are too short or too long")
+    return column.flatten()
+
+
+def stored_plans(rows: pa.RecordBatch) -> np.ndarray:
+    """(K, P, 3) poses of the plans of a stored rollout, to about 10 micrometres.
+
+    Raises:
+        ValueError: They are damaged.
+    """
+    lengths = np.diff(rows[_PLAN_COLUMNS[0]].offsets.to_numpy())
+    if (lengths > NUM_KEPT).any():
+        raise ValueError(f"a plan of {lengths.max()} poses")
+    known = np.arange(NUM_KEPT) < lengths[:, None]
+    offsets = np.full((*known.shape, 3), np.nan)
+    for axis, name in enumerate(_PLAN_COLUMNS):
+        offsets[known, axis] = _cells(rows[name], lengths, name).to_numpy()
+    return stack(rows, EGO_COLUMNS[:3])[:, None] + offsets
+
+
+def stored_tracks(rows: pa.RecordBatch, tokens: Sequence[str]) -> dict[str, np.ndarray]:
+    """Fields `valid`, `poses`, `velocities` and `sizes` of the tracks of a stored rollout.
+
+    Args:
+        rows: Columns of `TRACKS`.
+        tokens: N tokens of the tracks, in the order of the arrays.
+
+    Raises:
+        ValueError: They are damaged, or of other tracks.
+    """
+    names = rows["track_tokens"]
+    lengths = np.diff(names.offsets.to_numpy())
+    found = pc.index_in(names.flatten(), pa.array(tokens, pa.string()))
+    if found.null_count:
+        raise ValueError("it has tracks that the scenario has not")
+    row, track = np.repeat(np.arange(len(rows)), lengths), found.to_numpy()
+    valid = np.zeros((len(rows), len(tokens)), np.bool_)
+    valid[row, track] = True
+    if np.count_nonzero(valid) != len(row):
+        raise ValueError("it has a track twice in a row")
+    columns = [f"track_{name}" for name in BOX]
+    boxes = np.stack([_cells(rows[name], lengths, name).to_numpy() for name in columns], axis=1)
+    out = {"valid": valid}
+    for name, part in zip(
+        ("poses", "velocities", "sizes"), np.split(boxes, [3, 5], axis=1), strict=True
+    ):
+        out[name] = np.full((*valid.shape, part.shape[1]), np.nan)
+        out[name][row, track] = part
+    return out
+
+
+def encode_rows(rows: pa.RecordBatch) -> bytes:
+    """The rows of a rollout as bytes, an Arrow stream."""
+    sink = pa.BufferOutputStream()
+    options = pa.ipc.IpcWriteOptions(compression="lz4")
+    with pa.ipc.new_stream(sink, rows.schema, options=options) as stream:
+        stream.write_batch(rows)
+    encoded: bytes = sink.getvalue().to_pybytes()
+    return encoded
+
+
+def decode_rows(data: bytes) -> pa.RecordBatch:
+    """What `encode_rows` was given."""
+    return pa.ipc.open_stream(data).read_next_batch()
+
+
+def stack(rows: pa.RecordBatch, names: Iterable[str]) -> np.ndarray:
+    """(K, C) numbers of C columns."""
+    return np.stack([rows[name].to_numpy() for name in names], axis=1)
+
 
 FOLDER = "rollouts"
 _PART = re.compile(r"part-(\d+)\.parquet")

@@ -1,16 +1,26 @@
-"""Traffic that goes straight on, and several models in one rollout, each for tracks of its own."""
+"""Traffic beside other traffic: what goes straight on, shares a rollout, or crosses in any.
+
+`Mixed` is several models in one rollout, each for tracks of its own. `Scripted` is traffic of any
+model, and the pedestrians that an edit adds: they wait for the ego, cross once, and stand.
+"""
 
 from collections.abc import Callable, Collection
 from typing import Protocol
 
 import numpy as np
 
-from shiftsim.errors import ConfigError
+from shiftsim.errors import ConfigError, TrafficError
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
+from shiftsim.sim.traffic import Traffic
+from shiftsim.world.events import CROSSING_SIZE, ScriptedPedestrian
+from shiftsim.world.lanes import find_start
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import LAST_AGENT_KIND, Tracks
+from shiftsim.world.state import LAST_AGENT_KIND, Tracks, center_poses
 
 Rule = Collection[int] | Callable[[Tracks], BoolArray]
+_SETS_OFF = 50.0  # m, how near along its lane the ego must be
+_AT_END = 0.1  # m, a projection on the end of the lane
+_WALK = 150  # iterations that a walk takes, and as many more as it starts late
 
 
 class ConstantVelocity:
@@ -91,3 +101,90 @@ class Mixed:
         """Let every policy move its own."""
         for _, policy in self._policies:
             policy.step(iteration, ego, tracks, row)
+
+
+def share_walked(iteration: int, active: int, num_iterations: int) -> float:
+    """How much of its way a pedestrian of interPlan has gone that set off at an iteration."""
+    return min(max(0, iteration - active) / min(active + _WALK, num_iterations), 1.0)
+
+
+class Scripted:
+    """Traffic of any model, and the pedestrians of an edited scenario."""
+
+    def __init__(self, traffic: Traffic) -> None:
+        self._traffic = traffic
+        self._pedestrians: tuple[ScriptedPedestrian, ...] = ()
+        self._start_times: list[float] = []
+        self._seconds = np.zeros(0)
+
+    def start(self, scenario: Scenario, tracks: Tracks, row: int) -> None:
+        """Prepare traffic and pedestrians."""
+        self._pedestrians = scenario.script.pedestrians if scenario.script else ()
+        self._crossings = scenario.script.crossings if scenario.script else ()
+        self._map = scenario.map
+        self._active = [crossing.iteration for crossing in self._crossings]
+        self._start_times = [np.inf] * len(self._pedestrians)
+        times = scenario.iteration_times
+        self._seconds = (times - times[0]) * 1e-6
+        self._traffic.start(scenario, tracks, row)
+        now = int(scenario.iteration_rows[0])
+        if self._crossings:
+            self._cross(0, scenario.ego[now], tracks, row)
+
+    def step(self, iteration: int, ego: FloatArray, tracks: Tracks, row: int) -> None:
+        """Move the pedestrians, which the other traffic then sees, and that traffic."""
+        now, after = self._seconds[iteration], self._seconds[iteration + 1]
+        x, y, _ = center_poses(ego[None, :3])[0]
+        for number, pedestrian in enumerate(self._pedestrians):
+            near = (
+                np.hypot(pedestrian.start[0] - x, pedestrian.start[1] - y) <= pedestrian.ego_within
+            )
+            if near and self._start_times[number] == np.inf:
+                self._start_times[number] = now
+        self._move_pedestrians(after, tracks, row)
+        if self._crossings:
+            self._cross(iteration + 1, ego, tracks, row)
+        self._traffic.step(iteration, ego, tracks, row)
+        self._move_pedestrians(after, tracks, row)  # a model may have moved all pedestrians
+
+    def _cross(self, iteration: int, ego: FloatArray, tracks: Tracks, row: int) -> None:
+        """Move pedestrians of interPlan.
+
+        nuPlan rule 713: they are not there before they set off, report no velocity, walk the slower
+        the later they set off, and setting off at iteration 0 is forgotten.
+        """
+        center = center_poses(ego[None, :3])[0]
+        start = find_start(self._map, center)
+        if start is None:
+            raise TrafficError(
+                f"the ego is on no lane at iteration {iteration}, so no pedestrian can look for it",
+                hint="interPlan fails here as well",
+            )
+        lane = self._map.baselines.at(start.edge)
+        length = self._map.baselines.length(start.edge)
+        for number, crossing in enumerate(self._crossings):
+            if not self._active[number]:
+                x, y = crossing.start[:2]
+                along = self._map.progress_on(start.edge, float(x), float(y))
+                if abs(along - length) < _AT_END:
+                    along += float(np.hypot(*(crossing.start[:2] - lane[-1])))
+                if abs(along - start.progress) > _SETS_OFF:
+                    continue
+                self._active[number] = iteration
+            share = share_walked(iteration, self._active[number], len(self._seconds))
+            track = crossing.track
+            tracks.valid[row, track] = True
+            tracks.poses[row, track] = crossing.start
+            tracks.poses[row, track, :2] += share * (crossing.end - crossing.start[:2])
+            tracks.velocities[row, track] = 0.0
+            tracks.sizes[row, track] = CROSSING_SIZE
+
+    def _move_pedestrians(self, seconds: float, tracks: Tracks, row: int) -> None:
+        for pedestrian, start_time in zip(self._pedestrians, self._start_times, strict=True):
+            poses, velocities, present = pedestrian.walk(np.array([seconds]), start_time)
+            if present[0]:
+                track = pedestrian.track
+                tracks.valid[row, track] = True
+                tracks.poses[row, track] = poses[0]
+                tracks.velocities[row, track] = velocities[0]
+                tracks.sizes[row, track] = pedestrian.size

@@ -8,7 +8,7 @@ from worlds import cruise_scenario, standing_tracks
 
 from shiftsim.errors import TrafficError
 from shiftsim.sim.traffic import LogReplay
-from shiftsim.sim.traffic.scripted import Scripted, share_walked
+from shiftsim.sim.traffic.mixed import Scripted, share_walked
 from shiftsim.world.events import CROSSING_SIZE, Crossing, RolloutEvents, ScriptedPedestrian
 from shiftsim.world.state import AgentKind, center_poses
 

@@ -10,6 +10,9 @@ Vehicles of the first frame are put on the baseline of the lane or connector the
 which there is none, or no space, are not simulated.
 """
 
+from copy import copy
+from typing import Any
+
 import numpy as np
 
 from shiftsim.errors import ConfigError, TrafficError
@@ -27,6 +30,7 @@ from shiftsim.sim.traffic.idm.scene import (
     MAX_ROUTE,
     REPLAYED_KINDS,
     Fleet,
+    Footprints,
     IdmParameters,
     Scene,
     lane_graph,
@@ -54,6 +58,13 @@ class IdmTraffic:
         """Traffic with nuPlan's parameters, or others."""
         self._parameters = IdmParameters(*map(float, parameters or IdmParameters()))
         self._scene: Scene | None = None
+
+    def __deepcopy__(self, memo: Any) -> "IdmTraffic":
+        """A model that goes on from here; what agents read of the map stays one."""
+        other = copy(self)
+        if (scene := self._scene) is not None:
+            other._scene = _copied(scene)
+        return other
 
     def start(
         self, scenario: Scenario, tracks: Tracks, row: int, own: IntArray | None = None
@@ -155,6 +166,20 @@ class IdmTraffic:
             gone[self._stopped[far]] = True
             _remove(tracks, row, gone)
             self._stopped = self._stopped[~far]
+
+
+def _copied(scene: Scene) -> Scene:
+    """The same scene, in arrays of its own where a step writes."""
+    # long arrays that are not full are made anew
+    scene = with_longer_paths(scene, -(-scene.fleet.path.shape[1] // 2))
+    curve, yielding = scene.footprints.curve, scene.yielding
+    written = {name: getattr(yielding, name).copy() for name in ("num_drawn", "ego_block")}
+    return scene._replace(
+        graph=scene.graph._replace(lights=scene.graph.lights.copy()),
+        fleet=Fleet._make(array.copy() for array in scene.fleet),
+        footprints=Footprints._make(a if a is curve else a.copy() for a in scene.footprints),
+        yielding=yielding._replace(**written),
+    )
 
 
 def _remove(tracks: Tracks, row: int, which: np.ndarray) -> None:

@@ -1,0 +1,367 @@
+"""Branches of rollouts: K plans driven from one snapshot, and what each of them is worth.
+
+A branch follows its plan, or follows it for a while and leaves the rest to a planner. Its parts are
+those of NAVSIM's EPDMS over all that it has driven, among what the others really did there.
+
+Array axes: N snapshots, K plans of each, H poses of a plan, T = steps + 1 states.
+"""
+
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from shiftsim.errors import ConfigError, DataError, ShiftsimError
+from shiftsim.geometry.boxes import boxes_to_corners, from_frame, wrap_angle
+from shiftsim.kernels import FloatArray, IntArray, kernel
+from shiftsim.metrics import navsim
+from shiftsim.planners.basic import ConstantVelocity
+from shiftsim.planners.pdm.planner import PdmClosed
+from shiftsim.planners.pdm.scorer import TTC_STEPS
+from shiftsim.planners.proposals import contacts, places
+from shiftsim.planners.registry import load_planner
+from shiftsim.sim.dynamics.bicycle import step_bicycle, step_seconds
+from shiftsim.sim.dynamics.lqr import (
+    MIN_POSES,
+    NOT_COVERED,
+    NUPLAN,
+    TOO_SHORT,
+    TRACKED,
+    LqrParameters,
+    Reference,
+    command,
+    fit_profiles,
+    num_resampled,
+    profile_at,
+    raise_for_status,
+)
+from shiftsim.sim.dynamics.perfect import interpolate
+from shiftsim.sim.log import Snapshot
+from shiftsim.sim.loop import Rollout, Setting, simulate_together
+from shiftsim.sim.planner import BatchPlanner, Planner, scene_info
+from shiftsim.sim.traffic import traffic_name
+from shiftsim.world.state import (
+    HEADING,
+    LAST_AGENT_KIND,
+    NUM_STATE,
+    PACIFICA,
+    Tracks,
+    X,
+    Y,
+    center_poses,
+)
+
+_PAST = 15  # states before the present that comfort looks back on
+_TTC = TTC_STEPS[-1]  # steps that the time to collision looks ahead
+PARTS = (
+    *navsim.VERSIONS["v2"].multipliers,
+    "time_to_collision_within_bound",
+    "lane_keeping",
+    "history_comfort",
+    "progress_m",
+)
+FIRST = PARTS[:5]  # those that are violated at a step
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Branches:
+    """What was driven, and how. `lead` is (K,) for one snapshot, and (N, K) for a list of them.
+
+    A branch that failed has NaN for states and parts.
+
+    Attributes:
+        states: (*lead, T, 11) ego states, the present one first.
+        parts: (*lead,) each, by name, as of `navsim.Scores` in version v2; `progress_m` is along
+            the centerline [m].
+        first: (*lead,) step of the first violation of a part, inf without one; comfort, whose
+            filters look at the whole, and `lane_keeping` have none.
+        errors: (*lead,) why a branch failed, else empty.
+    """
+
+    states: FloatArray
+    parts: dict[str, FloatArray]
+    first: dict[str, FloatArray]
+    errors: np.ndarray
+
+    def __repr__(self) -> str:
+        return f"<Branches: {self.errors.shape}, {self.states.shape[-2] - 1} steps each>"
+
+
+def branch(
+    snapshot: Snapshot | Sequence[Snapshot],
+    plans: FloatArray,
+    steps: int = 80,
+    *,
+    spacing: float = 0.1,
+    follow: int | None = None,
+    planner: str | Planner = "",
+    store: Any = None,
+    setting: Setting | None = None,
+) -> Branches:
+    """Drive several plans from one state each, and rate what comes of them.
+
+    Args:
+        snapshot: Where they begin, or N of them.
+        plans: (K, H, 3), or (N, K, H, 3): rear axle x [m], y [m], heading [rad] in the frame of the
+            ego, at `spacing`, twice that, … from now.
+        steps: How many steps of 0.1 s are driven.
+        spacing: Time between two poses [s].
+        follow: Steps after which the planner goes on; all if None.
+        planner: By name, or one that is copied for every branch. It is first asked there.
+        store: Where the scenarios are, of snapshots from other processes.
+        setting: In place of the snapshot's, which names models of one's own only.
+
+    Raises:
+        ConfigError: Plans do not fit or are too short, or the controller is not `lqr`.
+        DataError: The scenario is not there, or ends before.
+
+    Example:
+        ```python
+        from shiftsim.sim.loop import Rollout
+
+        scenario = shiftsim.open_store("demo")["01f13e"]
+        rollout = Rollout(scenario, shiftsim.load_planner("idm"))
+        ahead = 0.6 * np.arange(1, 41)  # m, at 6 m/s
+        plans = np.stack([np.stack([ahead, by * ahead, 0.0 * ahead], -1) for by in (0.0, 0.1)])
+        found = shiftsim.branch(rollout.snapshot(), plans, steps=40)
+        print(found.parts["progress_m"], found.first["drivable_area_compliance"])
+        ```
+    """
+    plans = np.asarray(plans, np.float64)
+    if isinstance(snapshot, Snapshot):
+        found = [_Start(snapshot, store, setting).branch(plans, steps, spacing, follow, planner)]
+        return _joined(found, squeeze=True)
+    if len(plans) != len(snapshot) or not len(plans):
+        raise ConfigError(f"{len(snapshot)} snapshots, and plans for {len(plans)} of them")
+    starts = (_Start(one, store, setting) for one in snapshot)
+    pairs = zip(starts, plans, strict=True)
+    return _joined([one.branch(own, steps, spacing, follow, planner) for one, own in pairs])
+
+
+def _joined(found: Sequence[Branches], *, squeeze: bool = False) -> Branches:
+    def join(arrays: list[np.ndarray]) -> Any:
+        return arrays[0] if squeeze else np.stack(arrays)
+
+    return Branches(
+        states=join([one.states for one in found]),
+        parts={name: join([one.parts[name] for one in found]) for name in PARTS},
+        first={name: join([one.first[name] for one in found]) for name in FIRST},
+        errors=join([one.errors for one in found]),
+    )
+
+
+class _Start:
+    """Where branches begin: the rollout that has come there."""
+
+    def __init__(self, snapshot: Snapshot, store: Any, setting: Setting | None) -> None:
+        scenario = snapshot.scenario
+        if scenario is None:
+            if store is None:
+                raise DataError(
+                    f"{snapshot!r} is from another process, without its scenario",
+                    hint="give the store that has it: store=shiftsim.open_store(NAME)",
+                )
+            scenario = store.read(snapshot.token)
+        self.snapshot, self.scenario = snapshot, scenario
+        self.setting = setting or snapshot.setting
+        if self.setting.controller != "lqr":
+            raise ConfigError(f"branches need the controller 'lqr', not {self.setting.controller}")
+        self.rollout = Rollout(scenario, ConstantVelocity(), self.setting)
+        self.rollout.resume(snapshot)
+        # whether the others do the same whatever the ego does
+        named, script = self.setting.traffic, scenario.script
+        is_replayed = isinstance(named, str) and traffic_name(named) == "nonreactive"
+        self.is_replayed = is_replayed and not (script is not None and script.has_pedestrians)
+
+    def branch(
+        self,
+        plans: FloatArray,
+        steps: int,
+        spacing: float,
+        follow: int | None,
+        planner: str | Planner,
+    ) -> Branches:
+        """All branches of one snapshot; arguments as of `branch`."""
+        follow = steps if follow is None or not planner else min(follow, steps)
+        self._require(plans, steps, spacing, follow)
+        log, now = self.rollout.log(), self.snapshot.iteration
+        ego = self.snapshot.ego[-1]
+        plan_us = log.time_us[now] + np.rint(1e6 * spacing * np.arange(plans.shape[1] + 1))
+        states = np.zeros((len(plans), plans.shape[1] + 1, NUM_STATE))
+        states[:, 0, :3], states[:, 1:, :3] = ego[:3], from_frame(plans, ego[:3])
+        commands = np.empty((len(plans), follow, 2))
+        driven = np.empty((len(plans), follow + 1, NUM_STATE))
+        driven[:, 0] = ego
+        times = log.time_us[now : now + follow + 1], plan_us.astype(np.int64)
+        noise = log.noise[now : now + follow]
+        status = follow_plans(*times, states, noise, NUPLAN, driven, commands)
+        raise_for_status(int(status), int(times[0][0]), times[1])
+        if self.is_replayed and follow == steps:
+            return self._rated(driven, [self.rollout], np.full(len(plans), "", object))
+        forks, errors = self._forks(driven[:, 1:], commands)
+        if follow < steps:
+            self._drive_on(forks, errors, planner, steps - follow)
+        out = np.full((len(plans), steps + 1, NUM_STATE), np.nan)
+        for number, fork in enumerate(forks):
+            states = fork.log().ego[now : now + steps + 1]
+            out[number, : len(states)] = states
+            if len(states) <= steps and not errors[number]:
+                errors[number] = "the scenario has ended"
+        return self._rated(out, forks, errors)
+
+    def _require(self, plans: FloatArray, steps: int, spacing: float, follow: int) -> None:
+        left = self.rollout.num_samples - 1 - self.snapshot.iteration
+        if not 1 <= steps <= left or not follow:
+            raise DataError(f"{steps} steps, {follow} by plan: {self.snapshot!r} has {left} left")
+        if plans.ndim != 3 or plans.shape[2] != 3 or not plans.size or not np.isfinite(plans).all():
+            raise ConfigError(f"plans must be finite and (K, H, 3), not {plans.shape}")
+        if round(10 * spacing * plans.shape[1]) < follow:
+            raise ConfigError(
+                f"plans of {spacing * plans.shape[1]:g} s are too short for {follow} steps",
+                hint="drive fewer steps, or let a planner go on: follow=…, planner=…",
+            )
+
+    def _forks(self, driven: FloatArray, commands: FloatArray) -> tuple[list[Rollout], np.ndarray]:
+        """A rollout of each branch, in which the others have seen what it drove."""
+        forks, errors, before = [], np.full(len(driven), "", object), self.snapshot
+        for number, (states, sent) in enumerate(zip(driven, commands, strict=True)):
+            fork = self.rollout.fork()
+            more = replace(
+                before,
+                ego=np.concatenate([before.ego, states]),
+                commands=np.concatenate([before.commands, sent]),
+                planning_seconds=np.append(before.planning_seconds, np.zeros(len(sent))),
+                degraded=np.append(before.degraded, np.zeros(len(sent), np.bool_)),
+            )
+            try:
+                fork.resume(more)
+            except ShiftsimError as error:
+                errors[number] = error.message
+            forks.append(fork)
+        return forks, errors
+
+    def _drive_on(
+        self, forks: list[Rollout], errors: np.ndarray, planner: str | Planner, steps: int
+    ) -> None:
+        """Let planners drive the branches that are under way; those of one network together."""
+        one: Any = load_planner(planner) if isinstance(planner, str) else planner
+        active = [number for number, error in enumerate(errors) if not error]
+        for number in active:
+            own = one.fork() if isinstance(one, BatchPlanner) else deepcopy(one)
+            forks[number].drive_by(own)
+        ended = simulate_together([forks[number] for number in active], steps)
+        for number, result in zip(active, ended, strict=True):
+            if isinstance(result, Exception):
+                errors[number] = str(result)
+
+    def _rated(self, driven: FloatArray, worlds: list[Rollout], errors: np.ndarray) -> Branches:
+        """Parts of all branches, in one world or in one each."""
+        now, count = self.snapshot.iteration, driven.shape[1]
+        observation, road = self.rollout.observe(), self.scenario.map
+        planner = PdmClosed(map_radius=navsim.RADIUS, lateral_offsets=())
+        planner.reset(scene_info(self.scenario))
+        place = planner.look(observation)[0].place
+        ground = navsim.ground_around(road, place, observation.ego.center)
+        ego, lights = observation.history.ego, self.scenario.iteration_rows[now : now + count]
+        dark = _around(self.rollout.log().tracks.rows(slice(now, now + 1)), ego[-1])
+        lit = navsim.with_lights(dark, self.scenario, lights, 1)
+        tables = [
+            {name: np.full(len(driven), np.nan) for name in names} for names in (PARTS, FIRST)
+        ]
+        # beyond what was driven only a recording is known
+        known = count + (_TTC if self.is_replayed else 0)
+        for number, world in enumerate(worlds):
+            rows = slice(None) if world is self.rollout else slice(number, number + 1)
+            if any(errors[rows]):
+                continue
+            around = _around(world.log().tracks.rows(slice(now, now + known)), ego[-1])
+            around = around._replace(connectors=lit.connectors, red=lit.red)
+            past = np.ascontiguousarray(ego[-1 - _PAST : -1])
+            parts = navsim.evaluate(driven[rows], ground, around, "v2", past)
+            for table, found in zip(tables, (parts, _first_steps(parts, around)), strict=True):
+                for name, column in table.items():
+                    column[rows] = found[name]
+        driven[errors != ""] = np.nan
+        return Branches(states=driven, parts=tables[0], first=tables[1], errors=errors)
+
+
+def _around(tracks: Tracks, ego: FloatArray) -> navsim.Surroundings:
+    """The others at times 0.1 s apart, without lights; what the ego touches at first is ignored."""
+    boxes = boxes_to_corners(tracks.poses, tracks.sizes)
+    centers = np.where(tracks.valid[..., None], tracks.poses[..., :2], np.inf)
+    is_agent = tracks.kinds <= LAST_AGENT_KIND
+    speeds = np.where(is_agent, np.nan_to_num(np.hypot(*tracks.velocities.T).T), 0.0)
+    radii = 0.5 * np.nan_to_num(np.hypot(*tracks.sizes.T).T).max(axis=0, initial=0.0)
+    size = np.array([PACIFICA.length, PACIFICA.width])
+    footprint = boxes_to_corners(center_poses(ego[:3]), size)
+    ignored = contacts.touches_boxes(footprint, boxes[0]) & tracks.valid[0]
+    others = contacts.Obstacles(boxes, centers, centers, speeds, radii, is_agent, ignored)
+    way = np.nan_to_num(np.hypot(*np.diff(tracks.poses[..., :2], axis=0).T).T)
+    reaches = (_TTC + 1) * way.max(axis=0, initial=0.0)
+    return navsim.Surroundings(others, np.arange(len(boxes)), reaches, [], np.zeros((0, 0), bool))
+
+
+def _first_steps(parts: navsim.Parts, around: navsim.Surroundings) -> navsim.Parts:
+    """(K,) step of the first violation of what has one, inf without one."""
+    states, flags = parts["states"], parts["flags"]
+    centers = center_poses(states[..., :3])
+    way = navsim.way_off_route(centers[..., :2], flags[..., places.OFF_ROUTE])
+    when = {
+        "drivable_area_compliance": flags[..., places.OFF_ROAD],
+        "driving_direction_compliance": way >= navsim.DIRECTION_LIMITS[0],
+        "traffic_light_compliance": np.zeros(states.shape[:2], np.bool_),
+    }
+    if around.connectors:
+        corners = boxes_to_corners(centers, np.array([PACIFICA.length, PACIFICA.width]))
+        when["traffic_light_compliance"] = navsim.touches_red(corners, around)
+    steps = {name: np.where(m.any(axis=1), m.argmax(axis=1), np.inf) for name, m in when.items()}
+    right = parts["driving_direction_compliance"] == 1.0  # intersections do not count
+    steps["driving_direction_compliance"][right] = np.inf
+    return steps | {
+        "no_at_fault_collisions": parts["collision_index"],
+        "time_to_collision_within_bound": parts["ttc_index"],
+    }
+
+
+@kernel
+def follow_plans(
+    time_us: IntArray,  # (S + 1,) time stamps, from now on [us]
+    plan_us: IntArray,  # (H,) those of the poses of plans [us]
+    plans: FloatArray,  # (K, H, 11) states of plans; only the poses are read
+    noise: FloatArray,  # (S, 2) of the commands
+    params: LqrParameters,
+    states: FloatArray,  # (K, S + 1, 11) the first ones are there; receives the others
+    commands: FloatArray,  # (K, S, 2) receives the commands before noise
+) -> int:
+    """What `track_and_step` does step by step, for many plans that are not made anew.
+
+    Returns:
+        TRACKED, or why the rest was not written.
+    """
+    if num_resampled(plan_us, params.step_us) < MIN_POSES:
+        return TOO_SHORT
+    dt, target, ahead = params.step_us / 1e6, np.empty(plans.shape[2]), np.empty(params.horizon)
+    for row in range(len(plans)):
+        speeds, curvatures = fit_profiles(plan_us, plans[row], params)
+        for step in range(len(noise)):
+            now, state = time_us[step] * 1e-6, states[row, step]
+            if not interpolate(plan_us, plans[row], time_us[step], target):
+                return NOT_COVERED
+            turn = target[HEADING]
+            lateral = -(state[X] - target[X]) * np.sin(turn) + (state[Y] - target[Y]) * np.cos(turn)
+            for index in range(params.horizon):
+                at = now + index * dt
+                ahead[index] = profile_at(curvatures, plan_us[0], params.step_us, at)
+            speed = profile_at(speeds, plan_us[0], params.step_us, now + params.horizon * dt)
+            error = wrap_angle(state[HEADING] - turn)
+            accel, rate = command(state, Reference(TRACKED, lateral, error, speed, ahead), params)
+            commands[row, step, 0], commands[row, step, 1] = accel, rate
+            if noise[step, 0] != 0.0:
+                accel += noise[step, 0]
+            if noise[step, 1] != 0.0:
+                rate += noise[step, 1]
+            span = step_seconds(time_us[step], time_us[step + 1])
+            step_bicycle(state, accel, rate, params.wheel_base, span, states[row, step + 1])
+    return TRACKED
