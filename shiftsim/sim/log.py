@@ -5,6 +5,7 @@ iterations: the state reached after the last planner call is never stored.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +16,13 @@ from shiftsim.world.state import Tracks, TrafficLights
 NUM_KEPT = 18  # poses of a plan
 
 
+class Seen(NamedTuple):
+    """What a planner saw in K samples."""
+
+    ego: FloatArray  # (K, 3) where it took its rear axle to be: x [m], y [m], heading [rad]
+    tracks: Tracks  # the boxes; those that return after a drop-out have tokens of their own
+
+
 @dataclass(frozen=True, slots=True)
 class SimulationLog:
     """One rollout. K samples, T = K + 1 iterations.
@@ -23,7 +31,7 @@ class SimulationLog:
         token: Id of the scenario.
         time_us: (K,) time stamps [us].
         ego: (K, 11) simulated ego states, columns of `state.STATE_COLUMNS`.
-        tracks: What the planner saw of the others at each sample.
+        tracks: The others at each sample.
         traffic_lights: Lights at each sample.
         expert_time_us: (T,) time stamps of the iterations [us].
         expert_ego: (T, 11) recorded ego states at the iterations.
@@ -36,6 +44,7 @@ class SimulationLog:
             command was returned. Of a rollout from disk they are rounded to 1 mm and 0.1 mrad.
         planning_seconds: (K,) time the planner took for each call [s].
         degraded: (K,) whether the plan was a fallback by the planner's own account.
+        seen: What the planner saw in place of `ego` and `tracks`; None where it saw these.
 
     Example:
         ```python
@@ -57,6 +66,7 @@ class SimulationLog:
     plans: FloatArray
     planning_seconds: FloatArray
     degraded: BoolArray
+    seen: Seen | None = None
 
     def __repr__(self) -> str:
         gone = np.hypot(*np.diff(self.ego[:, :2], axis=0).T).sum()

@@ -18,6 +18,7 @@ from shiftsim.errors import DataError
 from shiftsim.runs.rollouts import Task
 from shiftsim.sim.log import NUM_KEPT, SimulationLog
 from shiftsim.sim.noise import sample_noise
+from shiftsim.sim.perception import noise_of
 from shiftsim.world.ranges import RUN, require
 from shiftsim.world.scenario import Scenario
 
@@ -131,7 +132,9 @@ def complete_rollout(
     except ValueError as error:
         raise DataError(f"{where} is damaged: {error}", hint="make the run again") from error
     if rows[NOISE_COLUMNS[0]].null_count:
-        noise = sample_noise(task.noise, seed=task.seed, token=task.token, num_steps=len(rows))
+        noise = sample_noise(
+            noise_of(task.noise), seed=task.seed, token=task.token, num_steps=len(rows)
+        )
     else:
         noise = stack(rows, NOISE_COLUMNS)
     return SimulationLog(
