@@ -106,7 +106,7 @@ def figures(groups: Sequence[Group], *, form: FigureFormat = DEFAULT_FORM) -> li
 
         shown = [group for group in mine if group.estimate().value is not None]
         clean = [group for group in shown if group.noise == "none"]
-        found = {group.noise.partition("-")[0] for group in shown}
+        found = {g.noise.partition("-")[0] for g in shown if "+" not in g.noise}
         for kind, (panels, label, words) in _CURVES.items():
             if not (kinds := {panels[k]: _levels(k, shown) for k in panels if k in found}):
                 continue
