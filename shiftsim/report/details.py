@@ -294,6 +294,7 @@ def drift_matrix(groups: Sequence[Group]) -> Table | None:
     words = "planners that are given the recording drive by it, whatever is seen: {}"
     informed = {g.name for g in drifts if planner_identities(g.run)[g.name].get("sees_recording")}
     notes = [data.rules for data in distinct_sets(drifts)]
+    notes += [f"a latency is borne if it costs at most {_BORNE:g} points"] if any(findings) else []
     notes += [words.format(", ".join(sorted(informed)))] if informed else []
     title = "Planner × traffic × drift: closed-loop score × 100"
     return Table.of("drift", title, records, 3, notes=notes, findings=[*filter(None, findings)])
@@ -319,8 +320,10 @@ def _borne(planner: str, mode: str, groups: Mapping[str, Group]) -> str:
     falls = [name for name in late if scores[name] < scores["none"] - _BORNE]
     borne = late[: late.index(falls[0])] if falls else late
     upto = f"a latency of {borne[-1][8:]} ms" if borne else "no latency that was run"
-    lost = f" and {scores['none'] - scores[falls[0]]:.1f} at {falls[0][8:]} ms" if falls else ""
-    return f"{planner} bears {upto} in {mode} traffic: it loses at most {_BORNE:g} points{lost}."
+    if not falls:
+        return f"{planner} bears {upto} ({mode}), the longest that was run."
+    lost = f"loses {scores['none'] - scores[falls[0]]:.1f} points at {falls[0][8:]} ms"
+    return f"{planner} bears {upto} ({mode}) and {lost}."
 
 
 def has_open_loop(group: Group) -> bool:

@@ -160,7 +160,11 @@ class TaskRunner:
             # pedestrians of an edit wait for the ego
             own_tracks = self.config.traffic != "nonreactive" or self.edits is not None
             own_noise = not is_standard(self.noises[task.noise].noise)
-            encoded = encode_rows(rollout_rows(log, with_tracks=own_tracks, with_noise=own_noise))
+            with_seen = any(drift.senses for drift in self.noises.values())  # as other rollouts
+            rows = rollout_rows(
+                log, with_tracks=own_tracks, with_noise=own_noise, with_seen=with_seen
+            )
+            encoded = encode_rows(rows)
         return TaskResult(
             task,
             OK,

@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 from shiftsim.data.store.tables import write_blocks
 from shiftsim.errors import DataError
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.rollouts.columns import NOISE_COLUMNS, STATES, TRACKS
+from shiftsim.runs.rollouts.columns import NOISE_COLUMNS, SEEN, STATES, TRACKS
 
 FOLDER = "rollouts"
 _PART = re.compile(r"part-(\d+)\.parquet")
@@ -84,7 +84,8 @@ class RolloutReader:
         self._file, self._rows = pq.ParquetFile(path), pa.table({})
         self._path = path
         found = self._file.schema_arrow
-        for column in [*STATES, *(TRACKS if TRACKS.names[0] in found.names else ())]:
+        there = (table for table in (TRACKS, SEEN) if table.names[0] in found.names)
+        for column in chain(STATES, *there):
             at = found.get_field_index(column.name)
             if at < 0 or not found.field(at).type.equals(column.type):
                 raise TypeError(f"column {column.name!r} is missing or not {column.type}")
@@ -108,7 +109,7 @@ def write_rollouts(
 ) -> dict[Task, RolloutLocation]:
     """Write rollouts into new files of a folder, and say where they are.
 
-    They have columns of `STATES`, and of `TRACKS` in all rollouts or in none. Columns that name a
+    They have columns of `STATES`, and of `TRACKS` and `SEEN` in all or in none. Columns that name a
     task already are written anew.
     """
     rollouts, locations = iter(rollouts), dict[Task, RolloutLocation]()
