@@ -302,7 +302,7 @@ def drift_matrix(groups: Sequence[Group]) -> Table | None:
 
 def _senses(group: Group) -> bool:
     """Whether something but the actuation drifts."""
-    fields = group.run.manifest["determining"]["noise"].get(group.noise, {})
+    fields = group.run.manifest["determining"].get("noise", {}).get(group.noise, {})
     return bool({"perception", "localization", "latency"} & {*fields})
 
 

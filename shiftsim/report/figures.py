@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from textwrap import wrap
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,11 +28,12 @@ from shiftsim.report.words import LONG, noise_order
 from shiftsim.sim.perception import LEVELS
 
 _NOISES = {"awgn": "white noise (AWGN)", "ou": "correlated noise (OU)"}
-_SENSORS = {"perception": "errors of boxes", "miss": "missed boxes", "dropout": "lost tracks"}
-_SENSORS |= {"localization": "error of the pose", "latency": "latency [ms]"}
+_BOXES = {"perception": "errors", "miss": "misses", "dropout": "drop-outs"}
+_TIMES = {"localization": "own pose", "latency": "latency"}
 _CURVES = {  # figures by name: panels by kind, label of the axis, title
     "robustness": (_NOISES, "strength of the noise", "Noise robustness"),
-    "drift": (_SENSORS, "level", "Perception, localization and latency"),
+    "perception": (_BOXES, "level", "Perception"),
+    "latency": (_TIMES, "level, latency [ms]", "Localization and latency"),
 }
 _TRAFFIC = {"NR": "non-reactive traffic", "R": "reactive traffic"}
 _SPREAD = 0.62  # how much of a place on the axis the planners share
@@ -45,7 +45,6 @@ _HEIGHT, _AROUND, _HIGHEST = 1.9, 0.6, 8.0  # inches, of a panel, words around i
 _BESIDE = 0.5  # inches, beside a panel: the labels of its axis
 _LONGEST = 18  # palette.characters of a name at the end of a line
 _WIDE = 5.0  # inches; what is wider needs both columns of a paper, and has panels side by side
-_NONE: Mapping[str, str] = MappingProxyType({})
 _BARS = "bars: 95 % bootstrap interval over recordings"
 
 
@@ -412,13 +411,11 @@ def _sample(noise: str) -> Any:
     return Line2D([], [], linestyle=dashes(noise), **Style(_GREY, "o").marks(noise))
 
 
-def _finish(
-    figure: Any, title: str, notes: str, form: FigureFormat, samples: Mapping[str, str] = _NONE
-) -> None:
+def _finish(figure: Any, title: str, notes: str, form: FigureFormat, samples: Any = None) -> None:
     """Legend, title and what stands beside every score; `samples` are noises by their label."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    handles += [*map(_sample, samples.values())]
-    labels += samples
+    handles += [*map(_sample, (samples or {}).values())]
+    labels += samples or {}
     look = {"loc": "outside upper center", "frameon": False, "fontsize": SMALL, "handlelength": 3.2}
     for columns in range(min(4, max(1, len(labels))), 0, -1):  # as many as fit
         legend = figure.legend(handles, labels, ncols=columns, **look)
