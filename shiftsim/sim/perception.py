@@ -230,7 +230,7 @@ def _seen(before: Perception, part: str) -> Perception:
     else:
         more = _KINDS[kind][one_of(kind, level, LEVELS)]
     name = part if before.name == "none" else f"{before.name}+{part}"
-    return replace(before, **more, name=name)  # type: ignore[arg-type]
+    return replace(before, **more, name=name)
 
 
 def _number(part: str, text: str) -> int:
