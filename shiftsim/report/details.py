@@ -307,8 +307,9 @@ def _senses(group: Group) -> bool:
 
 
 def _change(before: Group | None, after: Group | None) -> Number | None:
-    known = before and after and before is not after and before.is_complete and after.is_complete
-    return Number(_score(after) - _score(before)) if known else None
+    if not (before and after) or before is after or not (before.is_complete and after.is_complete):
+        return None
+    return Number(_score(after) - _score(before))
 
 
 def _borne(planner: str, mode: str, groups: Mapping[str, Group]) -> str:

@@ -98,9 +98,9 @@ def prepare(
         ShiftsimError: Something is unknown, missing or contradictory.
     """
     models = list(noises) or make_drifts(*(getattr(config, name) for name in DRIFT))
-    names = {"noise": tuple(model.name for model in models)}  # of all that drifts
-    plain = {item.name: item.default for item in fields(RunConfig) if item.name in DRIFT[1:]}
-    config = replace(config, **plain | names, traffic=traffic_name(config.traffic))
+    values: dict[str, Any] = {one.name: one.default for one in fields(config) if one.name in DRIFT}
+    values["noise"] = tuple(model.name for model in models)  # of all that drifts
+    config = replace(config, **values, traffic=traffic_name(config.traffic))
     traffic, traffic_fingerprint, is_batched = _traffic(config)
     thresholds = asdict(thresholds_of(config.thresholds))
     for metric in config.metrics:

@@ -123,8 +123,8 @@ class Rollout:
         drift, seed, token = setting.drift, setting.seed, scenario.token
         truth = self._ego, self._tracks
         self._sensing = Sensing(drift, seed, token, truth) if drift.senses else None
-        shown = (self._sensing.ego, self._sensing.tracks) if self._sensing else truth
-        self._observations = ObservationBuilder(self._time_us, *shown, self._lights)
+        ego, tracks = (self._sensing.ego, self._sensing.tracks) if self._sensing else truth
+        self._observations = ObservationBuilder(self._time_us, ego, tracks, self._lights)
         present = int(self._time_us[start])
         self._latency = Latency(drift.latency, self._ego[: start + 1], present)
         self._noise = sample_noise(drift.noise, seed=seed, token=token, num_steps=self.num_samples)

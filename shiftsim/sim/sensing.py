@@ -231,7 +231,7 @@ class Latency:
     def __init__(self, milliseconds: int, past: FloatArray, now_us: int) -> None:
         """Begin with the plan to keep speed and curvature of the past (H, 11), the present last."""
         steps = milliseconds // DT_MS
-        self._waiting = deque([coasting(past, now_us, steps + _COAST)] * steps)
+        self._waiting = deque[Plan]([coasting(past, now_us, steps + _COAST)] * steps)
 
     def exchange(self, plan: Plan, next_us: int) -> Plan:
         """The plan that is followed until `next_us`, as this one is made."""
