@@ -13,8 +13,9 @@ from typing import Any
 from shiftsim.errors import one_of
 from shiftsim.report.groups import KnownSet
 from shiftsim.report.paper import Published
+from shiftsim.sim.perception import has_seeds
 
-TRACKS = ("semantic-shift", "state-drift", "edits", "finding")
+TRACKS = ("semantic-shift", "state-drift", "sensor-drift", "edits", "finding")
 INTERPLAN_THRESHOLDS = "nuplan"  # of its edits, whatever the track's own
 _HERE = Path(__file__).parent
 
@@ -56,7 +57,7 @@ class Track:
     @property
     def rollouts_per_scenario(self) -> int:
         """Rollouts of one planner on one scenario."""
-        noisy = sum(name != "none" for name in self.noise)
+        noisy = sum(map(has_seeds, self.noise))
         return len(self.traffic) * (len(self.noise) - noisy + noisy * len(self.seeds))
 
 

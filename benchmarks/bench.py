@@ -32,7 +32,7 @@ from shiftsim.report.groups import (
 from shiftsim.report.palette import DEFAULT_FORM, FigureFormat
 from shiftsim.report.tables import FORMATS, Table
 from shiftsim.runs.avoidable import grade
-from shiftsim.runs.config import default_workers, make_config
+from shiftsim.runs.config import DRIFT, default_workers, make_config
 from shiftsim.runs.edited import EditSet, edits_text, make_edits
 from shiftsim.runs.execute import Progress, execute
 from shiftsim.runs.filter import filter_store
@@ -80,10 +80,11 @@ def plan_bench(
     """
     values = dict(settings)
     resumes = values.pop("resume", False)
-    modes = [values.pop("traffic")] if values.get("traffic") else list(track.traffic)
+    modes = given_modes(values.pop("traffic", None)) or list(track.traffic)
     edits_of = str(values.pop("edits", ""))
     values = {
-        "noise": list(track.noise),
+        # where others are given there is no noise but what is given
+        "noise": ["none"] if {*DRIFT} & {*values} else list(track.noise),
         "seeds": list(track.seeds),
         "store": DEFAULT_STORE,
     } | values
@@ -129,6 +130,11 @@ def plan_bench(
     edited = _prepared(track, changed, drivable, folder, edits)
     lists = (_list_of(unlimited), _list_of(_without_limit(next(iter(edited.values())))))
     return Plan(track, folder, runs | edited, lists, text)
+
+
+def given_modes(traffic: str | Sequence[str] | None) -> list[str]:
+    """Traffic modes that were given, one or a list."""
+    return [traffic] if isinstance(traffic, str) else [*(traffic or ())]
 
 
 def _plan_towns(track: Track, values: Mapping[str, Any], modes: Sequence[str], out: str) -> Plan:

@@ -17,6 +17,7 @@ from shiftsim.planners.registry import PLANNERS, readiness
 from shiftsim.report.groups import TRAFFIC, Group, distinct_sets, token_digest
 from shiftsim.report.tables import Cell, Number, Table
 from shiftsim.runs.scenarios import find_split
+from shiftsim.sim.perception import has_seeds
 
 _PAGE = "docs/data.md"
 OWN = "own scenarios"  # what a track drives besides its published list
@@ -154,6 +155,6 @@ def _belongs(group: Group, track: Track) -> bool:
 
 
 def _finished(group: Group, track: Track) -> int:
-    wanted = (0,) if group.noise == "none" else track.seeds
+    wanted = track.seeds if has_seeds(group.noise) else (0,)
     rows = [i for i, seed in enumerate(group.seeds) if seed in wanted]
     return int(np.isfinite(group.values[rows, :, 0]).sum())

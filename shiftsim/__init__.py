@@ -12,8 +12,10 @@ from shiftsim._version import __version__ as __version__
 _PUBLIC = {
     "Command": "shiftsim.world.state:Command",
     "EgoState": "shiftsim.world.state:EgoState",
+    "Localization": "shiftsim.sim.perception:Localization",
     "NoiseModel": "shiftsim.sim.noise:NoiseModel",
     "Observation": "shiftsim.sim.planner:Observation",
+    "Perception": "shiftsim.sim.perception:Perception",
     "Planner": "shiftsim.sim.planner:Planner",
     "Run": "shiftsim.api.finished:Run",
     "Scenario": "shiftsim.world.scenario:Scenario",

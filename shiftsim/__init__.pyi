@@ -25,6 +25,8 @@ from shiftsim.runs.rollouts.branches import branch as branch
 from shiftsim.runs.rollouts.elsewhere import score_rollout as score_rollout
 from shiftsim.sim.log import SimulationLog as SimulationLog
 from shiftsim.sim.noise import NoiseModel as NoiseModel
+from shiftsim.sim.perception import Localization as Localization
+from shiftsim.sim.perception import Perception as Perception
 from shiftsim.sim.planner import Observation as Observation
 from shiftsim.sim.planner import Planner as Planner
 from shiftsim.sim.planner import SceneInfo as SceneInfo
@@ -38,8 +40,10 @@ from shiftsim.world.state import Trajectory as Trajectory
 __all__ = [
     "Command",
     "EgoState",
+    "Localization",
     "NoiseModel",
     "Observation",
+    "Perception",
     "Planner",
     "Run",
     "Scenario",

@@ -171,7 +171,7 @@ def test_a_dict_of_planners_gives_them_their_names(pair, store):
 @pytest.mark.parametrize("name", [*TABLES])
 def test_every_table_comes_in_every_format(pair, name):
     pandas = pytest.importorskip("pandas")
-    if name in ("noise-robustness", "edits", "planner-comparison-noise"):
+    if name in ("noise-robustness", "drift", "edits", "planner-comparison-noise"):
         with pytest.raises(shiftsim.ShiftsimError, match="holds nothing of the table"):
             pair.table(name)
         return

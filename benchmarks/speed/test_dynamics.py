@@ -11,7 +11,9 @@ from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, command_and_step, step_bic
 from shiftsim.sim.dynamics.lqr import TRACKED, track_and_step
 from shiftsim.sim.dynamics.perfect import interpolate
 from shiftsim.sim.noise import parse_noise, sample_noise
-from shiftsim.world.state import HEADING, NUM_STATE, VX
+from shiftsim.sim.perception import parse_drift
+from shiftsim.sim.sensing import Sensing
+from shiftsim.world.state import HEADING, NUM_STATE, VX, tracks_of_boxes
 
 NOW = 1_630_000_000_000_000
 STEP_US = 100_000
@@ -67,3 +69,21 @@ def test_bicycle_batch_of_fifteen(measure):
 def test_noise_of_a_rollout(measure):
     model = parse_noise("ou-high")
     measure(lambda: sample_noise(model, seed=0, token="a1b2", num_steps=150), calls=5)
+
+
+@pytest.mark.parametrize(
+    "name", ["perception-high", "localization-high", "perception-high+miss-high"]
+)
+def test_seeing_a_rollout_of_100_tracks(measure, name):
+    """Of 150 steps: at most 30 us per step at level high, with the numbers drawn before."""
+    rng, rows = np.random.default_rng(0), 171
+    boxes = rng.normal(0.0, 40.0, (rows, 100, 7))
+    tracks = tracks_of_boxes(boxes, [0] * 100, [f"{i:016x}" for i in range(100)])
+    drift, truth = parse_drift(name), (np.zeros((rows, NUM_STATE)), tracks)
+
+    def see() -> None:
+        sensing = Sensing(drift, 0, "a1", truth)
+        for row in range(21, rows):
+            sensing.see(row)
+
+    measure(see, calls=5, target=150 * 30e-6)

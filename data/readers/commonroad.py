@@ -14,6 +14,7 @@ import shapely
 
 from shiftsim.data.maps.build import build_lane_map
 from shiftsim.data.maps.lights import Cycle, LightStates, states_of_cycles
+from shiftsim.data.maps.opendrive.reading import xml_elements
 from shiftsim.data.maps.segments import LanePiece, MapSource, StopArea, stop_area
 from shiftsim.data.readers import codes
 from shiftsim.data.readers.build import make_samples
@@ -21,7 +22,6 @@ from shiftsim.data.readers.files import SceneFolder, SourceFile
 from shiftsim.data.readers.motion import unit_vectors
 from shiftsim.data.readers.reader import SourceRecording
 from shiftsim.data.readers.samples import TrackSamples
-from shiftsim.data.xml_elements import xml_elements
 from shiftsim.kernels import FloatArray
 from shiftsim.world.state import AgentKind, LightStatus
 

@@ -20,7 +20,8 @@ from shiftsim.metrics import MetricResult
 from shiftsim.planners import registry
 from shiftsim.sim import loop
 from shiftsim.sim.log import SimulationLog
-from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
+from shiftsim.sim.noise import NoiseModel
+from shiftsim.sim.perception import Localization, Perception, make_drifts
 from shiftsim.sim.planner import Observation, Planner, SceneInfo
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario, require_scenario
@@ -37,6 +38,9 @@ def run(
     planner: Any,
     *,
     noise: str | NoiseModel | Sequence[str | NoiseModel] = "none",
+    perception: str | Perception | Sequence[str | Perception] = "none",
+    localization: str | Localization | Sequence[str | Localization] = "none",
+    latency: int | Sequence[int] = 0,
     seeds: int | Iterable[int] = 0,
     on_progress: Any = None,
     **settings: Any,
@@ -48,7 +52,10 @@ def run(
             dict by what tables call them. Classes and instances of the main script run in this
             process.
         noise: Name or model, or a list of them.
-        seeds: Seeds of the noise.
+        perception: What planners see: name or model, or a list of them.
+        localization: Where they believe to be: name or model, or a list of them.
+        latency: How late plans arrive [ms], or a list; all combinations of the four are run.
+        seeds: Seeds of what is random.
         on_progress: Called with a `Progress` after every task.
         settings: The other settings of a run, as in a configuration file: `store`, `split`,
             `limit`, `traffic`, `thresholds`, `workers`, `out`, …
@@ -75,10 +82,7 @@ def run(
     labels = list(named) or [registry.planner_name(source) for source in planners]
     if wrong := [label for label in named if "=" in label]:
         raise ConfigError(f"label {wrong[0]!r} of a planner holds '='", hint="choose another one")
-    noises = [noise] if isinstance(noise, (str, NoiseModel)) else list(noise)
-    models = [m if isinstance(m, NoiseModel) else parse_noise(m) for m in noises if m != "all"]
-    if any(isinstance(m, str) and m == "all" for m in noises):
-        models += [parse_noise(name) for name in NOISE_NAMES]
+    models = make_drifts(noise, perception, localization, latency)
     values = {
         "planners": labels,
         "noise": [model.name for model in models],
@@ -118,7 +122,7 @@ def bench(
     """Run a benchmark track with all its traffic modes, noises and seeds, as `shiftsim bench` does.
 
     Args:
-        track: `semantic-shift`, `state-drift` or `edits`.
+        track: `semantic-shift`, `state-drift`, `sensor-drift` or `edits`.
         planner: A name, `package.module:Class` or `LABEL=` one of those, or a list of them.
         out: Folder; that of an earlier call goes on.
         val14: Store, or STORE:SPLIT, with Val14.
@@ -135,9 +139,10 @@ def bench(
     """
     from shiftsim.benchmarks import load_track
     from shiftsim.benchmarks.bench import plan_bench, run_bench
+    from shiftsim.runs.config import DRIFT
 
     settings["planners"] = planner
-    for name in ("planners", "noise", "seeds"):
+    for name in ("planners", *DRIFT, "seeds", "traffic"):
         if isinstance(settings.get(name), (str, int)):
             settings[name] = [settings[name]]
     plan = plan_bench(load_track(track), settings, reference=val14, out=str(out))
@@ -246,7 +251,7 @@ def simulate(
         planner: A planner or the name of one; None only with `log-playback`, which needs none.
         setting: How it is driven.
         changes: Fields of `Setting` that differ from it: `noise`, `seed`, `traffic`, `controller`,
-            `strict`.
+            `strict`, `perception`, `localization`, `latency`.
 
     Returns:
         The rollout, K = T - 1 samples.

@@ -20,10 +20,12 @@ if TYPE_CHECKING:
 _MAIN_TABLE = {
     "semantic-shift": "semantic-shift",
     "state-drift": "noise-robustness",
+    "sensor-drift": "drift",
     "edits": "edits",
     "finding": "noise-robustness",
 }
-_SETTINGS = """planners store split edits checkpoints planner_args seeds noise traffic controller
+_SETTINGS = """planners store split edits checkpoints planner_args seeds noise perception
+localization latency controller
 limit device batch_size strict workers timeout executor scheduler resume retry_failed out
 save_rollouts allow_partial""".split()
 
@@ -32,15 +34,17 @@ save_rollouts allow_partial""".split()
     *_SETTINGS,
     store="Own scenarios: name or folder (demo).",
     seeds="Only these, such as 0,1; the result is partial.",
-    noise="Only these; the result is partial.",
-    traffic="Only this mode; the result is partial.",
+    noise="Only these, such as perception-low or latency-200; the result is partial.",
     edits="For the track edits: a .toml file of edits, in place of those that it draws.",
     resume="Only go on with what is there, as the same command does anyway.",
     retry_failed="Do again what failed before.",
 )
 def bench(
     settings: cli.Settings,
-    track: str = Argument(help="semantic-shift, state-drift, edits or finding."),
+    track: str = Argument(help="semantic-shift, state-drift, sensor-drift, edits or finding."),
+    traffic: list[str] | None = Option(
+        None, help="Only these modes; repeatable, also package.module:Model."
+    ),
     val14: str = Option("", help="Store, or STORE:SPLIT, with Val14 (left out)."),
     published: bool = Option(False, "--published", help="The paper's figures beside the own ones."),
     estimate: bool = Option(
@@ -61,6 +65,7 @@ def bench(
     from shiftsim.benchmarks.bench import plan_bench, run_bench
 
     chosen = load_track(track)
+    settings |= {"traffic": traffic} if traffic else {}
     out = settings.pop("out", "")
     if texts := settings.pop("planner_args", None):
         planners = settings.get("planners", ())

@@ -93,7 +93,7 @@ def examine(
     from shiftsim.runs.config import default_workers
     from shiftsim.runs.manifest import versions
     from shiftsim.verify.report import Report
-    from shiftsim.verify.self_check import CHECKS, check_reference
+    from shiftsim.verify.rollouts import CHECKS, check_reference
 
     began, report = perf_counter(), Report()
     advance(0, len(CHECKS) + 1, "torch")

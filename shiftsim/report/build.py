@@ -30,6 +30,7 @@ TABLES = {
     "ranking": "planners by score, without noise and under the hardest, and what that says",
     "semantic-shift": "clean scores by site, beside the published ones",
     "noise-robustness": "scores under every noise",
+    "drift": "scores by planner, traffic and what planners see, and what latency they bear",
     "edits": "scores of edited scenarios by kind and difficulty",
     "planner-comparison": "every pair of planners scenario by scenario, clean",
     "planner-comparison-noise": "the same under every noise",
@@ -115,6 +116,7 @@ def _makers(
             groups, published, with_published=options.with_published
         ),
         "noise-robustness": lambda: [paper.noise_robustness(groups, shown)],
+        "drift": lambda: [details.drift_matrix(groups)],
         "edits": lambda: details.edited_scores(groups),
         "planner-comparison": lambda: [details.planner_comparison(groups)],
         "planner-comparison-noise": lambda: [details.planner_comparison(groups, noisy=True)],

@@ -1,6 +1,6 @@
 """Tables beyond the paper's: a ranking, planners compared, scenario types, edits, times."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations, product
 
 import numpy as np
@@ -9,7 +9,7 @@ import pyarrow.compute as pc
 from shiftsim.edits.sampling import GRADES, graded
 from shiftsim.kernels import FloatArray
 from shiftsim.metrics import MULTIPLIERS, navsim_rollouts, open_loop
-from shiftsim.report.groups import COLUMNS, Group, by_set, distinct_sets
+from shiftsim.report.groups import COLUMNS, Group, by_set, distinct_sets, planner_identities
 from shiftsim.report.statistics import (
     FEW_CLUSTERS,
     Comparison,
@@ -25,6 +25,7 @@ from shiftsim.report.words import REASONS, noise_order
 from shiftsim.runs.results import Run
 
 ALL_KINDS = "all"
+_BORNE = 5.0  # points of the score that a planner may lose to what it is said to bear
 _SIGNIFICANT = 0.05  # p-value below which a difference is called so
 
 
@@ -267,6 +268,63 @@ def _driven_as(group: Group) -> tuple[object, ...]:
     data = group.data
     labels = (group.traffic, group.planner, group.noise, group.seeds)
     return (*labels, data.windows, *data.traits[:3])
+
+
+def drift_matrix(groups: Sequence[Group]) -> Table | None:
+    """Planners by traffic under what they see and when their plans arrive; None without such runs.
+
+    Beside each score stands its change from that of the same planner without any drift.
+    """
+    drifts = [group for group in groups if _senses(group)]
+    modes = list(dict.fromkeys(group.traffic for group in drifts))
+    records, findings = list[Record](), list[str]()
+    for data, mine in by_set([*_under(groups, "none"), *drifts] if drifts else []):
+        for planner in dict.fromkeys(group.planner for group in mine):
+            own = [group for group in mine if group.planner == planner]
+            by_mode = {mode: {g.noise: g for g in own if g.traffic == mode} for mode in modes}
+            for noise in noise_order(noise for found in by_mode.values() for noise in found):
+                record: Record = {"set": data.label, "planner": planner, "drift": noise}
+                for mode, found in by_mode.items():
+                    record[mode] = found[noise].estimate() if noise in found else None
+                    record[f"{mode} change"] = _change(found.get("none"), found.get(noise))
+                records.append(record)
+            findings += [_borne(planner, mode, found) for mode, found in by_mode.items()]
+    if not records:
+        return None
+    words = "planners that are given the recording drive by it, whatever is seen: {}"
+    informed = {g.name for g in drifts if planner_identities(g.run)[g.name].get("sees_recording")}
+    notes = [data.rules for data in distinct_sets(drifts)]
+    notes += [f"a latency is borne if it costs at most {_BORNE:g} points"] if any(findings) else []
+    notes += [words.format(", ".join(sorted(informed)))] if informed else []
+    title = "Planner × traffic × drift: closed-loop score × 100"
+    return Table.of("drift", title, records, 3, notes=notes, findings=[*filter(None, findings)])
+
+
+def _senses(group: Group) -> bool:
+    """Whether something but the actuation drifts."""
+    fields = group.run.manifest["determining"].get("noise", {}).get(group.noise, {})
+    return bool({"perception", "localization", "latency"} & {*fields})
+
+
+def _change(before: Group | None, after: Group | None) -> Number | None:
+    if not (before and after) or before is after or not (before.is_complete and after.is_complete):
+        return None
+    return Number(_score(after) - _score(before))
+
+
+def _borne(planner: str, mode: str, groups: Mapping[str, Group]) -> str:
+    """How late the plans of a planner may be before its score falls; empty where it is unknown."""
+    scores = {noise: _score(group) for noise, group in groups.items() if group.is_complete}
+    late = [name for name in noise_order(scores) if name[8:].isdecimal()]
+    if "none" not in scores or not late:
+        return ""
+    falls = [name for name in late if scores[name] < scores["none"] - _BORNE]
+    borne = late[: late.index(falls[0])] if falls else late
+    upto = f"a latency of {borne[-1][8:]} ms" if borne else "no latency that was run"
+    if not falls:
+        return f"{planner} bears {upto} ({mode}), the longest that was run."
+    lost = f"loses {scores['none'] - scores[falls[0]]:.1f} points at {falls[0][8:]} ms"
+    return f"{planner} bears {upto} ({mode}) and {lost}."
 
 
 def has_open_loop(group: Group) -> bool:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from textwrap import wrap
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,22 +24,27 @@ from shiftsim.report.groups import COLUMNS, DataSet, Group, by_set
 from shiftsim.report.palette import DEFAULT_FORM, SMALL, TEXT, FigureFormat, Style, dashes
 from shiftsim.report.statistics import rank_correlation, score_interval
 from shiftsim.report.tables import Interval, Number
-from shiftsim.report.words import LONG
+from shiftsim.report.words import LONG, noise_order
+from shiftsim.sim.perception import LEVELS
 
-LEVELS = ("none", "low", "mid", "high")
-_KINDS = {"awgn": "white noise (AWGN)", "ou": "correlated noise (OU)"}
+_NOISES = {"awgn": "white noise (AWGN)", "ou": "correlated noise (OU)"}
+_BOXES = {"perception": "errors", "miss": "misses", "dropout": "drop-outs"}
+_TIMES = {"localization": "own pose", "latency": "latency"}
+_CURVES = {  # figures by name: panels by kind, label of the axis, title
+    "robustness": (_NOISES, "strength of the noise", "Noise robustness"),
+    "perception": (_BOXES, "level", "Perception"),
+    "latency": (_TIMES, "level, latency [ms]", "Localization and latency"),
+}
 _TRAFFIC = {"NR": "non-reactive traffic", "R": "reactive traffic"}
 _SPREAD = 0.62  # how much of a place on the axis the planners share
 _GREY = "0.45"
 _MEAN = {"markeredgecolor": "black", "markeredgewidth": 0.9}
 _ADE = "average displacement error (ADE) [m]"
 _RHO = "ρ: Spearman's rank correlation, of scenarios by planner, and of the planners' means"
-_HEIGHT, _AROUND = 1.9, 0.6  # inches, of a panel and of the words above and below it
-_HIGHEST = 8.0  # inches, of all panels
+_HEIGHT, _AROUND, _HIGHEST = 1.9, 0.6, 8.0  # inches, of a panel, words around it, all panels
 _BESIDE = 0.5  # inches, beside a panel: the labels of its axis
 _LONGEST = 18  # palette.characters of a name at the end of a line
 _WIDE = 5.0  # inches; what is wider needs both columns of a paper, and has panels side by side
-_NONE: Mapping[str, str] = MappingProxyType({})
 _BARS = "bars: 95 % bootstrap interval over recordings"
 
 
@@ -101,15 +105,16 @@ def figures(groups: Sequence[Group], *, form: FigureFormat = DEFAULT_FORM) -> li
 
         shown = [group for group in mine if group.estimate().value is not None]
         clean = [group for group in shown if group.noise == "none"]
-        found = {group.noise.partition("-")[0] for group in shown}
-        if kinds := {_KINDS[kind]: _levels(kind, shown) for kind in _KINDS if kind in found}:
-            labels = ("strength of the noise", "closed-loop score")
+        found = {g.noise.partition("-")[0] for g in shown if "+" not in g.noise}
+        for kind, (panels, label, words) in _CURVES.items():
+            if not (kinds := {panels[k]: _levels(k, shown) for k in panels if k in found}):
+                continue
+            labels = (label, "closed-loop score")
             drawn = _scores(shown, kinds, styles, form, noise="some", labels=labels)
             bars = f"bars: standard deviation over seeds; without several, {_BARS.split(': ')[1]}"
             note = f"n = {len(data.tokens)} scenarios; {bars}; thin line: the clean score"
-            samples = {"clean": "none", "under noise": "some"}
-            title = f"Noise robustness on {data.label}"
-            add("robustness", title, drawn, f"{data.rules}\n{note}", samples=samples)
+            note, samples = f"{data.rules}\n{note}", {"clean": "none", "under noise": "some"}
+            add(kind, f"{words} on {data.label}", drawn, note, samples=samples)
         if not clean:
             continue
         every = np.ones(len(data.tokens), np.bool_)
@@ -129,17 +134,13 @@ def figures(groups: Sequence[Group], *, form: FigureFormat = DEFAULT_FORM) -> li
             lone = f"{note} (none for a single recording)"
             add("cities", f"Score per city of {data.label}", drawn, lone)
         is_narrow = 0.0 < form.width < _WIDE  # where there is room for abbreviations only
-        places = [
-            _place(
-                name if is_narrow else "\n".join([*wrap(LONG[name], 12), f"({name})"]), every, key
-            )
-            for key, name in COLUMNS.items()
-        ]
+        in_full = {name: "\n".join([*wrap(LONG[name], 12), f"({name})"]) for name in LONG}
+        heads = {} if is_narrow else in_full
+        places = [_place(heads.get(name, name), every, key) for key, name in COLUMNS.items()]
         drawn = _scores(clean, {"": places}, styles, form, labels=("", "score"))
         add("metrics", f"Metrics on {data.label}", drawn, note)
-    return (
-        [*out, open_against_closed(groups, form=form)] if any(map(has_open_loop, groups)) else out
-    )
+    more = [open_against_closed(groups, form=form)] if any(map(has_open_loop, groups)) else []
+    return [*out, *more]
 
 
 @palette.in_format
@@ -240,9 +241,7 @@ def _levels(kind: str, groups: Sequence[Group]) -> list[_Place]:
     """The places of every level of a noise; bars are deviations over seeds, or intervals."""
     scores = {(g.traffic, g.planner, g.noise): (g.estimate(), score_interval(g)) for g in groups}
 
-    def place(level: str) -> _Place:
-        noise = level if level == "none" else f"{kind}-{level}"
-
+    def place(noise: str) -> _Place:
         def score(group: Group) -> tuple[Number | None, Interval | None]:
             found, interval = scores.get((group.traffic, group.planner, noise), (None, None))
             if found is None or found.value is None or found.std is None:
@@ -250,9 +249,12 @@ def _levels(kind: str, groups: Sequence[Group]) -> list[_Place]:
             low, high = found.value - found.std, found.value + found.std
             return found, Interval(max(low, 0.0), min(high, 100.0))
 
-        return _Place(level, score)
+        return _Place(noise.partition("-")[2] or ("0" if kind == "latency" else "none"), score)
 
-    return [place(level) for level in LEVELS]
+    levels = (f"{kind}-{level}" for level in LEVELS)
+    if kind == "latency":
+        levels = (n for n in noise_order(g.noise for g in groups) if n[8:].isdecimal())
+    return [*map(place, ("none", *levels))]
 
 
 def _scores(
@@ -409,13 +411,11 @@ def _sample(noise: str) -> Any:
     return Line2D([], [], linestyle=dashes(noise), **Style(_GREY, "o").marks(noise))
 
 
-def _finish(
-    figure: Any, title: str, notes: str, form: FigureFormat, samples: Mapping[str, str] = _NONE
-) -> None:
+def _finish(figure: Any, title: str, notes: str, form: FigureFormat, samples: Any = None) -> None:
     """Legend, title and what stands beside every score; `samples` are noises by their label."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    handles += [*map(_sample, samples.values())]
-    labels += samples
+    handles += [*map(_sample, (samples or {}).values())]
+    labels += samples or {}
     look = {"loc": "outside upper center", "frameon": False, "fontsize": SMALL, "handlelength": 3.2}
     for columns in range(min(4, max(1, len(labels))), 0, -1):  # as many as fit
         legend = figure.legend(handles, labels, ncols=columns, **look)

@@ -20,7 +20,7 @@ from shiftsim.kernels import BoolArray, FloatArray
 from shiftsim.metrics import SHORT_NAMES
 from shiftsim.report.tables import Number
 from shiftsim.runs.results import Run
-from shiftsim.sim.noise import NOISE_NAMES
+from shiftsim.sim.perception import drift_order
 from shiftsim.world.scenario import FULL_DURATION
 
 GROUPINGS = ("scenario_type", "city", "seed")
@@ -342,7 +342,7 @@ def _groups(run: Run, known: Sequence[KnownSet]) -> Iterator[Group]:
     places = pc.index_in(scores["token"], value_set=pa.array(data.tokens, pa.string())).to_numpy()
     order = product(
         _ordered(tasks["planner"], run.manifest["config"]["planners"]),
-        _ordered(tasks["noise"], NOISE_NAMES),
+        drift_order(pc.unique(tasks["noise"]).to_pylist()),
     )
     for planner, noise in order:
         seeds = np.unique(tasks["seed"].to_numpy()[_matching(tasks, planner, noise)])

@@ -10,6 +10,7 @@ from shiftsim.report.statistics import FEW_CLUSTERS, score_interval
 from shiftsim.report.tables import Cell, Number, Row, Table
 from shiftsim.report.words import LONG, NAMES
 from shiftsim.sim.noise import NOISE_NAMES
+from shiftsim.sim.perception import drift_order
 
 VAL14 = "val14"
 INTERVALS = (
@@ -203,8 +204,7 @@ def noise_robustness(groups: Sequence[Group], published: Published | None = None
     found = {group.noise for group in groups}
     if found <= {"none"}:
         return None
-    noises = [name for name in NOISE_NAMES if name in found or published is not None]
-    noises += sorted(found - set(NOISE_NAMES))
+    noises = drift_order(found if published is None else found | {*NOISE_NAMES})
     scores: dict[tuple[str, ...], dict[str, Cell]] = {}
     for data, mine in by_set(groups):
         for group in mine:

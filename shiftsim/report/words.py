@@ -8,7 +8,7 @@ import pyarrow as pa
 
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES
 from shiftsim.runs.rollouts import Task
-from shiftsim.sim.noise import NOISE_NAMES
+from shiftsim.sim.perception import drift_order
 from shiftsim.world.state import AgentKind, Tracks
 
 COLLISIONS = "no_ego_at_fault_collisions"
@@ -60,8 +60,7 @@ def legend(shorts: Iterable[str], words: Mapping[str, str] = LONG) -> str:
 
 def noise_order(names: Iterable[str]) -> list[str]:
     """Noises, each once: none, then by kind from low to high, then custom ones by name."""
-    found = set(names)
-    return [name for name in NOISE_NAMES if name in found] + sorted(found - {*NOISE_NAMES})
+    return drift_order(names)
 
 
 def task_of(row: Mapping[str, Any]) -> Task:

@@ -18,6 +18,7 @@ from shiftsim.files import DEFAULT_STORE, make_table
 Value: TypeAlias = bool | int | float | str | list[Any]
 
 _LABELS = "give each a label: --planner LABEL=PLANNER, or shiftsim.run({label: planner})"
+DRIFT = ("noise", "perception", "localization", "latency")  # settings of which a run has a product
 MAX_SEED = 2**63 - 1
 MAX_SEEDS = 10_000  # of one range
 
@@ -45,6 +46,18 @@ def parse_seeds(text: str) -> list[int]:
             f"seeds {text!r} are not integers", hint="for example --seeds 0,1,2 or --seeds 0-2"
         ) from error
     return seeds
+
+
+def parse_latency(text: str) -> list[int]:
+    """Latencies as given on the command line, such as `0,100,200` [ms].
+
+    Raises:
+        ConfigError: They are no integers.
+    """
+    try:
+        return [int(word) for word in text.split(",")]
+    except ValueError as error:
+        raise ConfigError(f"latency {text!r} is not in ms", hint="--latency 0,100,200") from error
 
 
 def parse_workers(text: str) -> int:
@@ -94,6 +107,16 @@ class RunConfig:
     )
     noise: tuple[str, ...] = setting(
         ("none",), "none, awgn-low … ou-high, all; repeatable. [none]", "--noise", "-n"
+    )
+    perception: tuple[str, ...] = setting(
+        ("none",),
+        "Boxes as seen: low, mid, high, miss-…, dropout-…, range-60; repeatable. [none]",
+    )
+    localization: tuple[str, ...] = setting(
+        ("none",), "Errors of the ego's own pose: low, mid, high; repeatable. [none]"
+    )
+    latency: tuple[int, ...] = setting(
+        (0,), "Plans arrive late by so many ms: 0,100,300 are three. [0]", parse=parse_latency
     )
     seeds: tuple[int, ...] = setting(
         (0,), "Noise seeds: 0,1,2 or 0-2 are three, 3 is number 3 alone. [0]", parse=parse_seeds
@@ -149,7 +172,7 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         labels = [split_label(planner)[0] for planner in self.planners]
-        for name in ("planners", "noise", "metrics", "checkpoints", "seeds"):
+        for name in ("planners", *DRIFT, "metrics", "checkpoints", "seeds"):
             values = labels if name == "planners" else getattr(self, name)
             if len(set(values)) != len(values):
                 raise ConfigError(
@@ -158,7 +181,7 @@ class RunConfig:
                 )
         if not self.planners:
             raise ConfigError("no planner", hint="name one, for example --planner idm")
-        for name in ("noise", "seeds"):
+        for name in (*DRIFT, "seeds"):
             if not getattr(self, name):
                 raise ConfigError(f"{name} is empty", hint=f"give at least one value for {name}")
         if any(not 0 <= seed <= MAX_SEED for seed in self.seeds):

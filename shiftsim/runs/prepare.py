@@ -7,7 +7,7 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,12 +24,12 @@ from shiftsim.planners.registry import (
     run_planner,
     takes_argument,
 )
-from shiftsim.runs.config import RunConfig, Value, default_workers, parse_shard, split_label
+from shiftsim.runs.config import DRIFT, RunConfig, Value, default_workers, parse_shard, split_label
 from shiftsim.runs.manifest import State, check_resumable, check_target, code_digest
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.scenarios import Selection, select_scenarios
 from shiftsim.runs.task import Batch, TaskRunner
-from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
+from shiftsim.sim.perception import Drift, make_drifts
 from shiftsim.sim.traffic import PLANNER, BatchTraffic, make_traffic, traffic_name
 
 if TYPE_CHECKING:
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from shiftsim.runs.edited import EditSet
 
 RUNS = Path("runs")
-_NOISE_FIELDS = ("kind", "sigma_accel", "sigma_rate", "theta")
 _MAX_NAME = 40  # characters of one part of a run's name
 _MEMORY_OF_NETWORK = 1.5e9  # bytes per worker
 
@@ -52,7 +51,7 @@ class RunPlan:
     selection: Selection  # the scenarios
     # the planners by name, that of the traffic by the name of the traffic
     planners: Mapping[str, RunPlanner]
-    noises: Mapping[str, NoiseModel]  # the noise models, by name
+    noises: Mapping[str, Drift]  # noise and what else drifts, by name
     batches: tuple[Batch, ...]  # all tasks whose scenario exists, as they are handed out
     missing: tuple[Task, ...]  # tasks whose scenario the store does not hold
     fingerprint: dict[str, Any]  # everything that the scores depend on
@@ -88,25 +87,20 @@ def prepare(
     config: RunConfig,
     *,
     planners: Sequence[Any] = (),
-    noises: Sequence[NoiseModel] = (),
+    noises: Sequence[Drift] = (),
     edits: "EditSet | None" = None,
 ) -> RunPlan:
     """Resolve every name and check everything that a run needs.
 
-    Classes or instances of planners, noise models, and edits take the place of the names in the
-    settings.
+    Classes or instances of planners, drifts, and edits take the place of the names in the settings.
 
     Raises:
         ShiftsimError: Something is unknown, missing or contradictory.
     """
-    # `all` stands for the seven of the benchmark
-    names = [
-        name for given in config.noise for name in (NOISE_NAMES if given == "all" else [given])
-    ]
-    models = list(noises) or [parse_noise(name) for name in dict.fromkeys(names)]
-    config = replace(
-        config, noise=tuple(model.name for model in models), traffic=traffic_name(config.traffic)
-    )
+    models = list(noises) or make_drifts(*(getattr(config, name) for name in DRIFT))
+    values: dict[str, Any] = {one.name: one.default for one in fields(config) if one.name in DRIFT}
+    values["noise"] = tuple(model.name for model in models)  # of all that drifts
+    config = replace(config, **values, traffic=traffic_name(config.traffic))
     traffic, traffic_fingerprint, is_batched = _traffic(config)
     thresholds = asdict(thresholds_of(config.thresholds))
     for metric in config.metrics:
@@ -133,7 +127,7 @@ def prepare(
         (entry.name, model.name, seed)
         for entry in entries
         for model in models
-        for seed in ((0,) if model.kind == "none" else config.seeds)
+        for seed in (config.seeds if model.is_random else (0,))
     ]
     # scenario by scenario, so that a worker can often reuse the one it has read
     tasks = [Task(*run, token) for token in selection.present for run in runs]
@@ -352,23 +346,17 @@ def _of_shard(shard: str, batches: list[Batch]) -> list[Batch]:
 def _fingerprint(
     config: RunConfig,
     entries: Iterable[RunPlanner],
-    models: Sequence[NoiseModel],
+    models: Sequence[Drift],
     thresholds: dict[str, Any],
 ) -> dict[str, Any]:
     """Everything else that the scores depend on, as JSON values."""
-    noisy = any(model.kind != "none" for model in models)
-    fields = {
+    noisy = any(model.is_random for model in models)
+    values = {
         "shiftsim": __version__,
         "code": code_digest(),
         "metric_version": METRIC_VERSION,
         "planners": {entry.name: dict(entry.fingerprint) for entry in entries},
-        "noise": {
-            model.name: {
-                **{name: getattr(model, name) for name in _NOISE_FIELDS},
-                "function": model.name if model.function is not None else None,
-            }
-            for model in models
-        },
+        "noise": {model.name: model.fingerprint() for model in models},
         "seeds": sorted(config.seeds) if noisy else [0],
         "traffic": config.traffic,
         "controller": config.controller,
@@ -376,7 +364,7 @@ def _fingerprint(
         "metrics": config.added_metrics,
         "strict": config.strict,
     }
-    plain: dict[str, Any] = json.loads(json.dumps(fields, sort_keys=True, default=str))
+    plain: dict[str, Any] = json.loads(json.dumps(values, sort_keys=True, default=str))
     return plain
 
 

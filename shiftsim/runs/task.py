@@ -29,7 +29,8 @@ from shiftsim.runs.tables import FAILED, OK, TABLES, TaskResult
 from shiftsim.sim import loop
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.loop import Rollout
-from shiftsim.sim.noise import NoiseModel, is_standard
+from shiftsim.sim.noise import is_standard
+from shiftsim.sim.perception import Drift
 from shiftsim.sim.planner import Planner
 from shiftsim.sim.traffic import BatchTraffic, Traffic, make_traffic
 from shiftsim.world.scenario import Scenario
@@ -83,10 +84,10 @@ class TaskRunner:
         config: RunConfig,
         store: str,
         planners: Mapping[str, RunPlanner],
-        noises: Mapping[str, NoiseModel],
+        noises: Mapping[str, Drift],
         edits: "EditSet | None" = None,
     ) -> None:
-        """Planners and noise models are by name; one of the traffic is a planner, too."""
+        """Planners and drifts are by name; one of the traffic is a planner, too."""
         self.config, self.planners, self.noises = config, planners, noises
         self.edits = edits
         self._scenarios = ScenarioReader(store, edits)
@@ -158,8 +159,12 @@ class TaskRunner:
         if keep == "all" or (keep == "failed" and scores["cls"] == 0.0):
             # pedestrians of an edit wait for the ego
             own_tracks = self.config.traffic != "nonreactive" or self.edits is not None
-            own_noise = not is_standard(self.noises[task.noise])
-            encoded = encode_rows(rollout_rows(log, with_tracks=own_tracks, with_noise=own_noise))
+            own_noise = not is_standard(self.noises[task.noise].noise)
+            with_seen = any(drift.senses for drift in self.noises.values())  # as other rollouts
+            rows = rollout_rows(
+                log, with_tracks=own_tracks, with_noise=own_noise, with_seen=with_seen
+            )
+            encoded = encode_rows(rows)
         return TaskResult(
             task,
             OK,
@@ -182,8 +187,12 @@ class TaskRunner:
         return open_loop.metric_rows(poses, scenario)
 
     def _setting(self, task: Task) -> loop.Setting:
+        drift = self.noises[task.noise]
         return loop.Setting(
-            noise=self.noises[task.noise],
+            noise=drift.noise,
+            perception=drift.perception,
+            localization=drift.localization,
+            latency=drift.latency,
             seed=task.seed,
             traffic=self._make_traffic(),
             controller=self.config.controller,

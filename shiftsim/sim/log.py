@@ -5,7 +5,7 @@ iterations: the state reached after the last planner call is never stored.
 """
 
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,13 @@ if TYPE_CHECKING:
 NUM_KEPT = 18  # poses of a plan
 
 
+class Seen(NamedTuple):
+    """What a planner saw in K samples."""
+
+    ego: FloatArray  # (K, 3) where it took its rear axle to be: x [m], y [m], heading [rad]
+    tracks: Tracks  # the boxes; those that return after a drop-out have tokens of their own
+
+
 @dataclass(frozen=True, slots=True)
 class SimulationLog:
     """One rollout. K samples, T = K + 1 iterations.
@@ -27,7 +34,7 @@ class SimulationLog:
         token: Id of the scenario.
         time_us: (K,) time stamps [us].
         ego: (K, 11) simulated ego states, columns of `state.STATE_COLUMNS`.
-        tracks: What the planner saw of the others at each sample.
+        tracks: The others at each sample.
         traffic_lights: Lights at each sample.
         expert_time_us: (T,) time stamps of the iterations [us].
         expert_ego: (T, 11) recorded ego states at the iterations.
@@ -40,6 +47,7 @@ class SimulationLog:
             command was returned. Of a rollout from disk they are rounded to 1 mm and 0.1 mrad.
         planning_seconds: (K,) time the planner took for each call [s].
         degraded: (K,) whether the plan was a fallback by the planner's own account.
+        seen: What the planner saw in place of `ego` and `tracks`; None where it saw these.
 
     Example:
         ```python
@@ -61,6 +69,7 @@ class SimulationLog:
     plans: FloatArray
     planning_seconds: FloatArray
     degraded: BoolArray
+    seen: Seen | None = None
 
     def snapshot(self, iteration: int, setting: "Setting") -> "Snapshot":
         """Where the rollout was at an iteration, driven as a setting says."""

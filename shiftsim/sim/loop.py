@@ -21,6 +21,7 @@ from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
 from shiftsim.sim.dynamics.perfect import KEPT_US, follow_perfectly, sample_poses
 from shiftsim.sim.log import SimulationLog, Snapshot
 from shiftsim.sim.noise import NoiseModel, sample_noise
+from shiftsim.sim.perception import Drift, Localization, Perception, make_drift
 from shiftsim.sim.plan_check import contiguous, find_fault, find_warning
 from shiftsim.sim.planner import (
     BatchPlanner,
@@ -30,6 +31,7 @@ from shiftsim.sim.planner import (
     rollout_rows,
     scene_info,
 )
+from shiftsim.sim.sensing import Latency, Sensing
 from shiftsim.sim.traffic import BatchTraffic, Move, Traffic, make_traffic
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import NUM_STATE, Command, Trajectory, center_poses
@@ -47,15 +49,24 @@ class Setting:
 
     # actuation noise, by name or model; added to the command before the motion model
     noise: str | NoiseModel = "none"
-    seed: int = 0  # seed of the noise, and of planners that sample
+    seed: int = 0  # seed of what is random, also of planners that sample
     traffic: str | Traffic = "nonreactive"  # `nonreactive`, `reactive`, or a traffic model
     # `lqr` (tracker and kinematic bicycle), `perfect` (the ego is where the plan says) or `log-
     # playback` (the ego is where the recording was; plans are ignored)
     controller: str = "lqr"
     strict: bool = False  # fail where the planner falls back instead of counting the step
+    # what the planner sees, and where it believes to be, by name or model
+    perception: str | Perception = "none"
+    localization: str | Localization = "none"
+    latency: int = 0  # time from an observation until its plan is followed [ms]
 
     def __post_init__(self) -> None:
         one_of("controller", self.controller, CONTROLLERS)
+
+    @property
+    def drift(self) -> Drift:
+        """All that differs from a perfect vehicle."""
+        return make_drift(self.noise, self.perception, self.localization, self.latency)
 
 
 DEFAULT = Setting()
@@ -110,11 +121,14 @@ class Rollout:
 
             self._traffic = Scripted(self._traffic)
         self._traffic.start(scenario, self._tracks, start)
-        arrays = self._time_us, self._ego, self._tracks, self._lights
-        self._observations = ObservationBuilder(*arrays)
-        self._noise = sample_noise(
-            setting.noise, seed=setting.seed, token=scenario.token, num_steps=self.num_samples
-        )
+        drift, seed, token = setting.drift, setting.seed, scenario.token
+        truth = self._ego, self._tracks
+        self._sensing = Sensing(drift, seed, token, truth) if drift.senses else None
+        ego, tracks = (self._sensing.ego, self._sensing.tracks) if self._sensing else truth
+        self._observations = ObservationBuilder(self._time_us, ego, tracks, self._lights)
+        present = int(self._time_us[start])
+        self._latency = Latency(drift.latency, self._ego[: start + 1], present)
+        self._noise = sample_noise(drift.noise, seed=seed, token=token, num_steps=self.num_samples)
         self._commands = np.full((self.num_samples, 2), np.nan)
         self._plans = np.full((self.num_samples, len(KEPT_US), 3), np.nan)
         self._seconds = np.zeros(self.num_samples)
@@ -129,7 +143,10 @@ class Rollout:
 
     def observe(self) -> Observation:
         """What the planner sees now."""
-        return self._observations.at(self.iteration, self._start + self.iteration)
+        row = self._start + self.iteration
+        if self._sensing is not None:
+            self._sensing.see(row)
+        return self._observations.at(self.iteration, row)
 
     def advance(self, plan: Plan, seconds: float = 0.0) -> None:
         """Store this sample, and move the ego and the traffic to the next one.
@@ -150,6 +167,8 @@ class Rollout:
             plan = self._checked(plan)
         if iteration + 1 == self.num_samples:
             return None
+        if plan is not None:
+            plan = self._latency.exchange(plan, int(self._time_us[row + 1]))
         # nuPlan rule 13: the ego moves first, and the traffic sees where it was before
         self._move_ego(plan)
         return Move(iteration, self._ego[row], self._tracks, row + 1)
@@ -183,6 +202,7 @@ class Rollout:
         plan = executable(plan, now_us, next_us, f"iteration {iteration}: ")
         if isinstance(plan, Command):
             return plan
+        plan = self._sensing.to_truth(plan, row) if self._sensing else plan
         poses = self._plans[iteration]
         sample_poses(plan.time_us, plan.states, now_us, KEPT_US, poses)
         if iteration == 0 and self.setting.controller == "lqr":
@@ -212,7 +232,13 @@ class Rollout:
 
         Raises:
             DataError: The rollout has ended.
+            ConfigError: What is seen drifts, or plans are late: those under way are not kept.
         """
+        if self._sensing is not None or self.setting.drift.latency:
+            raise ConfigError(
+                "there are no snapshots under perception, localization or latency",
+                hint="take it from a rollout without, or with actuation noise only",
+            )
         if self.done:
             raise DataError(f"the rollout of {self.scenario.token!r} has ended")
         # views: nobody writes to the rows that lie behind
@@ -265,8 +291,11 @@ class Rollout:
 
     def drive_by(self, planner: Planner) -> None:
         """Have a planner drive from here on."""
-        self.planner = planner
-        planner.reset(scene_info(self.scenario, self.setting.seed, planner))
+        self.planner, believed = planner, None
+        if self._sensing is not None:
+            self._sensing.see(self._start)
+            believed = self._sensing.ego[self._start, :3]
+        planner.reset(scene_info(self.scenario, self.setting.seed, planner, believed))
 
     def log(self) -> SimulationLog:
         """The finished rollout."""
@@ -285,6 +314,7 @@ class Rollout:
             plans=self._plans[: self.num_samples],
             planning_seconds=self._seconds[: self.num_samples],
             degraded=self._degraded[: self.num_samples],
+            seen=self._sensing.seen(samples) if self._sensing else None,
         )
 
 

@@ -173,10 +173,15 @@ def keyed_generator(seed: int, token: str, channel: str) -> np.random.Generator:
 
     So the same noise hits every planner, in any order of runs and on any number of workers.
     """
+    key = int.from_bytes(channel_key(seed, token, channel), "little")
+    return np.random.Generator(np.random.Philox(key=key))
+
+
+def channel_key(seed: int, token: str, channel: str) -> bytes:
+    """16 bytes that stand for seed, scenario token and channel name."""
     # nuPlan rule 14: the key is the BLAKE2b digest of the three, the generator is Philox
     text = f"{int(seed)}\n{token}\n{channel}"
-    digest = hashlib.blake2b(text.encode(), digest_size=16).digest()
-    return np.random.Generator(np.random.Philox(key=int.from_bytes(digest, "little")))
+    return hashlib.blake2b(text.encode(), digest_size=16).digest()
 
 
 def _load_noise(name: str) -> NoiseModel:

@@ -231,10 +231,13 @@ def sees_recording(planner: object) -> bool:
     return getattr(planner, "sees_recording", False) is True
 
 
-def scene_info(scenario: Scenario, seed: int = 0, planner: object = None) -> SceneInfo:
+def scene_info(
+    scenario: Scenario, seed: int = 0, planner: object = None, start: FloatArray | None = None
+) -> SceneInfo:
     """What a planner is told before the first step; `seed` is that of the task.
 
-    The recording is there for a planner that declares it only.
+    The recording is there for a planner that declares it only. It begins in the pose `start` (3,),
+    as far as it knows; where the recording does if None.
     """
     times = scenario.iteration_times
     return SceneInfo(
@@ -247,7 +250,7 @@ def scene_info(scenario: Scenario, seed: int = 0, planner: object = None) -> Sce
         log_name=scenario.log_name,
         seed=seed,
         expert=scenario if sees_recording(planner) else None,
-        start=readonly(scenario.ego[scenario.iteration_rows[0], :3]),
+        start=readonly(scenario.ego[scenario.iteration_rows[0], :3] if start is None else start),
     )
 
 

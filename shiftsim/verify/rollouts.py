@@ -1,24 +1,35 @@
-"""Rollouts in the words of nuPlan's tables: columns, tolerances, and what a planner saw."""
+"""Rollouts in the words of nuPlan's tables: columns, tolerances, and what a planner saw.
+
+Last, a few outputs of nuPlan's own code that come with the package, against what is computed here.
+"""
 
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any, TypeAlias
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from shiftsim.data.store.map import read_map_file
 from shiftsim.errors import DataError
+from shiftsim.files import PACKAGE
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.kernels import FloatArray, IntArray
+from shiftsim.metrics import evaluate, measure
+from shiftsim.metrics.comfort import comfort_signals, within_bounds
+from shiftsim.metrics.result import PROFILES
 from shiftsim.planners.registry import load_planner
+from shiftsim.sim.dynamics import lqr
+from shiftsim.sim.dynamics.bicycle import WHEEL_BASE, step_bicycle, step_seconds
 from shiftsim.sim.dynamics.lqr import TRACKED, track_and_step
 from shiftsim.sim.dynamics.perfect import interpolate
 from shiftsim.sim.log import SimulationLog, as_recorded
 from shiftsim.sim.planner import Observation, observe_log, scene_info
-from shiftsim.verify.report import TOLERANCE, Source
+from shiftsim.verify.report import EXACT, TOLERANCE, Named, Report, Source
 from shiftsim.world import state
-from shiftsim.world.scenario import Scenario
+from shiftsim.world.scenario import Scenario, scenario_of_rows
 from shiftsim.world.state import AgentKind, Tracks, Trajectory, tracks_of_boxes
 
 Bounds: TypeAlias = dict[str, ArrayLike]  # tolerance by column, "" being that of all others
@@ -55,6 +66,8 @@ ORIGINS = {  # of the ego states in a simulation log
     "other": "driven by another controller: its states do not follow from the plans",
     "unknown": "driven or played back: its plans are of a class that is not known here",
 }
+REFERENCE = PACKAGE / "verify" / "reference"
+_SIGNALS = ("heading", "vx", "ax", "ay", "omega", "alpha")
 _STEP_ERROR = 1e-6  # m, rad, m/s, …: of a state that follows from the plan before it
 
 
@@ -186,3 +199,71 @@ def compare_plans(where: str, spec: str, run: RecordedRun, rows: Source) -> None
             ours |= {name: values for name, values in columns if name in rows}
             here, at = rows.at(recorded == iteration), f"{where} iteration {iteration}"
             here.match(at, ours, TOLERANCE, quantity=f"{spec} plan")
+
+
+def _check_bicycle(arrays: Named, report: Report) -> None:
+    after_step = np.empty(arrays["in_state"].shape[1])
+    for case, (before, command, dt_us, after) in enumerate(
+        zip(*(arrays[name] for name in ("in_state", "cmd", "dt_us", "out_state")), strict=True)
+    ):
+        step_bicycle(before, *command.tolist(), WHEEL_BASE, step_seconds(0, int(dt_us)), after_step)
+        report.compare("bicycle step", f"case {case}", after_step, after, atol=TOLERANCE)
+
+
+def _check_tracker(arrays: Named, report: Report) -> None:
+    commands = np.column_stack([arrays["accel_cmd"], arrays["steer_rate_cmd"]])
+    for case, (begin, end) in enumerate(zip(*_bounds(arrays["traj_ptr"]), strict=True)):
+        columns = {name: arrays[f"traj_{name}"][begin:end] for name in ("x", "y", "heading")}
+        plan = arrays["traj_time_us"][begin:end], ego_states(columns)
+        now, ego = int(arrays["now_us"][case]), arrays["ego_state"][case]
+        command = lqr.track(now, ego, *plan, lqr.NUPLAN)[1:]
+        report.compare("tracker command", f"case {case}", command, commands[case], atol=TOLERANCE)
+
+
+def _check_comfort(arrays: Named, report: Report) -> None:
+    for case, (begin, end) in enumerate(zip(*_bounds(arrays["sig_ptr"]), strict=True)):
+        states = ego_states({name: arrays[f"sig_in_{name}"][begin:end] for name in _SIGNALS})
+        signals = comfort_signals(arrays["sig_in_time_us"][begin:end], states)
+        for name, profile in PROFILES.items():
+            flags = within_bounds(signals, profile)
+            theirs = arrays["within_default" if name == "nuplan" else f"within_{name}"][case]
+            report.compare(f"comfort, {name}", f"case {case}", [*flags, all(flags)], theirs)
+
+
+def _bounds(ends: np.ndarray) -> tuple[list[int], list[int]]:
+    return ends[:-1].tolist(), ends[1:].tolist()
+
+
+def _check_metrics(arrays: Named, report: Report) -> None:
+    road = read_map_file(REFERENCE / "metric_world.arrow")
+    time_us, expert = arrays["time_us"], arrays["expert"]
+    scenario = scenario_of_rows("world", road, time_us, expert, Tracks.empty(len(time_us)))
+    measured = measure(recorded_log(scenario, arrays["ego"]), road)
+    for name, profile in PROFILES.items():
+        result = evaluate(measured, profile)
+        for metric, score in {**result.scores, "score": result.score}.items():
+            if score is not None:
+                theirs, atol = arrays[f"{name} {metric}"], SCORES.get(metric, EXACT)
+                report.compare(f"score {metric}", name, score, theirs, atol=atol)
+
+
+CHECKS = {
+    "bicycle_steps.npz": _check_bicycle,
+    "lqr_commands.npz": _check_tracker,
+    "comfort_signals.npz": _check_comfort,
+    "metric_world.npz": _check_metrics,
+}
+
+
+def check_reference(name: str, report: Report) -> None:
+    """Compare with one file, a name in `CHECKS`.
+
+    Raises:
+        DataError: The file is missing or damaged.
+    """
+    path = REFERENCE / name
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            CHECKS[name](dict(archive), report)
+    except (OSError, BadZipFile, LookupError, ValueError) as error:
+        raise DataError(f"{path}: {error}", hint="install shiftsim again") from error

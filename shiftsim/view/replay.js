@@ -30,6 +30,7 @@ const state = {
   side: false,
   expert: true,
   plans: true,
+  seen: true, // whether what the planner in focus saw is outlined
   up: false, // whether the ego's forward is up
   fork: false, // whether what could have been driven in place of a collision is drawn
   tube: false, // whether the seeds of a planner are drawn together
@@ -284,6 +285,10 @@ function drawPanel(panel, members, leading, at) {
   const { fields, names } = tracksOf(leading);
   const edited = new Set(meta.edited.map((name) => names.indexOf(name)));
   drawAgents(context, fields, panel, at, highlighted, edited);
+  const own = rollouts[leading];
+  if (state.seen && own.has("seen.size")) {
+    drawSeen(context, own, meta.vehicle, panel, at, meta.rollouts[leading].colour);
+  }
   if (state.expert) {
     drawPath(context, scene.get("expert.xy").data, at, panel, COLOURS.recorded, [2, 3], 1.5);
     drawEgo(context, poseAt(scene, "expert", 1, 0, at), meta.vehicle, panel, COLOURS.recorded, false);
@@ -701,7 +706,7 @@ function listLegend() {
 }
 
 const LINKED = ["side", "up", "tube", "fork"]; // of them, what the link says
-const OPTIONS = ["follow", "side", "expert", "plans", "up", "tube", "fork"];
+const OPTIONS = ["follow", "side", "expert", "plans", "seen", "up", "tube", "fork"];
 function syncOptions() {
   for (const name of OPTIONS) byId(name).checked = state[name];
   byId("route").checked = map.layers.route;
@@ -877,6 +882,7 @@ const KEYS = {
   b: () => setOption("side", !state.side),
   e: () => setOption("expert", !state.expert),
   p: () => setOption("plans", !state.plans),
+  o: () => setOption("seen", !state.seen),
   u: () => setOption("up", !state.up),
   n: () => tubes.length && setOption("tube", !state.tube),
   k: showFork,
@@ -1060,6 +1066,7 @@ async function start() {
   startTheme();
   map = new MapPicture(scene);
   byId("tube").parentElement.hidden = !tubes.length;
+  byId("seen").parentElement.hidden = !meta.rollouts.some((rollout) => rollout.seen);
   byId("fork").parentElement.hidden = !meta.rollouts.some(({ fork }) => fork?.branches.length);
   listRollouts();
   await loadState();

@@ -174,6 +174,9 @@ def rollout_fields(replay: Replay, index: int) -> Fields:
         fields |= _poses(f"branch{number}", branch.poses[:, None], origin)
     if replay.own_tracks:
         fields |= _track_fields(log.tracks, origin)
+    if log.seen is not None:
+        fields |= _track_fields(log.seen.tracks, origin, "seen")
+        fields |= _poses("believed", log.seen.ego[:, None], origin)
     return fields
 
 
@@ -208,6 +211,7 @@ def describe_scene(replay: Replay) -> dict[str, Any]:
                 "fork": _describe_fork(item, styles),
                 "scores": _scores(item.metrics),
                 "degraded": int(item.log.degraded.sum()),
+                "seen": item.log.seen is not None,
                 "tracks": _track_names(item.log.tracks) if own else None,
             }
             for item in shown
@@ -251,7 +255,7 @@ def _poses(name: str, poses: FloatArray, origin: FloatArray) -> Fields:
     }
 
 
-def _track_fields(tracks: Tracks, origin: FloatArray) -> Fields:
+def _track_fields(tracks: Tracks, origin: FloatArray, name: str = "tracks") -> Fields:
     """Tracks that are there at some time; values of absent samples repeat the one before."""
     used = np.flatnonzero(tracks.valid.any(axis=0))
     valid = tracks.valid[:, used]
@@ -262,10 +266,10 @@ def _track_fields(tracks: Tracks, origin: FloatArray) -> Fields:
     poses = tracks.poses[:, used][rows, columns]
     sizes = tracks.sizes[:, used][first, columns]
     return {
-        "tracks.valid": valid,
-        "tracks.kind": tracks.kinds[used].astype(np.uint8),
-        "tracks.size": Quantised(sizes, _METRES),
-        **_poses("tracks", np.array(poses), origin),
+        f"{name}.valid": valid,
+        f"{name}.kind": tracks.kinds[used].astype(np.uint8),
+        f"{name}.size": Quantised(sizes, _METRES),
+        **_poses(name, np.array(poses), origin),
     }
 
 

@@ -218,6 +218,24 @@ function drawAgents(context, fields, panel, at, highlighted, edited = new Set())
   outline(context, marked, panel, 3, COLOURS.partner);
 }
 
+// what the planner saw: outlines of boxes, and of the ego where it believed to be
+function drawSeen(context, fields, vehicle, panel, at, colour) {
+  const size = fields.get("seen.size").data;
+  const valid = fields.get("seen.valid").data;
+  const count = size.length / 2;
+  const now = { ...at, next: at.row };
+  context.beginPath();
+  for (let i = 0; i < count; i++) {
+    if (!valid[at.row * count + i]) continue;
+    const half = size[2 * i] / 2;
+    addBox(context, ...poseAt(fields, "seen", count, i, now), half, half, size[2 * i + 1] / 2, panel);
+  }
+  context.lineWidth = 1.5;
+  context.strokeStyle = colour;
+  context.stroke();
+  drawEgo(context, poseAt(fields, "believed", 1, 0, now), vehicle, panel, colour, false, [2, 2]);
+}
+
 // boxes drawn around agents
 function outline(context, boxes, panel, width, colour) {
   for (const [x, y, heading, half, halfWidth] of boxes) {

@@ -14,14 +14,15 @@ from shiftsim.edits.sampling import GRADES, KINDS
 from shiftsim.errors import ConfigError
 from shiftsim.metrics import PROFILES
 from shiftsim.report.groups import token_digest
-from shiftsim.sim.noise import NOISE_NAMES, SIGMA_BY_LEVEL, parse_noise
+from shiftsim.sim.noise import NOISE_NAMES, SIGMA_BY_LEVEL
+from shiftsim.sim.perception import parse_drift
 from shiftsim.sim.traffic import traffic_name
 
 
 @pytest.mark.parametrize("name", TRACKS)
 def test_a_track_names_only_what_exists(name):
     track = load_track(name)
-    assert [parse_noise(noise).name for noise in track.noise] == list(track.noise)
+    assert [parse_drift(noise).name for noise in track.noise] == list(track.noise)
     assert [traffic_name(mode) for mode in track.traffic] == list(track.traffic)
     assert {track.own_thresholds, *(one.thresholds for one in [track.reference] if one)} <= set(
         PROFILES
@@ -35,6 +36,11 @@ def test_state_drift_is_the_papers_seven_settings_and_three_seeds():
     assert track.seeds == (0, 1, 2)
     assert track.rollouts_per_scenario == 2 * (1 + 6 * 3)
     assert load_track("semantic-shift").rollouts_per_scenario == 2
+
+
+def test_sensor_drift_has_seeds_for_all_but_latency():
+    track = load_track("sensor-drift")
+    assert track.rollouts_per_scenario == 2 * (1 + 12 * 3 + 4)
 
 
 def test_the_track_of_edits_draws_as_many_of_every_kind_and_difficulty():

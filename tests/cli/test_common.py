@@ -31,7 +31,8 @@ def test_every_setting_is_an_option_with_its_help():
 
 def test_the_options_are_those_of_before():
     flags = [max(option.opts, key=len) for option in options_of("run").values()]
-    words = """--planner --noise --seeds --store --split --limit --all --edits --traffic
+    words = """--planner --noise --perception --localization --latency --seeds --store --split
+        --limit --all --edits --traffic
         --controller --thresholds --planner-arg --metric --checkpoint --device --batch-size
         --isolate --planner-python --strict --open-loop --out --workers --timeout
         --resume --retry-failed --shard --executor --scheduler --save-rollouts

@@ -7,18 +7,18 @@ import pytest
 
 from shiftsim.cli import doctor
 from shiftsim.errors import ShiftsimError
-from shiftsim.verify import self_check
+from shiftsim.verify import rollouts
 
 
 @pytest.mark.slow
 def test_a_wrong_number_is_found(tmp_path, monkeypatch):
-    shutil.copytree(self_check.REFERENCE, tmp_path, dirs_exist_ok=True)
+    shutil.copytree(rollouts.REFERENCE, tmp_path, dirs_exist_ok=True)
     with np.load(tmp_path / "bicycle_steps.npz") as stored:
         arrays = {name: stored[name].copy() for name in stored.files}
     changed = next(name for name in arrays if arrays[name].dtype == np.float64)
     arrays[changed].reshape(-1)[3] += 1e-3
     np.savez(tmp_path / "bicycle_steps.npz", **arrays)
-    monkeypatch.setattr(self_check, "REFERENCE", tmp_path)
+    monkeypatch.setattr(rollouts, "REFERENCE", tmp_path)
 
     found = doctor.examine()
 
@@ -30,6 +30,6 @@ def test_a_wrong_number_is_found(tmp_path, monkeypatch):
 
 
 def test_missing_references_are_an_error(tmp_path, monkeypatch):
-    monkeypatch.setattr(self_check, "REFERENCE", tmp_path)
+    monkeypatch.setattr(rollouts, "REFERENCE", tmp_path)
     with pytest.raises(ShiftsimError, match="bicycle_steps"):
         doctor.examine()

@@ -57,7 +57,9 @@ NEEDS = {  # of extras and of the dependency group `docs`
     "nuplan_results": ("msgpack",),
     "training": ("gymnasium", "torch", "safetensors"),
     **dict.fromkeys(("run_folder", "store_format"), ("duckdb", "pandas", "polars")),
-    **dict.fromkeys(("compare_checkpoints", "quickstart", "state_drift"), ("matplotlib",)),
+    **dict.fromkeys(
+        ("compare_checkpoints", "quickstart", "sensor_drift", "state_drift"), ("matplotlib",)
+    ),
     "seeing": ("matplotlib", "pandas"),
 }
 UNITS = {

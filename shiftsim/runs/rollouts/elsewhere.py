@@ -23,7 +23,7 @@ from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.metrics import MetricResult, Thresholds, compute_metrics
 from shiftsim.metrics.score import without
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.rollouts.files import KINDS, STATES, TRACKS
+from shiftsim.runs.rollouts.files import KINDS, SEEN, STATES, TRACKS
 from shiftsim.runs.rollouts.poses import NEED_BOXES, POINTS, REAR_AXLE, Boxes, Driven, rollout_of
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.scenario import Scenario
@@ -39,7 +39,7 @@ _KEY = {"planner": pa.string(), "noise": pa.string(), "seed": pa.int64(), "token
 _TIMES, _POSE = {"time_us": 1.0, "time_s": 1e6}, ("x", "y", "heading")
 _BOX = (*STATE_COLUMNS[:5], "length", "width")
 _KNOWN = {*_KEY, *_TIMES, *STATE_COLUMNS, *_BOX, "seconds", "track_token", "type"}
-_KNOWN |= {*STATES.names, *TRACKS.names, KINDS, "iteration"}  # of rollouts of our own
+_KNOWN |= {*STATES.names, *TRACKS.names, *SEEN.names, KINDS, "iteration"}  # of rollouts of our own
 _NO_ROWS = np.zeros(0, np.int64)
 _TEXTS = dict.fromkeys(
     ("planner", "noise", "token", "scenario", "track_token", "type"), pa.string()

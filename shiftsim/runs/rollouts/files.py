@@ -28,10 +28,12 @@ from shiftsim.data.store.schema import BOX, EGO_COLUMNS, list_of
 from shiftsim.data.store.tables import write_blocks
 from shiftsim.errors import DataError
 from shiftsim.runs.rollouts import Task
-from shiftsim.sim.log import NUM_KEPT, SimulationLog
+from shiftsim.sim.log import NUM_KEPT, Seen, SimulationLog
 from shiftsim.sim.noise import sample_noise
+from shiftsim.sim.perception import noise_of
 from shiftsim.world.ranges import RUN, require
 from shiftsim.world.scenario import Scenario
+from shiftsim.world.state import Tracks
 
 COMMAND_COLUMNS = ("command_accel_mps2", "command_steering_rate_radps")
 NOISE_COLUMNS = ("noise_accel_mps2", "noise_steering_rate_radps")
@@ -61,13 +63,27 @@ TRACKS = _schema(
 )
 
 
+SEEN = _schema(  # what the planner saw; NaN and empty where that was the truth
+    {
+        **dict.fromkeys(("seen_x_m", "seen_y_m", "seen_heading_rad"), pa.float64()),
+        "seen_track_tokens": list_of(pa.string()),
+        **dict.fromkeys((f"seen_track_{name}" for name in BOX[:2]), list_of(pa.float64())),
+        **dict.fromkeys((f"seen_track_{name}" for name in BOX[2:]), list_of(pa.float32())),
+    }
+)
+
 KINDS = "track_kinds"  # beside `TRACKS` where there are other tracks than in the scenario
 
 
 def rollout_rows(
-    log: SimulationLog, *, with_tracks: bool, with_noise: bool = True, with_kinds: bool = False
+    log: SimulationLog,
+    *,
+    with_tracks: bool,
+    with_noise: bool = True,
+    with_kinds: bool = False,
+    with_seen: bool = False,
 ) -> pa.RecordBatch:
-    """Columns of `STATES`, and of `TRACKS` where tracks are not the recorded ones.
+    """Columns of `STATES`, of `TRACKS` where tracks are not the recorded ones, and of `SEEN`.
 
     Noise that `complete_rollout` can make again from the task is left out: null. Kinds are needed
     of tracks that the scenario has not.
@@ -82,19 +98,29 @@ def rollout_rows(
     known = np.logical_and.accumulate(~np.isnan(log.plans[..., 0]), axis=1)
     offsets = (log.plans - log.ego[:, None, :3])[known].astype(np.float32)
     columns += [_lists(known.sum(axis=1), of) for of in offsets.T]
-    if not with_tracks:
-        return pa.RecordBatch.from_arrays(columns, schema=STATES)
-    tracks = log.tracks
+    schema = [*STATES, *(TRACKS if with_tracks else ()), *(SEEN if with_seen else ())]
+    columns += _box_columns(log.tracks) if with_tracks else []
+    if with_seen:
+        count, names = len(log.time_us), SEEN.names
+        seen = log.seen or Seen(np.full((count, 3), np.nan), Tracks.empty(count))
+        columns += map(pa.array, np.ascontiguousarray(seen.ego.T))
+        boxes = zip(_box_columns(seen.tracks), names[3:], strict=True)
+        columns += [lists.cast(SEEN.field(name).type) for lists, name in boxes]
+    if with_kinds:
+        codes = pa.array(log.tracks.kinds[np.nonzero(log.tracks.valid)[1]], pa.int8())
+        columns.append(_lists(log.tracks.valid.sum(axis=1), codes))
+        schema.append(pa.field(KINDS, list_of(pa.int8()), nullable=False))
+    return pa.RecordBatch.from_arrays(columns, schema=pa.schema(schema))
+
+
+def _box_columns(tracks: Tracks) -> list[pa.Array]:
+    """Columns of `TRACKS`."""
     row, track = np.nonzero(tracks.valid)
     lengths = tracks.valid.sum(axis=1)
-    columns.append(_lists(lengths, pa.array(tracks.tokens, pa.string()).take(pa.array(track))))
+    columns = [_lists(lengths, pa.array(tracks.tokens, pa.string()).take(pa.array(track)))]
     for values in (tracks.poses, tracks.velocities, tracks.sizes):
         columns += [_lists(lengths, of) for of in values[row, track].T]
-    schema = pa.schema([*STATES, *TRACKS])
-    if with_kinds:
-        columns.append(_lists(lengths, pa.array(tracks.kinds[track], pa.int8())))
-        schema = schema.append(pa.field(KINDS, list_of(pa.int8()), nullable=False))
-    return pa.RecordBatch.from_arrays(columns, schema=schema)
+    return columns
 
 
 def _lists(lengths: np.ndarray, items: np.ndarray | pa.Array) -> pa.Array:
@@ -140,10 +166,13 @@ def complete_rollout(
         if "track_tokens" in rows.schema.names:
             stored: dict[str, Any] = stored_tracks(rows, tracks.tokens)
             tracks = replace(tracks, **stored)
+        seen = _stored_seen(rows, scenario.tracks)
     except ValueError as error:
         raise DataError(f"{where} is damaged: {error}", hint="make the run again") from error
     if rows[NOISE_COLUMNS[0]].null_count:
-        noise = sample_noise(task.noise, seed=task.seed, token=task.token, num_steps=len(rows))
+        noise = sample_noise(
+            noise_of(task.noise), seed=task.seed, token=task.token, num_steps=len(rows)
+        )
     else:
         noise = stack(rows, NOISE_COLUMNS)
     return SimulationLog(
@@ -160,7 +189,27 @@ def complete_rollout(
         plans=plans,
         planning_seconds=rows["planning_seconds"].to_numpy().astype(np.float64),
         degraded=np.array(rows["degraded"].to_numpy(zero_copy_only=False)),
+        seen=seen,
     )
+
+
+def _stored_seen(rows: pa.RecordBatch, true: Tracks) -> Seen | None:
+    """What was seen in a stored rollout; None where it was the truth.
+
+    Raises:
+        ValueError: It is damaged.
+    """
+    if SEEN.names[0] not in rows.schema.names:
+        return None
+    ego = stack(rows, SEEN.names[:3])
+    if np.isnan(ego).all():
+        return None
+    tokens = tuple(rows["seen_track_tokens"].flatten().unique().to_pylist())
+    kinds = dict(zip(true.tokens, true.kinds.tolist(), strict=True))
+    # a track that was lost has another token
+    codes = [kinds[name if name in kinds else name.rpartition("~")[0]] for name in tokens]
+    boxes: dict[str, Any] = stored_tracks(rows, tokens, "seen_track_")
+    return Seen(ego, Tracks(**boxes, kinds=np.array(codes, np.int64), tokens=tokens))
 
 
 def _cells(column: pa.Array, lengths: np.ndarray, name: str) -> pa.Array:
@@ -190,17 +239,20 @@ def stored_plans(rows: pa.RecordBatch) -> np.ndarray:
     return stack(rows, EGO_COLUMNS[:3])[:, None] + offsets
 
 
-def stored_tracks(rows: pa.RecordBatch, tokens: Sequence[str]) -> dict[str, np.ndarray]:
+def stored_tracks(
+    rows: pa.RecordBatch, tokens: Sequence[str], prefix: str = "track_"
+) -> dict[str, np.ndarray]:
     """Fields `valid`, `poses`, `velocities` and `sizes` of the tracks of a stored rollout.
 
     Args:
         rows: Columns of `TRACKS`.
         tokens: N tokens of the tracks, in the order of the arrays.
+        prefix: Of the columns; those that were seen have `seen_track_`.
 
     Raises:
         ValueError: They are damaged, or of other tracks.
     """
-    names = rows["track_tokens"]
+    names = rows[f"{prefix}tokens"]
     lengths = np.diff(names.offsets.to_numpy())
     found = pc.index_in(names.flatten(), pa.array(tokens, pa.string()))
     if found.null_count:
@@ -210,7 +262,7 @@ def stored_tracks(rows: pa.RecordBatch, tokens: Sequence[str]) -> dict[str, np.n
     valid[row, track] = True
     if np.count_nonzero(valid) != len(row):
         raise ValueError("it has a track twice in a row")
-    columns = [f"track_{name}" for name in BOX]
+    columns = [f"{prefix}{name}" for name in BOX]
     boxes = np.stack([_cells(rows[name], lengths, name).to_numpy() for name in columns], axis=1)
     out = {"valid": valid}
     for name, part in zip(
@@ -303,7 +355,8 @@ class RolloutReader:
         self._file, self._rows = pq.ParquetFile(path), pa.table({})
         self._path = path
         found = self._file.schema_arrow
-        for column in [*STATES, *(TRACKS if TRACKS.names[0] in found.names else ())]:
+        there = (table for table in (TRACKS, SEEN) if table.names[0] in found.names)
+        for column in chain(STATES, *there):
             at = found.get_field_index(column.name)
             if at < 0 or not found.field(at).type.equals(column.type):
                 raise TypeError(f"column {column.name!r} is missing or not {column.type}")
@@ -327,7 +380,7 @@ def write_rollouts(
 ) -> dict[Task, RolloutLocation]:
     """Write rollouts into new files of a folder, and say where they are.
 
-    They have columns of `STATES`, and of `TRACKS` in all rollouts or in none. Columns that name a
+    They have columns of `STATES`, and of `TRACKS` and `SEEN` in all or in none. Columns that name a
     task already are written anew.
     """
     rollouts, locations = iter(rollouts), dict[Task, RolloutLocation]()

@@ -240,7 +240,7 @@ def test_velocities_that_nothing_explains_are_doubted_where_most_are_wrong(wrong
     ("share", "remedy"), [(0.0, ""), (0.4, ""), (0.5, "'front'"), (-0.1, ""), (-0.2, "'rear'")]
 )
 def test_places_are_those_of_the_middle(share, remedy):
-    """Cars of 4 m turn at 0.4 rad/s; the places are so many lengths ahead of what does not slide."""
+    """Cars of 4 m turn at 0.4 rad/s; places are so many lengths ahead of what does not slide."""
     table = table_of(*[("car", 0.0, 0.0, 8.0, 0.0, 5.0)] * 3)
     table.sizes[:], table.headings[:] = (4.0, 2.0), 0.4 * table.time
     cos, sin = np.cos(table.headings), np.sin(table.headings)

@@ -1,0 +1,304 @@
+"""Models of what a planner sees, where it believes to be, and when its plan arrives.
+
+A drift has one of each, and the actuation noise; its name is what runs, tables and pictures call
+it. `sensing` applies it.
+"""
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field, fields, replace
+from itertools import chain, product
+from math import inf, isfinite, log, radians
+from typing import Any
+
+import numpy as np
+
+from shiftsim.errors import ConfigError, one_of
+from shiftsim.files import load_attribute
+from shiftsim.kernels import FloatArray
+from shiftsim.sim.noise import NOISE_NAMES, NoiseModel, parse_noise
+
+DT = 0.1  # s, nominal time between rows
+DT_MS = 100
+LEVELS = ("low", "mid", "high")
+
+_ERRORS = {
+    "low": {"position": 0.1, "heading": radians(1.0), "velocity": 0.2, "size": 0.02},
+    "mid": {"position": 0.3, "heading": radians(3.0), "velocity": 0.5, "size": 0.05},
+    "high": {"position": 0.5, "heading": radians(5.0), "velocity": 1.0, "size": 0.1},
+}
+_MISSES = {
+    "low": {"missed": 0.02, "gap": 0.3},
+    "mid": {"missed": 0.1, "gap": 0.5},
+    "high": {"missed": 0.2, "gap": 1.0},
+}
+_LOSSES = {  # one of 20, 10, 5 tracks in 15 s
+    "low": {"lost": 1 / 300, "lost_for": 1.0},
+    "mid": {"lost": 1 / 150, "lost_for": 2.0},
+    "high": {"lost": 1 / 75, "lost_for": 4.0},
+}
+_POSES = {
+    "low": {"position": 0.05, "heading": radians(0.2)},
+    "mid": {"position": 0.15, "heading": radians(0.5)},
+    "high": {"position": 0.3, "heading": radians(1.0)},
+}
+_KINDS = {"perception": _ERRORS, "miss": _MISSES, "dropout": _LOSSES, "localization": _POSES}
+_AXES = (*_KINDS, "range", "latency")  # in the order of tables, behind actuation noise
+_HINT = "give module:attribute of a function, NoiseModel, Perception or Localization"
+
+
+@dataclass(frozen=True, slots=True)
+class Perception:
+    """How the boxes that a planner sees differ from those that are there.
+
+    Errors are stated at a distance of 20 m.
+
+    Attributes:
+        position: Standard deviation of the error of x and of y [m].
+        heading: Of the heading [rad].
+        velocity: Of both components of the velocity [m/s].
+        size: Of length and width, which are wrong alike, as a share of them.
+        tau: Time in which these errors decay to 1/e [s].
+        missed: Share of detections that are missed, twice as many beyond 50 m.
+        gap: Mean time for which a track is missed [s].
+        lost: How often a track is lost, to return under a new token [1/s].
+        lost_for: For how long [s].
+        range: Distance up to which boxes are seen [m].
+        name: As in tables and on the command line; derived from the values when empty.
+
+    Example:
+        ```python
+        blurred = shiftsim.Perception(position=1.0, missed=0.1, name="blurred")
+        scenario = shiftsim.open_store("demo")["01f13e"]
+        log = shiftsim.simulate(scenario, "idm", perception=blurred, seed=3)
+        print(log.seen.tracks.poses[0, 0] - log.tracks.poses[0, 0])
+        ```
+    """
+
+    position: float = 0.0
+    heading: float = 0.0
+    velocity: float = 0.0
+    size: float = 0.0
+    tau: float = -DT / log(0.9)
+    missed: float = 0.0
+    gap: float = 0.5
+    lost: float = 0.0
+    lost_for: float = 2.0
+    range: float = inf
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        bounds = {"tau": (DT, inf), "missed": (0.0, 0.25), "gap": (DT, inf), "lost_for": (DT, inf)}
+        _check(self, bounds | {"lost": (0.0, 1.0 / DT)})
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(6,) deviations of x, y, heading, velocity x, y, and size."""
+        at, of = self.position, self.velocity
+        return np.array([at, at, self.heading, of, of, self.size])
+
+    @property
+    def acts(self) -> bool:
+        """Whether anything is seen otherwise than it is."""
+        return bool(self.sigmas.any() or self.missed or self.lost or isfinite(self.range))
+
+
+@dataclass(frozen=True, slots=True)
+class Localization:
+    """How the pose that a planner takes for its own differs from the true one.
+
+    Attributes:
+        position: Standard deviation of the error of x and of y [m].
+        heading: Of the heading [rad].
+        tau: Time in which the error decays to 1/e [s].
+        name: As in tables and on the command line; derived from the values when empty.
+
+    Example:
+        ```python
+        lost = shiftsim.Localization(position=1.0, heading=0.02, name="lost")
+        log = shiftsim.simulate(shiftsim.open_store("demo")["01f13e"], "idm", localization=lost)
+        ```
+    """
+
+    position: float = 0.0
+    heading: float = 0.0
+    tau: float = 3.0
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        _check(self, {"tau": (DT, inf)})
+
+    @property
+    def acts(self) -> bool:
+        """Whether the pose is another than the true one."""
+        return bool(self.position or self.heading)
+
+
+def _check(model: Perception | Localization, bounds: dict[str, tuple[float, float]]) -> None:
+    """Refuse values out of their bounds, and derive the name where it is empty."""
+    kind, values = type(model).__name__.lower(), list[str]()
+    for item in fields(model)[:-1]:
+        value, (low, high) = getattr(model, item.name), bounds.get(item.name, (0.0, inf))
+        if not low <= value <= high:
+            raise ConfigError(f"{kind} {item.name} is {value!r}; it must be {low:g} to {high:g}")
+        values += [f"{item.name}={value:g}"] if value != item.default else []
+    if not model.name:
+        object.__setattr__(model, "name", f"{kind}({','.join(values)})" if values else "none")
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """What differs from a perfect vehicle: actuation, perception, localization, latency."""
+
+    noise: NoiseModel = field(default_factory=NoiseModel)
+    perception: Perception = field(default_factory=Perception)
+    localization: Localization = field(default_factory=Localization)
+    latency: int = 0  # of plans [ms]
+
+    def __post_init__(self) -> None:
+        if self.latency < 0 or self.latency % DT_MS:
+            raise ConfigError(
+                f"latency {self.latency!r} is not a multiple of {DT_MS} ms",
+                hint="plans arrive at a step of the simulation: 0, 100, 200, …",
+            )
+
+    @property
+    def name(self) -> str:
+        """As in tables: the names of what acts, joined by `+`, or none."""
+        late = f"latency-{self.latency}" if self.latency else "none"
+        names = (self.noise.name, self.perception.name, self.localization.name, late)
+        return "+".join(name for name in names if name != "none") or "none"
+
+    @property
+    def senses(self) -> bool:
+        """Whether a planner sees anything otherwise than it is."""
+        return self.perception.acts or self.localization.acts
+
+    @property
+    def is_random(self) -> bool:
+        """Whether rollouts differ from seed to seed."""
+        return self.noise.kind != "none" or self.senses
+
+    def fingerprint(self) -> dict[str, Any]:
+        """What rollouts depend on, as JSON values; of noise alone what it always was."""
+        names = ("kind", "sigma_accel", "sigma_rate", "theta")
+        out: dict[str, Any] = {name: getattr(self.noise, name) for name in names}
+        out["function"] = None if self.noise.function is None else self.noise.name
+        if self.senses and self.noise.kind == "none":
+            out["kind"] = "sensing"  # has seeds
+        for name, model in (("perception", self.perception), ("localization", self.localization)):
+            out |= {name: asdict(model)} if model.acts else {}
+        return out | ({"latency": self.latency} if self.latency else {})
+
+
+def parse_drift(name: str) -> Drift:
+    """The drift of a name.
+
+    Args:
+        name: Names joined by `+`: those of `NOISE_NAMES`; `perception-`, `miss-`, `dropout-` and
+            `localization-` with `low`, `mid` or `high`; `range-METRES`; `latency-MS`; and
+            `module:attribute` of a noise function or of a model.
+
+    Raises:
+        ConfigError: A name is unknown, or there are two of a kind.
+    """
+    found, kinds = Drift(), list[str]()
+    for part in filter(lambda part: part != "none", name.split("+")):
+        kind, _, level = part.partition("-")
+        if kind not in _AXES:
+            model: Any = load_attribute("noise", part, _HINT) if ":" in part else None
+            known = isinstance(model, (Perception, Localization))
+            found = _joined(found, model if known else parse_noise(part))
+            kind = type(model).__name__.lower() if known else "noise"
+        elif kind == "latency":
+            found = replace(found, latency=_number(part, level))
+        elif kind == "localization":
+            one_of(kind, level, LEVELS)
+            found = replace(found, localization=Localization(**_POSES[level], name=part))
+        else:
+            found = replace(found, perception=_seen(found.perception, part))
+        kinds.append(kind)
+    if len(kinds) != len(set(kinds)):
+        raise ConfigError(f"drift {name!r} has two of a kind")
+    return found
+
+
+def _seen(before: Perception, part: str) -> Perception:
+    """A perception with one more of its named errors."""
+    kind, _, level = part.partition("-")
+    if kind == "range":
+        more: dict[str, float] = {"range": float(_number(part, level))}
+    else:
+        more = _KINDS[kind][one_of(kind, level, LEVELS)]
+    name = part if before.name == "none" else f"{before.name}+{part}"
+    return replace(before, **more, name=name)
+
+
+def _number(part: str, text: str) -> int:
+    if not text.isdecimal():
+        raise ConfigError(f"{part!r} has no number", hint="for example latency-200 or range-60")
+    return int(text)
+
+
+def _joined(found: Drift, model: NoiseModel | Perception | Localization) -> Drift:
+    names = {NoiseModel: "noise", Perception: "perception", Localization: "localization"}
+    return replace(found, **{names[type(model)]: model})  # type: ignore[arg-type]
+
+
+def make_drift(
+    noise: Any = "none", perception: Any = "none", localization: Any = "none", latency: int = 0
+) -> Drift:
+    """A drift of names or models; noise may be the name of a drift, or a drift.
+
+    Perception takes `low`, `mid` and `high` for `perception-low`, and so on.
+
+    Raises:
+        ConfigError: A name is unknown, or there are two of a kind.
+    """
+    names, models = list[str](), list[Any]()
+    for kind, given in zip(
+        ("", "perception", "localization"), (noise, perception, localization), strict=True
+    ):
+        if not isinstance(given, str):
+            models.append(given)
+            continue
+        parts = given.split("+")
+        names += [f"{kind}-{part}" if kind and part in LEVELS else part for part in parts]
+    names += [f"latency-{latency}"] if latency else []
+    found = parse_drift("+".join(names or ["none"]))
+    for model in models:
+        found = model if isinstance(model, Drift) else _joined(found, model)
+    return found
+
+
+def make_drifts(noise: Any, perception: Any, localization: Any, latency: Any) -> list[Drift]:
+    """Every combination of what may be lists, each once; the noise `all` is all its names."""
+    given = (noise, perception, localization, latency)
+    noises, *others = ([*one] if isinstance(one, (list, tuple)) else [one] for one in given)
+    named = [NOISE_NAMES if isinstance(one, str) and one == "all" else [one] for one in noises]
+    found = [make_drift(*one) for one in product(chain(*named), *others)]
+    return list({one.name: one for one in found}.values())
+
+
+def noise_of(name: str) -> str:
+    """The actuation noise in the name of a drift, of those of `NOISE_NAMES`."""
+    return next((part for part in name.split("+") if part in NOISE_NAMES), "none")
+
+
+def has_seeds(name: str) -> bool:
+    """Whether rollouts under the drift of a name differ from seed to seed."""
+    return any(part != "none" and not part.startswith("latency-") for part in name.split("+"))
+
+
+def drift_order(names: Iterable[str]) -> list[str]:
+    """Drifts, each once: none, noise, others by kind from low to high, then custom ones by name."""
+    return sorted(set(names), key=lambda name: [_rank(part) for part in name.split("+")])
+
+
+def _rank(part: str) -> tuple[int, float, str]:
+    if part in NOISE_NAMES:
+        return 0, NOISE_NAMES.index(part), ""
+    kind, _, level = part.partition("-")
+    if kind not in _AXES:
+        return 1 + len(_AXES), 0.0, part
+    number = float(level) if level.isdecimal() else LEVELS.index(level) if level in LEVELS else inf
+    return 1 + _AXES.index(kind), number, part
