@@ -29,8 +29,8 @@ from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.state import AgentKind
 
 EGO = "ego"
-_FILES = ("sync", "ego_state_se3", "box_detections_se3", "traffic_light_detections")
-_FILES += ("custom.scenario",)  # of nuPlan
+_LOG = ("sync", "ego_state_se3", "box_detections_se3", "traffic_light_detections")
+_FILES = (*_LOG, "custom.scenario")  # the last one of nuPlan only
 # columns of these files, beside their time stamps, and of maps
 _EGO = dict(imu_se3=items(pa.float64(), 7))
 _BOXES = dict(

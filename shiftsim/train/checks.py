@@ -65,7 +65,7 @@ def check(planner: Planner, scenarios: Iterable[Scenario]) -> list[dict[str, Any
                 after = planner.plan(case.changed)
                 passed[case.check].append(_is_passed(scenario, case, before, after))
     return [
-        {"check": name, "cases": len(found), "passed": float(np.mean(found or [np.nan]))}
+        {"check": name, "cases": len(found), "passed": float(np.mean(found)) if found else np.nan}
         for name, found in passed.items()
     ]
 
@@ -122,10 +122,11 @@ def _with_vehicle(tracks: Tracks, pose: np.ndarray) -> Tracks:
     center = from_frame(np.array([0.5 * PACIFICA.length, 0.0, 0.0]), pose)
     new = (True, center, np.zeros(2), [PACIFICA.length, PACIFICA.width])
     old = (tracks.valid, tracks.poses, tracks.velocities, tracks.sizes)
-    wide = []
-    for array, value in zip(old, new, strict=True):
-        column = np.empty((len(array), 1, *array.shape[2:]), array.dtype)
-        column[:] = value
-        wide.append(np.concatenate([array, column], axis=1))
+
+    def wider(array: np.ndarray, value: Any) -> np.ndarray:
+        column = np.full((len(array), 1, *array.shape[2:]), value, array.dtype)
+        return np.concatenate([array, column], axis=1)
+
+    valid, poses, velocities, sizes = map(wider, old, new)
     kinds = np.append(tracks.kinds, AgentKind.VEHICLE)
-    return Tracks(*wide, kinds, (*tracks.tokens, "obstacle"))
+    return Tracks(valid, poses, velocities, sizes, kinds, (*tracks.tokens, "obstacle"))

@@ -46,8 +46,8 @@ TEMPERATURE = 0.1  # of the contrastive loss
 CLIP = 5.0  # of the norm of all gradients
 WARM_UP, FLOOR = 0.05, 2e-3  # here: share of rising, end of the learning rate as a share
 # layers of Diffusion Planner that begin small, and at zero
-SMALL = ("pos_emb", "type_emb", "speed_limit_emb", "traffic_emb", "t_embedder.mlp.0")
-SMALL += ("t_embedder.mlp.2",)
+_TIME = ("t_embedder.mlp.0", "t_embedder.mlp.2")
+SMALL = ("pos_emb", "type_emb", "speed_limit_emb", "traffic_emb", *_TIME)
 ZERO = ("adaLN_modulation.1", "final_layer.proj.4")
 # here plans and predictions are in units of two rows: at once, and what they grow by per second
 PLAN_MEAN = ((0.0, 0.0, 1.0, 0.0, 4.5, 0.0), (4.5, 0.0, 0.0, 0.0, 0.0, 0.0))

@@ -19,7 +19,7 @@ from shiftsim.errors import ShiftsimError
 from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.runs.results import Run, open_run
-from shiftsim.runs.task import Task
+from shiftsim.runs.rollouts import Task
 from shiftsim.sim.planner import scene_info
 from shiftsim.train.samples import KINDS, STEPS, Batch, Sample, make_batch, make_sample
 from shiftsim.world.scenario import Scenario
