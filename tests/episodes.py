@@ -8,8 +8,7 @@ import numpy as np
 
 from shiftsim.env.episode import REWARDS, Episode
 from shiftsim.env.terms import Terms, compute_reward_terms, make_state
-from shiftsim.sim.log import SimulationLog
-from shiftsim.sim.loop import Setting
+from shiftsim.sim.log import Setting, SimulationLog
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Command

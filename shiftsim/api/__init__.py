@@ -19,7 +19,7 @@ from shiftsim.files import DEFAULT_STORE, store_path
 from shiftsim.metrics import MetricResult
 from shiftsim.planners import registry
 from shiftsim.sim import loop
-from shiftsim.sim.log import SimulationLog
+from shiftsim.sim.log import DEFAULT, Setting, SimulationLog
 from shiftsim.sim.noise import NoiseModel
 from shiftsim.sim.perception import Localization, Perception, make_drifts
 from shiftsim.sim.planner import Observation, Planner, SceneInfo
@@ -241,7 +241,7 @@ def load_planner(name: str, **arguments: Any) -> Planner:
 def simulate(
     scenario: Scenario,
     planner: Planner | str | None,
-    setting: loop.Setting = loop.DEFAULT,
+    setting: Setting = DEFAULT,
     **changes: Any,
 ) -> SimulationLog:
     """Drive one scenario in closed loop; as `shiftsim.sim.loop.simulate`, or by a planner's name.

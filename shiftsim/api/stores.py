@@ -178,12 +178,15 @@ def convert_dataset(
     from shiftsim.data.readers.commonroad import CommonRoadReader
     from shiftsim.data.readers.py123d import Py123dReader, read_starts
 
-    if at and kind != "py123d":
+    if at is not None and kind != "py123d":
         raise ConfigError(f"at is for py123d, not {kind}", hint="leave it out")
     vehicles = one_of("egos", egos, ("recorded", "vehicles")) == "vehicles"
+    starts = None if at is None else read_starts(Path(at))
     readers: dict[str, Any] = {
         "av2": partial(Av2Reader, vehicles=vehicles),
-        "py123d": partial(Py123dReader, vehicles=vehicles, starts=at and read_starts(Path(at))),
+        "py123d": partial(
+            Py123dReader, vehicles=vehicles, starts=None if at is None else read_starts(Path(at))
+        ),
         "commonroad": CommonRoadReader,
     }
     reader = readers[one_of("data set", kind, readers)](Path(folder))

@@ -28,8 +28,7 @@ from shiftsim.geometry.boxes import from_frame
 from shiftsim.kernels import FloatArray
 from shiftsim.planners.learned.carl.planner import command_of
 from shiftsim.runs.scenarios import find_split
-from shiftsim.sim.log import Snapshot
-from shiftsim.sim.loop import Setting
+from shiftsim.sim.log import Setting, Snapshot
 from shiftsim.sim.noise import NoiseModel, parse_noise
 from shiftsim.sim.traffic import Traffic, make_traffic, traffic_name
 from shiftsim.world.scenario import Scenario

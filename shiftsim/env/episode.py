@@ -10,8 +10,8 @@ from gymnasium import Space, spaces
 from shiftsim.env.terms import Terms, compute_reward_terms, make_state
 from shiftsim.errors import PlannerError, ShiftsimError
 from shiftsim.metrics import SHORT_NAMES, compute_metrics
-from shiftsim.sim.log import Snapshot
-from shiftsim.sim.loop import Rollout, Setting
+from shiftsim.sim.log import Setting, Snapshot
+from shiftsim.sim.loop import Rollout
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Command, Trajectory

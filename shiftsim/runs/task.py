@@ -27,7 +27,7 @@ from shiftsim.runs.rollouts import Task
 from shiftsim.runs.rollouts.files import encode_rows, rollout_rows
 from shiftsim.runs.tables import FAILED, OK, TABLES, TaskResult
 from shiftsim.sim import loop
-from shiftsim.sim.log import SimulationLog
+from shiftsim.sim.log import Setting, SimulationLog
 from shiftsim.sim.loop import Rollout
 from shiftsim.sim.noise import is_standard
 from shiftsim.sim.perception import Drift
@@ -186,9 +186,9 @@ class TaskRunner:
         poses = [open_loop.Poses(plan.time_us, plan.states[:, :3]) for plan in plans]
         return open_loop.metric_rows(poses, scenario)
 
-    def _setting(self, task: Task) -> loop.Setting:
+    def _setting(self, task: Task) -> Setting:
         drift = self.noises[task.noise]
-        return loop.Setting(
+        return Setting(
             noise=drift.noise,
             perception=drift.perception,
             localization=drift.localization,

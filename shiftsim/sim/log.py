@@ -5,18 +5,49 @@ iterations: the state reached after the last planner call is never stored.
 """
 
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from shiftsim.errors import one_of
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
+from shiftsim.sim.noise import NoiseModel
+from shiftsim.sim.perception import Drift, Localization, Perception, make_drift
+from shiftsim.sim.traffic import Traffic
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Tracks, TrafficLights
 
-if TYPE_CHECKING:
-    from shiftsim.sim.loop import Setting
-
 NUM_KEPT = 18  # poses of a plan
+CONTROLLERS = ("lqr", "perfect", "log-playback")
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """How a scenario is driven, whichever scenario and planner it is."""
+
+    # actuation noise, by name or model; added to the command before the motion model
+    noise: str | NoiseModel = "none"
+    seed: int = 0  # seed of what is random, also of planners that sample
+    traffic: str | Traffic = "nonreactive"  # `nonreactive`, `reactive`, or a traffic model
+    # `lqr` (tracker and kinematic bicycle), `perfect` (the ego is where the plan says) or `log-
+    # playback` (the ego is where the recording was; plans are ignored)
+    controller: str = "lqr"
+    strict: bool = False  # fail where the planner falls back instead of counting the step
+    # what the planner sees, and where it believes to be, by name or model
+    perception: str | Perception = "none"
+    localization: str | Localization = "none"
+    latency: int = 0  # time from an observation until its plan is followed [ms]
+
+    def __post_init__(self) -> None:
+        one_of("controller", self.controller, CONTROLLERS)
+
+    @property
+    def drift(self) -> Drift:
+        """All that differs from a perfect vehicle."""
+        return make_drift(self.noise, self.perception, self.localization, self.latency)
+
+
+DEFAULT = Setting()
 
 
 class Seen(NamedTuple):
@@ -71,7 +102,7 @@ class SimulationLog:
     degraded: BoolArray
     seen: Seen | None = None
 
-    def snapshot(self, iteration: int, setting: "Setting") -> "Snapshot":
+    def snapshot(self, iteration: int, setting: Setting) -> "Snapshot":
         """Where the rollout was at an iteration, driven as a setting says."""
         past, ego = slice(iteration), self.ego[: iteration + 1]
         commands, seconds = self.commands[past], self.planning_seconds[past]
@@ -104,7 +135,7 @@ class Snapshot:
     """
 
     token: str
-    setting: "Setting"
+    setting: Setting
     ego: FloatArray
     commands: FloatArray
     planning_seconds: FloatArray

@@ -8,20 +8,19 @@ times; its last answer is never executed, and the state at T - 1 is neither reac
 import warnings
 from collections.abc import Callable, Sequence
 from copy import copy, deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import perf_counter
 from typing import Any, ParamSpec, TypeAlias, TypeVar, cast
 
 import numpy as np
 
-from shiftsim.errors import ConfigError, DataError, InvalidTrajectoryError, PlannerError, one_of
+from shiftsim.errors import ConfigError, DataError, InvalidTrajectoryError, PlannerError
 from shiftsim.kernels import FloatArray
 from shiftsim.sim.dynamics.bicycle import command_and_step
 from shiftsim.sim.dynamics.lqr import raise_for_status, track_and_step
 from shiftsim.sim.dynamics.perfect import KEPT_US, follow_perfectly, sample_poses
-from shiftsim.sim.log import SimulationLog, Snapshot
-from shiftsim.sim.noise import NoiseModel, sample_noise
-from shiftsim.sim.perception import Drift, Localization, Perception, make_drift
+from shiftsim.sim.log import DEFAULT, Setting, SimulationLog, Snapshot
+from shiftsim.sim.noise import sample_noise
 from shiftsim.sim.plan_check import contiguous, find_fault, find_warning
 from shiftsim.sim.planner import (
     BatchPlanner,
@@ -32,7 +31,7 @@ from shiftsim.sim.planner import (
     scene_info,
 )
 from shiftsim.sim.sensing import Latency, Sensing
-from shiftsim.sim.traffic import BatchTraffic, Move, Traffic, make_traffic
+from shiftsim.sim.traffic import BatchTraffic, Move, make_traffic
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import NUM_STATE, Command, Trajectory, center_poses
 
@@ -40,36 +39,6 @@ T = TypeVar("T")
 P = ParamSpec("P")
 Plan: TypeAlias = Trajectory | Command | None
 MIN_ITERATIONS = 3
-CONTROLLERS = ("lqr", "perfect", "log-playback")
-
-
-@dataclass(frozen=True, slots=True)
-class Setting:
-    """How a scenario is driven, whichever scenario and planner it is."""
-
-    # actuation noise, by name or model; added to the command before the motion model
-    noise: str | NoiseModel = "none"
-    seed: int = 0  # seed of what is random, also of planners that sample
-    traffic: str | Traffic = "nonreactive"  # `nonreactive`, `reactive`, or a traffic model
-    # `lqr` (tracker and kinematic bicycle), `perfect` (the ego is where the plan says) or `log-
-    # playback` (the ego is where the recording was; plans are ignored)
-    controller: str = "lqr"
-    strict: bool = False  # fail where the planner falls back instead of counting the step
-    # what the planner sees, and where it believes to be, by name or model
-    perception: str | Perception = "none"
-    localization: str | Localization = "none"
-    latency: int = 0  # time from an observation until its plan is followed [ms]
-
-    def __post_init__(self) -> None:
-        one_of("controller", self.controller, CONTROLLERS)
-
-    @property
-    def drift(self) -> Drift:
-        """All that differs from a perfect vehicle."""
-        return make_drift(self.noise, self.perception, self.localization, self.latency)
-
-
-DEFAULT = Setting()
 
 
 class Rollout:

@@ -23,7 +23,7 @@ from shiftsim.planners.learned.carl import planner as carl
 from shiftsim.planners.pdm.planner import PdmClosed
 from shiftsim.runs.workers import map_unordered
 from shiftsim.sim.dynamics.lqr import NUPLAN, raise_for_status, track
-from shiftsim.sim.loop import Setting
+from shiftsim.sim.log import Setting
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.train.folder import OnMessage, Settings
 from shiftsim.train.states import State, compress_raster

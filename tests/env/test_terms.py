@@ -14,7 +14,7 @@ from shiftsim.env.episode import Episode, nuplan, regular, survival
 from shiftsim.env.terms import Terms
 from shiftsim.metrics.comfort import comfort_signals, within_bounds
 from shiftsim.metrics.result import NUPLAN
-from shiftsim.sim.loop import Setting
+from shiftsim.sim.log import Setting
 from shiftsim.world.layers import make_layer
 from shiftsim.world.state import AgentKind, Command, center_poses, speeds
 

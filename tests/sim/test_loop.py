@@ -10,7 +10,8 @@ from shiftsim.errors import ConfigError, DataError, InvalidTrajectoryError, Plan
 from shiftsim.planners.basic import ConstantVelocity
 from shiftsim.sim import loop
 from shiftsim.sim.dynamics.bicycle import command_and_step
-from shiftsim.sim.loop import DEFAULT, Rollout, simulate, simulate_together
+from shiftsim.sim.log import DEFAULT
+from shiftsim.sim.loop import Rollout, simulate, simulate_together
 from shiftsim.sim.noise import NoiseModel
 from shiftsim.world.events import RolloutEvents, TerminationCondition
 from shiftsim.world.state import NUM_STATE, VX, Command, Trajectory, X

@@ -8,7 +8,8 @@ from worlds import cruise_scenario
 from shiftsim.planners.learned.carl import view
 from shiftsim.planners.learned.carl.network import CarlNetwork, Policy
 from shiftsim.planners.learned.carl.planner import MAX_STEERING, command_of, measure
-from shiftsim.sim.loop import Setting, simulate
+from shiftsim.sim.log import Setting
+from shiftsim.sim.loop import simulate
 from shiftsim.sim.planner import observe_log, scene_info
 from shiftsim.train.driving import Expert, brake_at_stand, encode_action
 from shiftsim.train.learning import (

@@ -38,8 +38,8 @@ from shiftsim.sim.dynamics.lqr import (
     raise_for_status,
 )
 from shiftsim.sim.dynamics.perfect import interpolate
-from shiftsim.sim.log import Snapshot
-from shiftsim.sim.loop import Rollout, Setting, simulate_together
+from shiftsim.sim.log import Setting, Snapshot
+from shiftsim.sim.loop import Rollout, simulate_together
 from shiftsim.sim.planner import BatchPlanner, Planner, scene_info
 from shiftsim.sim.traffic import traffic_name
 from shiftsim.world.state import (
