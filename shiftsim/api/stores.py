@@ -184,9 +184,7 @@ def convert_dataset(
     starts = None if at is None else read_starts(Path(at))
     readers: dict[str, Any] = {
         "av2": partial(Av2Reader, vehicles=vehicles),
-        "py123d": partial(
-            Py123dReader, vehicles=vehicles, starts=None if at is None else read_starts(Path(at))
-        ),
+        "py123d": partial(Py123dReader, vehicles=vehicles, starts=starts),
         "commonroad": CommonRoadReader,
     }
     reader = readers[one_of("data set", kind, readers)](Path(folder))
