@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from worlds import straight_road
 
+from shiftsim.data.readers.tracks.axes import Diagnostics, check_reference
 from shiftsim.data.readers.tracks.columns import recognise
 from shiftsim.data.readers.tracks.diagnostics import diagnose
 from shiftsim.data.readers.tracks.table import TrackTable
@@ -233,6 +234,22 @@ def test_velocities_that_nothing_explains_are_doubted_where_most_are_wrong(wrong
     rows = np.isin(table.track, wrong)
     table.velocities[rows] = random[rows]
     assert said(table, words)
+
+
+@pytest.mark.parametrize(
+    ("share", "remedy"), [(0.0, ""), (0.4, ""), (0.5, "'front'"), (-0.1, ""), (-0.2, "'rear'")]
+)
+def test_places_are_those_of_the_middle(share, remedy):
+    """Cars of 4 m turn at 0.4 rad/s; places are so many lengths ahead of what does not slide."""
+    table = table_of(*[("car", 0.0, 0.0, 8.0, 0.0, 5.0)] * 3)
+    table.sizes[:], table.headings[:] = (4.0, 2.0), 0.4 * table.time
+    cos, sin = np.cos(table.headings), np.sin(table.headings)
+    ahead = share * 4.0
+    table.xy[:] = np.column_stack([20.0 * sin + ahead * cos, ahead * sin - 20.0 * cos])
+    found = Diagnostics()
+    check_reference(table, found)
+    assert found.figures == {"reference_share": pytest.approx(share, abs=0.01)}
+    assert [remedy in error.remedy for error in found.errors] == [True] * bool(remedy)
 
 
 def test_rows_that_move_faster_are_those_of_vehicles():
