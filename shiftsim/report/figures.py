@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from textwrap import wrap
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,7 +39,6 @@ _HIGHEST = 8.0  # inches, of all panels
 _BESIDE = 0.5  # inches, beside a panel: the labels of its axis
 _LONGEST = 18  # palette.characters of a name at the end of a line
 _WIDE = 5.0  # inches; what is wider needs both columns of a paper, and has panels side by side
-_NONE: Mapping[str, str] = MappingProxyType({})
 _BARS = "bars: 95 % bootstrap interval over recordings"
 
 
@@ -95,7 +93,9 @@ def figures(groups: Sequence[Group], *, form: FigureFormat = DEFAULT_FORM) -> li
         name = f"{data.name}-{len(names) + 1}" if data.name in names else data.name
         names.append(data.name)
 
-        def add(kind: str, title: str, drawn: Any, note: str, name: str = name, **how: Any) -> None:
+        def add(
+            kind: str, title: str, drawn: Any, note: str, name: str = name, **how: bool
+        ) -> None:
             _finish(drawn, title, note, form, **how)
             out.append(Figure(f"{kind}_{name}", title, drawn))
 
@@ -107,9 +107,8 @@ def figures(groups: Sequence[Group], *, form: FigureFormat = DEFAULT_FORM) -> li
             drawn = _scores(shown, kinds, styles, form, noise="some", labels=labels)
             bars = f"bars: standard deviation over seeds; without several, {_BARS.split(': ')[1]}"
             note = f"n = {len(data.tokens)} scenarios; {bars}; thin line: the clean score"
-            samples = {"clean": "none", "under noise": "some"}
             title = f"Noise robustness on {data.label}"
-            add("robustness", title, drawn, f"{data.rules}\n{note}", samples=samples)
+            add("robustness", title, drawn, f"{data.rules}\n{note}", with_noise=True)
         if not clean:
             continue
         every = np.ones(len(data.tokens), np.bool_)
@@ -180,9 +179,7 @@ def open_against_closed(groups: Sequence[Group], *, form: FigureFormat = DEFAULT
 
 
 def _scatter(
-    axes: Any,
-    points: Sequence[tuple[Group, FloatArray, FloatArray]],
-    styles: Mapping[str, Style],
+    axes: Any, points: Sequence[tuple[Group, FloatArray, FloatArray]], styles: Mapping[str, Style]
 ) -> None:
     """(N,) values of scenarios by group, and the means of the groups where there are several."""
     means = []
@@ -402,20 +399,16 @@ def _finish_axes(axes: Any, title: str, label: str = "closed-loop score") -> Non
     axes.tick_params(labelsize=SMALL)
 
 
-def _sample(noise: str) -> Any:
-    """What lines of clean or disturbed rollouts look like, for a legend."""
+def _finish(
+    figure: Any, title: str, notes: str, form: FigureFormat, *, with_noise: bool = False
+) -> None:
+    """Legend, `with_noise` of its lines as well, title and what stands beside every score."""
     from matplotlib.lines import Line2D
 
-    return Line2D([], [], linestyle=dashes(noise), **Style(_GREY, "o").marks(noise))
-
-
-def _finish(
-    figure: Any, title: str, notes: str, form: FigureFormat, samples: Mapping[str, str] = _NONE
-) -> None:
-    """Legend, title and what stands beside every score; `samples` are noises by their label."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    handles += [*map(_sample, samples.values())]
-    labels += samples
+    for label, noise in (("clean", "none"), ("under noise", "some")) if with_noise else ():
+        labels.append(label)
+        handles.append(Line2D([], [], linestyle=dashes(noise), **Style(_GREY, "o").marks(noise)))
     look = {"loc": "outside upper center", "frameon": False, "fontsize": SMALL, "handlelength": 3.2}
     for columns in range(min(4, max(1, len(labels))), 0, -1):  # as many as fit
         legend = figure.legend(handles, labels, ncols=columns, **look)
