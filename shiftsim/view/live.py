@@ -134,14 +134,14 @@ class LiveRun:
         """
         with self._lock:
             worst = self._worst.values()
-            found = [r for _, n, r in worst if str(n) == str(number) and r.rollout]
-        if not found:
+            found = (r for _, n, r in worst if str(n) == str(number) and r.rollout)
+            result = next(found, None)
+        if result is None:
             return None
-        (result,) = found
         scenario = self._read(result.task.token)
         log = complete_rollout(decode_rows(result.rollout), scenario, result.task)
-        planner, noise, seed, _ = result.task
-        shown = ShownRollout(planner, noise, seed, log, result.scores["cls"], result.metrics)
+        key = result.task[:3]  # without its scenario
+        shown = ShownRollout(*key, log, result.scores["cls"], result.metrics)
         return replay_page(scenario, [shown])
 
 
