@@ -14,6 +14,7 @@ from shiftsim.report.groups import COLUMNS, Group, by_set, distinct_sets
 from shiftsim.report.statistics import FEW_CLUSTERS, Comparison, score_interval
 from shiftsim.report.tables import Cell, Interval, Number, Record, Row, Table
 from shiftsim.report.words import REASONS, noise_order
+from shiftsim.runs.results import Run
 
 ALL_KINDS = "all"
 _SIGNIFICANT = 0.05  # p-value below which a difference is called so
@@ -285,11 +286,8 @@ def open_loop_scores(groups: Sequence[Group]) -> Table | None:
 def open_loop_values(group: Group, metric: str) -> FloatArray:
     """(N,) an open-loop metric's mean over the seeds of every scenario; NaN where there is none."""
     metrics = group.metrics
-    means = (
-        metrics.filter(pc.equal(metrics["metric"], metric))
-        .group_by("token")
-        .aggregate([("value", "mean")])
-    )
+    mine = metrics.filter(pc.equal(metrics["metric"], metric))
+    means = mine.group_by("token").aggregate([("value", "mean")])
     found = {row["token"]: row["value_mean"] for row in means.to_pylist()}
     return np.array([found.get(token) for token in group.data.tokens], np.float64)
 
@@ -319,18 +317,12 @@ def _open_loop_record(group: Group) -> Record:
 def planning_times(groups: Sequence[Group]) -> Table:
     """How long planners think, and how often the simulator's fallback plan had to do."""
     each = {(group.run.path, group.planner): group for group in groups}
-    runs = {group.run.path: group.run.manifest for group in groups}
-    machines = [
-        {"processor": "?", "cores": "?", "workers": manifest.get("workers", "?")}
-        | manifest.get("machine", {})
-        for manifest in runs.values()
-    ]
-    words = "machine: {processor}, {cores} cores, {workers} workers"
+    runs = {group.run.path: group.run for group in groups}
     notes = (
         "per step: mean and 95th percentile within a rollout, of both the median over the "
         "rollouts, which compilation at the start of a run does not touch; per rollout: the "
         "median of reading, driving and scoring",
-        *dict.fromkeys(map(words.format_map, machines)),
+        *dict.fromkeys(f"machine: {_machine(run)}" for run in runs.values()),
     )
     title = "Planning time, and steps driven on a degraded (fallback) plan"
     records = [*map(_times_record, each.values())]
@@ -363,3 +355,9 @@ def _times_record(group: Group) -> Record:
         "degraded steps": Number(int(degraded.sum()), 0),
         "in rollouts": Number(int(np.sum(degraded > 0)), 0),
     }
+
+
+def _machine(run: Run) -> str:
+    machine = run.manifest.get("machine", {})
+    workers = run.manifest.get("workers", "?")
+    return f"{machine.get('processor', '?')}, {machine.get('cores', '?')} cores, {workers} workers"

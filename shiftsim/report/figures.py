@@ -93,9 +93,7 @@ def figures(groups: Sequence[Group], *, form: FigureFormat = DEFAULT_FORM) -> li
         name = f"{data.name}-{len(names) + 1}" if data.name in names else data.name
         names.append(data.name)
 
-        def add(
-            kind: str, title: str, drawn: Any, note: str, name: str = name, **how: bool
-        ) -> None:
+        def add(kind: str, title: str, drawn: Any, note: str, name: str = name, **how: Any) -> None:
             _finish(drawn, title, note, form, **how)
             out.append(Figure(f"{kind}_{name}", title, drawn))
 

@@ -257,11 +257,7 @@ def read_groups(
 
 
 def _planner_labels(groups: Sequence[Group]) -> dict[Path, str]:
-    """What groups of one name are called, by run: what tells them apart stands behind the name.
-
-    Raises:
-        DataError: Groups contradict each other, and nothing tells them apart.
-    """
+    """What groups of one name are called, by run: what tells them apart stands behind the name."""
     facts = {group.run.path: _planner_facts(group) for group in groups}
     if _contradiction(groups, facts):  # then the way in which they were run tells them apart
         facts = {group.run.path: facts[group.run.path] | _run_facts(group.run) for group in groups}

@@ -137,12 +137,8 @@ def worst_rollouts(run: Run, count: int = 10) -> list[dict[str, Any]]:
             known |= {"reason": f"{cause.reason}{score}{time}"}
         rows.append(row | known)
     return [
-        {
-            **words.task_of(row)._asdict(),
-            "cls": row["cls"],
-            "reason": row["reason"],
-            "others": others,
-        }
+        words.task_of(row)._asdict()
+        | {"cls": row["cls"], "reason": row["reason"], "others": others}
         for row, others in words.worst_of(rows, count)
     ]
 

@@ -237,7 +237,10 @@ def _latex(table: Table) -> str:
     columns = [*zip(*table.lines, strict=True)]
     sides = "".join("l" if i < table.num_labels else "r" for i in range(len(columns)))
     heads = [_stacked(name, cells) for name, *cells in columns]
-    names = [_latex_heading(head, side) for head, side in zip(heads, sides, strict=True)]
+    names = []
+    for head, side in zip(heads, sides, strict=True):
+        name = r" \\ ".join(map(_latex_cell, head))
+        names.append(f"\\shortstack[{side}]{{{name}}}" if len(head) > 1 else name)
     # a subscript is about as wide as its text would be without blanks
     sizes = [
         max(map(len, (*head, *(cell.replace(" ± ", "±") for cell in cells))))
@@ -277,7 +280,7 @@ def _for_paper(table: Table) -> Table:
 
 
 def _shared(table: Table) -> tuple[Collection[str], str]:
-    """Settings among the labels that are the same in all rows; in words what no title says."""
+    """Settings among the labels that all rows share; in words, those that the title lacks."""
     columns = {name: {row[i] for row in table.rows} for i, name in enumerate(table.header)}
     labels = [name for name in table.header[: table.num_labels] if name in _SETTINGS]
     shared = {name: shown(*columns[name]) for name in labels if len(columns[name]) == 1}
@@ -354,13 +357,6 @@ def _latex_cell(cell: Cell, *, is_bold: bool = False) -> str:
         text = re.sub(r"-(?=\d)", "$-$", text)
     # one that begins with "[" would be read as an option of the \\ or \toprule before it
     return f"{{{text}}}" if text.startswith("[") else text
-
-
-def _latex_heading(lines: Sequence[str], side: str) -> str:
-    """A heading of one line or of several; `side` is where its column is aligned."""
-    cells = [_latex_cell(line) for line in lines]
-    text = r" \\ ".join(cells)
-    return f"\\shortstack[{side}]{{{text}}}" if len(cells) > 1 else text
 
 
 def _stacked(name: str, cells: Sequence[str]) -> list[str]:

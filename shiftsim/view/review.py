@@ -39,11 +39,7 @@ class ReviewService:
     """
 
     def __init__(self, store: Path, reviewer: str = "") -> None:
-        """Open the store.
-
-        Args:
-            store: Its folder.
-            reviewer: Who reviews; the user's login name when empty.
+        """Open the store of a folder; an empty `reviewer` is the user's login name.
 
         Raises:
             DataError: There is no store, or its filter results or reviews are damaged.
