@@ -89,7 +89,9 @@ def make_tables(
         for table in filter(None, make() if name in chosen.tables else ()):
             of_planners = [] if name in _ABOUT_DATA else notes
             more = (n for n in of_planners if not any(n in other for other in table.notes))
-            named = _unused(table.name, out)
+            # the name is numbered where tables have it already
+            names = (table.name, *(f"{table.name}-{n}" for n in range(2, len(out) + 2)))
+            named = next(one for one in names if one not in {made.name for made in out})
             out.append(replace(table, name=named, notes=(*table.notes, *more)))
     return out
 
@@ -133,12 +135,6 @@ def _makers(
     }
 
 
-def _unused(name: str, tables: Sequence[Table]) -> str:
-    """The name, numbered where tables have it already."""
-    numbered = (name, *(f"{name}-{number + 2}" for number in range(len(tables))))
-    return next(one for one in numbered if one not in {table.name for table in tables})
-
-
 class Comparison:
     """Planners compared scenario by scenario, in pairs; printed as text.
 
@@ -165,21 +161,16 @@ class Comparison:
 
 
 def in_format(tables: Sequence[Table], format: str) -> Any:
-    """Tables as text in a format, or as a DataFrame."""
-    one_of("format", format, (*FORMATS, "pandas"))
-    if format == "pandas":
-        return to_pandas(tables)
-    return "\n\n".join(render(table, format) for table in tables)
+    """Tables as text in a format, or for `pandas` as one DataFrame with numbers in full.
 
-
-def to_pandas(tables: Sequence[Table]) -> Any:
-    """Tables as one DataFrame of pandas, with numbers in full; `attrs["notes"]` are the notes.
-
-    A column `table` tells several apart.
+    In that, `attrs["notes"]` are the notes, and a column `table` tells several tables apart.
 
     Raises:
         MissingExtraError: pandas is not installed.
     """
+    one_of("format", format, (*FORMATS, "pandas"))
+    if format != "pandas":
+        return "\n\n".join(render(table, format) for table in tables)
     pandas: Any = import_extra("pandas", "plots")
     frames = {}
     for table in tables:

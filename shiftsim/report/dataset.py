@@ -4,31 +4,21 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, TypeAlias
 
-from shiftsim.data.store.statistics import (
-    ALL,
-    COLUMNS,
-    PUBLISHED_SETS,
-    StoreStats,
-    store_stats,
-)
+from shiftsim.data.store.statistics import ALL, COLUMNS, PUBLISHED_SETS, StoreStats, store_stats
 from shiftsim.errors import DataError, one_of
 from shiftsim.report import palette
-from shiftsim.report.groups import DataSet, Group, distinct_sets
+from shiftsim.report.groups import Group, distinct_sets
 from shiftsim.report.palette import DEFAULT_FORM, SMALL, FigureFormat
 from shiftsim.report.paper import Published
 from shiftsim.report.tables import Number, Record, Row, Table, render
-from shiftsim.runs.results import Run
 from shiftsim.runs.scenarios import open_run_store
 
 _Bars: TypeAlias = list[tuple[float, dict[str, Any]]]
 FORMATS = ("text", "csv")
+_COLOURS = {f"{kind.name.lower()}s": colour for kind, colour in palette.AGENTS.items()}
 _MEANS = {  # headings of the means
-    "vehicles_t0": "vehicles t0",
-    "pedestrians_t0": "pedestrians t0",
-    "bicycles_t0": "bicycles t0",
-    "vehicles": "vehicles",
-    "pedestrians": "pedestrians",
-    "bicycles": "bicycles",
+    **{f"{kind}_t0": f"{kind} t0" for kind in _COLOURS},
+    **{kind: kind for kind in _COLOURS},
     "interactions": "close agents",
     "mean_speed_mps": "mean speed",
     "max_speed_mps": "max speed",
@@ -43,7 +33,6 @@ _NOTE = (
     "means per scenario; t0: present at iteration 0, else at any iteration; close agents: "
     "mean number near the ego's path within 3 s; at intersections: share of the scenarios; m, m/s"
 )
-_COLOURS = {f"{kind.name.lower()}s": colour for kind, colour in palette.AGENTS.items()}
 _OWN: dict[str, Any] = {"color": "#4a5560"}
 _PUBLISHED: dict[str, Any] = {"facecolor": "white", "edgecolor": "#4a5560", "hatch": "////"}
 _LINE, _SETS_HEIGHT = 0.4, 1.3  # inches: a city, the published sets
@@ -125,17 +114,11 @@ def stats_figure(
         bars += [(number, _PUBLISHED)] if number is not None else []
     hatched = " (hatched: published)" if any(sites) else ""
     _draw(panels[0], counts, "{:.0f}", f"scenarios{hatched}")
-    pale = [
-        [(row.get(kind, 0.0), {"color": c, "alpha": 0.45}) for kind, c in _COLOURS.items()]
-        for row in means
-    ]
-    full = [
-        [(row.get(f"{kind}_t0", 0.0), {"color": colour}) for kind, colour in _COLOURS.items()]
-        for row in means
-    ]
     label = "mean agents per scenario: at its\nstart (full), in all of it (pale)"
-    _draw(panels[1], pale, "{:.1f}", label)
-    _draw(panels[1], full, "", label)
+    for ending, alpha, form_of_values in (("", 0.45, "{:.1f}"), ("_t0", None, "")):
+        looks = {f"{kind}{ending}": {"color": c, "alpha": alpha} for kind, c in _COLOURS.items()}
+        rows = [[(row.get(name, 0.0), look) for name, look in looks.items()] for row in means]
+        _draw(panels[1], rows, form_of_values, label)
     handles = panels[1].containers[-len(_COLOURS) :]
     look = {"frameon": False, "fontsize": SMALL, "handlelength": 1.0, "columnspacing": 0.8}
     lower.legend(handles, _COLOURS, loc="outside upper center", ncols=3, **look)
@@ -168,16 +151,15 @@ def _draw(axes: Any, rows: Sequence[_Bars], form: str, label: str) -> None:
 def own_statistics(groups: Sequence[Group]) -> dict[str, StoreStats | str]:
     """Statistics of every data set by its label, or why there are none."""
     runs = {group.data.key: group.run for group in reversed(groups)}
-    return {data.label: _statistics(runs[data.key], data) for data in distinct_sets(groups)}
-
-
-def _statistics(run: Run, data: DataSet) -> StoreStats | str:
-    try:
-        store = open_run_store(run)
-        held = set(store.tokens)
-        return store_stats(store, [token for token in data.tokens if token in held])
-    except DataError as error:
-        return error.message
+    out: dict[str, StoreStats | str] = {}
+    for data in distinct_sets(groups):
+        try:
+            store = open_run_store(runs[data.key])
+            held = set(store.tokens)
+            out[data.label] = store_stats(store, [name for name in data.tokens if name in held])
+        except DataError as error:
+            out[data.label] = error.message
+    return out
 
 
 def data_statistics(found: Mapping[str, StoreStats | str]) -> Table | None:
@@ -199,9 +181,16 @@ def benchmark_comparison(
 ) -> Table:
     """The paper's comparison of benchmarks, with own sets beside; `edited` are those of edits."""
     own = {label: stats for label, stats in found.items() if isinstance(stats, StoreStats)}
-    columns = [_properties(stats, label in edited) for label, stats in own.items()]
+    columns: dict[str, dict[str, str]] = {}
+    for label, groups in ((label, stats.groups("city")) for label, stats in own.items()):
+        columns[label] = {
+            "semantic shift": "scenario" if label in edited else "–",
+            "scenario count": f"{groups[ALL]['scenarios']:.0f}",
+            "geographic coverage": ", ".join(city for city in groups if city != ALL),
+            "interaction density": f"{groups[ALL].get('interactions', math.nan):.1f}",
+        }
     rows = [
-        (name, *values, *(column.get(name, "–") for column in columns))
+        (name, *values, *(column.get(name, "–") for column in columns.values()))
         for name, values in published.comparison.items()
     ]
     notes = (
@@ -214,13 +203,3 @@ def benchmark_comparison(
     header = ("property", *published.sets, *labels)
     title = "Benchmarks compared"
     return Table("benchmark-comparison", title, header, rows, len(header), notes)
-
-
-def _properties(stats: StoreStats, is_edited: bool) -> dict[str, str]:
-    groups = stats.groups("city")
-    return {
-        "semantic shift": "scenario" if is_edited else "–",
-        "scenario count": f"{groups[ALL]['scenarios']:.0f}",
-        "geographic coverage": ", ".join(city for city in groups if city != ALL),
-        "interaction density": f"{groups[ALL].get('interactions', math.nan):.1f}",
-    }

@@ -9,20 +9,11 @@ import pyarrow.compute as pc
 from shiftsim.edits.sampling import GRADES, graded
 from shiftsim.kernels import FloatArray
 from shiftsim.metrics import MULTIPLIERS, navsim_rollouts, open_loop
+from shiftsim.report import statistics
 from shiftsim.report.groups import COLUMNS, Group, by_set, distinct_sets, planner_identities
-from shiftsim.report.statistics import (
-    FEW_CLUSTERS,
-    Comparison,
-    bootstrap_interval,
-    cluster_codes,
-    compare,
-    forest,
-    holm,
-    score_interval,
-)
+from shiftsim.report.statistics import FEW_CLUSTERS, Comparison, score_interval
 from shiftsim.report.tables import Cell, Interval, Number, Record, Row, Table
 from shiftsim.report.words import REASONS, noise_order
-from shiftsim.runs.results import Run
 
 ALL_KINDS = "all"
 _BORNE = 5.0  # points of the score that a planner may lose to what it is said to bear
@@ -98,7 +89,7 @@ def _findings(clean: Sequence[Group], noisy: Sequence[Group], heads: Sequence[st
             lead += f"; {second.planner} follows, {_score(first) - _score(second):.2f} behind"
         if second and second.seeds == first.seeds:  # these two are the first pair
             alike = [group for group in clean if group.seeds == first.seeds]
-            p = holm([one.p_value for one in _compared(alike)[1]])[0]
+            p = statistics.holm([one.p_value for one in _compared(alike)[1]])[0]
             sign = "significant" if p < _SIGNIFICANT else "not significant"
             lead += f", which is {sign} (p = {p:.2g}, Holm)"
         said.append(f"{lead}.")
@@ -140,11 +131,9 @@ def planner_comparison(groups: Sequence[Group], *, noisy: bool = False) -> Table
         "95 % CI: cluster bootstrap over recordings; p: the sign of each recording's difference "
         "flipped at random; Holm: corrected for all pairs of the same set, traffic and noise",
     ]
-    records, results = list[Record](), list[Comparison]()
-    for block in pairs:
-        found = _compared(block)
-        records += found[0]
-        results += found[1]
+    found = [*map(_compared, pairs)]
+    records = [record for each, _ in found for record in each]
+    results = [result for _, each in found for result in each]
     few = min(block[0].data.num_recordings for block in pairs)
     if few < FEW_CLUSTERS:
         notes.append(
@@ -155,25 +144,22 @@ def planner_comparison(groups: Sequence[Group], *, noisy: bool = False) -> Table
         words = "not compared, as rollouts are missing or no other planner has the same seeds"
         names = (f"{group.planner} {group.noise} {group.traffic}" for group in alone)
         notes.append(f"{words}: {', '.join(names)}")
-    return Table.of(
-        "planner-comparison-noise" if noisy else "planner-comparison",
-        f"Planners compared scenario by scenario{', under noise' if noisy else ', clean'}: "
-        "difference of closed-loop scores × 100, first minus second",
-        records,
-        5,
-        notes=notes,
-        drawn=("difference", forest(results)),
+    title = (
+        f"Planners compared scenario by scenario, {'under noise' if noisy else 'clean'}: "
+        "difference of closed-loop scores × 100, first minus second"
     )
+    name = f"planner-comparison{'-noise' if noisy else ''}"
+    drawn = ("difference", statistics.forest(results))
+    return Table.of(name, title, records, 5, notes=notes, drawn=drawn)
 
 
 def _compared(block: Sequence[Group]) -> tuple[list[Record], list[Comparison]]:
     """A record per pair of groups, and what it was made of."""
-    clusters = cluster_codes(block[0].data.recordings)
+    clusters = statistics.cluster_codes(block[0].data.recordings)
     pairs = [*combinations(block, 2)]
-    results = [
-        compare(100.0 * a.scenario_means(), 100.0 * b.scenario_means(), clusters) for a, b in pairs
-    ]
-    corrected = holm([result.p_value for result in results])
+    scores = ((100.0 * a.scenario_means(), 100.0 * b.scenario_means()) for a, b in pairs)
+    results = [statistics.compare(*both, clusters) for both in scores]
+    corrected = statistics.holm([result.p_value for result in results])
     records: list[Record] = [
         {
             **{"set": first.data.label, "traffic": first.traffic, "noise": first.noise},
@@ -259,7 +245,8 @@ def recorded_score(group: Group, others: Sequence[Group]) -> tuple[Number | None
         if bases and is_alike and set(bases) <= set(place):
             values = 100.0 * other.scenario_means()[[place[token] for token in bases]]
             if np.isfinite(values).all():
-                interval = bootstrap_interval(values, cluster_codes(group.data.recordings))
+                clusters = statistics.cluster_codes(group.data.recordings)
+                interval = statistics.bootstrap_interval(values, clusters)
                 return Number(float(values.mean())), interval
     return None, None
 
@@ -355,27 +342,18 @@ def open_loop_scores(groups: Sequence[Group]) -> Table | None:
 
 def open_loop_values(group: Group, metric: str) -> FloatArray:
     """(N,) an open-loop metric's mean over the seeds of every scenario; NaN where there is none."""
-    table = group.run.metrics
-    chosen = {"planner": group.name, "noise": group.noise, "metric": metric}
-    for name, value in chosen.items():
-        table = table.filter(pc.equal(table[name], value))
-    means = table.group_by("token").aggregate([("value", "mean")])
-    found = dict(zip(means["token"].to_pylist(), means["value_mean"].to_pylist(), strict=True))
-    values = (found.get(token) for token in group.data.tokens)
-    return np.array([np.nan if value is None else value for value in values])
+    metrics = group.metrics
+    mine = metrics.filter(pc.equal(metrics["metric"], metric))
+    means = mine.group_by("token").aggregate([("value", "mean")])
+    found = {row["token"]: row["value_mean"] for row in means.to_pylist()}
+    return np.array([found.get(token) for token in group.data.tokens], np.float64)
 
 
 def _open_loop_record(group: Group) -> Record:
-    metrics = group.run.metrics
-    mine = pc.and_(
-        pc.equal(metrics["planner"], group.name), pc.equal(metrics["noise"], group.noise)
-    )
-    found = metrics.filter(mine).group_by("metric").aggregate([("value", "sum"), ("value", "mean")])
-    sums, means = (
-        dict(zip(found["metric"].to_pylist(), found[f"value_{of}"].to_pylist(), strict=True))
-        for of in ("sum", "mean")
-    )
-    plans = metrics.filter(pc.and_(mine, pc.equal(metrics["metric"], open_loop.COUNT)))
+    metrics = group.metrics
+    found = metrics.group_by("metric").aggregate([("value", "sum"), ("value", "mean")]).to_pylist()
+    sums, means = ({row["metric"]: row[f"value_{of}"] for row in found} for of in ("sum", "mean"))
+    plans = metrics.filter(pc.equal(metrics["metric"], open_loop.COUNT))
     counted, there = sums.get(open_loop.COUNT), pc.sum(plans["threshold"]).as_py()
 
     def mean(name: str, scale: float = 1.0) -> Number | None:
@@ -418,23 +396,23 @@ def navsim_scores(groups: Sequence[Group]) -> Table | None:
 
 def _metric_means(group: Group) -> dict[str, float]:
     """Means over the rollouts of a group, by metric; NaN is left out."""
-    metrics = group.run.metrics
-    mine = pc.and_(
-        pc.equal(metrics["planner"], group.name), pc.equal(metrics["noise"], group.noise)
-    )
-    found = metrics.filter(mine).group_by("metric").aggregate([("value", "mean")])
+    found = group.metrics.group_by("metric").aggregate([("value", "mean")])
     return dict(zip(found["metric"].to_pylist(), found["value_mean"].to_pylist(), strict=True))
 
 
 def planning_times(groups: Sequence[Group]) -> Table:
     """How long planners think, and how often the simulator's fallback plan had to do."""
     each = {(group.run.path, group.planner): group for group in groups}
-    runs = {group.run.path: group.run for group in groups}
+    machines = []
+    for group in groups:
+        manifest = {"workers": "?", "machine": {}} | group.run.manifest
+        processor, cores = (manifest["machine"].get(name, "?") for name in ("processor", "cores"))
+        machines.append(f"machine: {processor}, {cores} cores, {manifest['workers']} workers")
     notes = (
         "per step: mean and 95th percentile within a rollout, of both the median over the "
         "rollouts, which compilation at the start of a run does not touch; per rollout: the "
         "median of reading, driving and scoring",
-        *dict.fromkeys(f"machine: {_machine(run)}" for run in runs.values()),
+        *dict.fromkeys(machines),
     )
     title = "Planning time, and steps driven on a degraded (fallback) plan"
     records = [*map(_times_record, each.values())]
@@ -467,9 +445,3 @@ def _times_record(group: Group) -> Record:
         "degraded steps": Number(int(degraded.sum()), 0),
         "in rollouts": Number(int(np.sum(degraded > 0)), 0),
     }
-
-
-def _machine(run: Run) -> str:
-    machine = run.manifest.get("machine", {})
-    workers = run.manifest.get("workers", "?")
-    return f"{machine.get('processor', '?')}, {machine.get('cores', '?')} cores, {workers} workers"

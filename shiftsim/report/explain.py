@@ -33,9 +33,8 @@ def select_tasks(
     Raises:
         ConfigError: There is no such task, or several scenarios begin like that.
     """
-    full = beginning(
-        f"run {run.path.name!r}", "scenario", token, set(run.tasks["token"].to_pylist())
-    )
+    tokens = set(run.tasks["token"].to_pylist())
+    full = beginning(f"run {run.path.name!r}", "scenario", token, tokens)
     wanted = {"planner": planner, "noise": noise, "seed": seed}
     given = {name: value for name, value in wanted.items() if value is not None}
     of_token = run.tasks.filter(pc.equal(run.tasks["token"], full)).to_pylist()
@@ -167,19 +166,17 @@ def explain_lines(task: dict[str, Any]) -> list[str]:
 
 
 def _metric_line(row: dict[str, Any]) -> str:
-    name, unit = row["metric"], UNITS.get(row["unit"], row["unit"])
+    metric, unit = row["metric"], UNITS.get(row["unit"], row["unit"])
     unit = f" {unit}" if unit else ""
     role = {"multiplier": "×", "weighted": "+"}.get(row["role"], " ")
     weight = "" if row["weight"] is None else f"weight {row['weight']:g}"
     score = "–" if row["score"] is None else f"{100.0 * row['score']:.2f}"
-    parts = [f"{role} {in_words(name):29} {score:>6}", f"{weight:8}"]
-    if row["value"] is not None:
-        parts.append(f"value {row['value']:.4g}{unit}")
-    if row["threshold"] is not None:
-        parts.append(f"threshold {row['threshold']:.4g}{unit}")
+    parts = [f"{role} {in_words(metric):29} {score:>6}", f"{weight:8}"]
+    known = (name for name in ("value", "threshold") if row[name] is not None)
+    parts += [f"{name} {row[name]:.4g}{unit}" for name in known]
     if row["first_violation_iteration"] is not None:
         value = f"{row['first_violation_value']:.4g}{unit}"
-        if name == COLLISIONS:  # its value counts collisions, that of a violation is a speed
+        if metric == COLLISIONS:  # its value counts collisions, that of a violation is a speed
             value = f"delta-v {value} m/s"
         parts.append(f"first violated at {row['first_violation_s']:.1f} s: {value}{_partner(row)}")
     return "  ".join(parts).rstrip()

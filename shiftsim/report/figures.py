@@ -181,9 +181,7 @@ def open_against_closed(groups: Sequence[Group], *, form: FigureFormat = DEFAULT
 
 
 def _scatter(
-    axes: Any,
-    points: Sequence[tuple[Group, FloatArray, FloatArray]],
-    styles: Mapping[str, Style],
+    axes: Any, points: Sequence[tuple[Group, FloatArray, FloatArray]], styles: Mapping[str, Style]
 ) -> None:
     """(N,) values of scenarios by group, and the means of the groups where there are several."""
     means = []
@@ -404,18 +402,14 @@ def _finish_axes(axes: Any, title: str, label: str = "closed-loop score") -> Non
     axes.tick_params(labelsize=SMALL)
 
 
-def _sample(noise: str) -> Any:
-    """What lines of clean or disturbed rollouts look like, for a legend."""
-    from matplotlib.lines import Line2D
-
-    return Line2D([], [], linestyle=dashes(noise), **Style(_GREY, "o").marks(noise))
-
-
 def _finish(figure: Any, title: str, notes: str, form: FigureFormat, samples: Any = None) -> None:
     """Legend, title and what stands beside every score; `samples` are noises by their label."""
+    from matplotlib.lines import Line2D
+
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    handles += [*map(_sample, (samples or {}).values())]
-    labels += samples or {}
+    for label, noise in (samples or {}).items():
+        labels.append(label)
+        handles.append(Line2D([], [], linestyle=dashes(noise), **Style(_GREY, "o").marks(noise)))
     look = {"loc": "outside upper center", "frameon": False, "fontsize": SMALL, "handlelength": 3.2}
     for columns in range(min(4, max(1, len(labels))), 0, -1):  # as many as fit
         legend = figure.legend(handles, labels, ncols=columns, **look)

@@ -137,6 +137,12 @@ class Group:
         """What weights of our own are called that the planner drove with; else empty."""
         return str(planner_identities(self.run).get(self.name, {}).get("weights") or "")
 
+    @property
+    def metrics(self) -> pa.Table:
+        """The rows of the run's `metrics.parquet` that are of this planner and noise."""
+        table = self.run.metrics
+        return table.filter(_matching(table, self.name, self.noise))
+
     def only(self, where: BoolArray) -> "Group":
         """The rollouts of some (N,) of the scenarios."""
         return replace(self, data=self.data.only(where), values=self.values[:, where])
@@ -204,16 +210,16 @@ def by_set(groups: Iterable[Group]) -> list[tuple[DataSet, list[Group]]]:
     found: dict[tuple[str, ...], list[Group]] = {}
     for group in groups:
         found.setdefault(group.data.key, []).append(group)
-    return [(mine[0].data, sorted(mine, key=_traffic_rank)) for mine in found.values()]
+    modes = [*TRAFFIC.values()]
+    return [
+        (mine[0].data, sorted(mine, key=lambda group: (group.traffic not in modes, group.traffic)))
+        for mine in found.values()
+    ]
 
 
 def distinct_sets(groups: Iterable[Group]) -> list[DataSet]:
     """The data sets of groups, each once."""
     return [data for data, _ in by_set(groups)]
-
-
-def _traffic_rank(group: Group) -> tuple[bool, str]:
-    return (group.traffic not in TRAFFIC.values(), group.traffic)
 
 
 def read_groups(
@@ -235,20 +241,14 @@ def read_groups(
     labels = {name: _planner_labels(mine) for name, mine in by_name.items()}
     seen: dict[tuple[object, ...], Group] = {}
     for group in found:
-        named = replace(
-            group, planner=labels[group.name][group.run.path], allow_partial=allow_partial
-        )
+        label = labels[group.name][group.run.path]
+        named = replace(group, planner=label, allow_partial=allow_partial)
         seen.setdefault((group.data.key, group.traffic, named.planner, group.noise), named)
-    return _labelled_apart(list(seen.values()))
-
-
-def _labelled_apart(groups: list[Group]) -> list[Group]:
-    """The same groups; sets of one label say what tells them apart, such as their thresholds."""
     kinds: dict[str, list[tuple[str, ...]]] = {}
-    for group in groups:
+    for group in seen.values():
         kinds.setdefault(group.data.label, []).append(group.data.traits)
     out = []
-    for group in groups:
+    for group in seen.values():  # sets of one label say what tells them apart
         values = zip(group.data.traits, zip(*kinds[group.data.label], strict=True), strict=True)
         differing = [value for value, all_values in values if len(set(all_values)) > 1]
         label = ", ".join([group.data.label, *differing])
@@ -257,11 +257,7 @@ def _labelled_apart(groups: list[Group]) -> list[Group]:
 
 
 def _planner_labels(groups: Sequence[Group]) -> dict[Path, str]:
-    """What groups of one name are called, by run: what tells them apart stands behind the name.
-
-    Raises:
-        DataError: Groups contradict each other, and nothing tells them apart.
-    """
+    """What groups of one name are called, by run: what tells them apart stands behind the name."""
     facts = {group.run.path: _planner_facts(group) for group in groups}
     if _contradiction(groups, facts):  # then the way in which they were run tells them apart
         facts = {group.run.path: facts[group.run.path] | _run_facts(group.run) for group in groups}
@@ -292,12 +288,11 @@ def _planner_labels(groups: Sequence[Group]) -> dict[Path, str]:
 def _planner_facts(group: Group) -> dict[str, Any]:
     """What identifies a planner; what people can read of it has a name."""
     determining, config = (group.run.manifest[part] for part in ("determining", "config"))
-    identity = determining["planners"].get(group.name)
-    out: dict[str, Any] = {"": (identity, determining.get("code"))}
-    if isinstance(identity, dict):
-        out |= {k: PurePath(str(v)).name for k, v in identity.get("arguments", {}).items()}
-        out |= {"batch size": identity["batch_size"]} if "batch_size" in identity else {}
-    if isinstance(identity, dict) and "checkpoint" in identity:
+    identity = planner_identities(group.run).get(group.name, {})
+    out: dict[str, Any] = {"": (determining["planners"].get(group.name), determining.get("code"))}
+    out |= {k: PurePath(str(v)).name for k, v in identity.get("arguments", {}).items()}
+    out |= {"batch size": identity["batch_size"]} if "batch_size" in identity else {}
+    if "checkpoint" in identity:
         others = {*config["planners"]} - {group.name}
         given = [t for t in config.get("checkpoints", ()) if t.partition("=")[0] not in others]
         given += [config.get("planner_args", {}).get(group.name, {}).get("checkpoint")]

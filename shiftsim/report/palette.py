@@ -12,6 +12,7 @@ Markers tell planners apart without any colour.
 import re
 from collections.abc import Callable, Iterable
 from functools import wraps
+from itertools import cycle
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar
 
@@ -176,11 +177,8 @@ def planner_styles(planners: Iterable[str]) -> dict[str, Style]:
     A name may end in a remark, as in `idm (reactive)`; the first of these has the planner's style.
     """
     out: dict[str, Style] = {}
-    others = 0
+    others = cycle(_OTHERS)
     for name in dict.fromkeys(planners):
         style = _KNOWN.get(name.partition(" (")[0])
-        if style is None or style in out.values():
-            style = _OTHERS[others % len(_OTHERS)]
-            others += 1
-        out[name] = style
+        out[name] = next(others) if style is None or style in out.values() else style
     return out

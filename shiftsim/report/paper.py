@@ -3,14 +3,13 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import methodcaller
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from shiftsim.report.groups import COLUMNS, DataSet, Group, by_set, distinct_sets
 from shiftsim.report.statistics import FEW_CLUSTERS, score_interval
 from shiftsim.report.tables import Cell, Number, Row, Table
-from shiftsim.report.words import LONG, NAMES
+from shiftsim.report.words import LONG, NAMES, noise_order
 from shiftsim.sim.noise import NOISE_NAMES
-from shiftsim.sim.perception import drift_order
 
 VAL14 = "val14"
 INTERVALS = (
@@ -83,8 +82,17 @@ def semantic_shift(
     for data, mine in others or val14:
         columns = _columns(data, val14 if others else [], published)
         compared = [one.rules for one, _ in val14] if others else []
-        notes = [data.rules, *compared, INTERVALS, *_set_notes(data, published)]
+        notes = [data.rules, *compared, INTERVALS]
         paper = published if published and _is_paper_like(data, published) else None
+        if data.num_recordings < FEW_CLUSTERS:
+            notes.append(f"few recordings ({data.num_recordings}): intervals are too narrow")
+        if paper and data.known != VAL14:
+            notes.append(
+                f"own list of {len(data.tokens)} scenarios, not the paper's: the authors' list of "
+                f"{paper.comparison['scenario count'][-1]} is unpublished"
+            )
+        elif published and data.known != VAL14:
+            notes.append("not a set of the published benchmark")
         if with_published and paper:
             notes.append(f"{PUBLISHED[1:-1]}: {paper.source}")
         rows = _semantic_rows(mine, columns, paper if with_published else None)
@@ -161,21 +169,6 @@ def _published_row(
     return (traffic, f"{planner} {PUBLISHED}", *cells)
 
 
-def _set_notes(data: DataSet, published: Published | None) -> list[str]:
-    """What a reader must know of a set: few recordings, or that it is not the paper's."""
-    notes = []
-    if data.num_recordings < FEW_CLUSTERS:
-        notes.append(f"few recordings ({data.num_recordings}): intervals are too narrow")
-    if published and data.known != VAL14 and not _is_paper_like(data, published):
-        notes.append("not a set of the published benchmark")
-    elif published and data.known != VAL14:
-        notes.append(
-            f"own list of {len(data.tokens)} scenarios, not the paper's: the authors' list of "
-            f"{published.comparison['scenario count'][-1]} is unpublished"
-        )
-    return notes
-
-
 def published_semantic(published: Published) -> Table:
     """The paper's own table."""
     sites = (name for name in published.columns if name not in LONG)
@@ -189,8 +182,8 @@ def published_semantic(published: Published) -> Table:
     header = ("traffic", "planner", *(column.heading for column in columns))
     notes = (published.source, "Val14 thresholds nuplan, DeepPlan thresholds deepplan")
     title = "Zero-shot generalization as published, scores × 100"
-    more: dict[str, Any] = {"words": _words(published), "best": dict.fromkeys(header[2:], max)}
-    return Table("semantic-shift_published", title, header, rows, 2, notes, **more)
+    words, best = _words(published), dict.fromkeys(header[2:], max)
+    return Table("semantic-shift_published", title, header, rows, 2, notes, words=words, best=best)
 
 
 def _words(published: Published | None) -> dict[str, str]:
@@ -204,38 +197,29 @@ def noise_robustness(groups: Sequence[Group], published: Published | None = None
     found = {group.noise for group in groups}
     if found <= {"none"}:
         return None
-    noises = drift_order(found if published is None else found | {*NOISE_NAMES})
+    noises = noise_order([*found, *(NOISE_NAMES if published else ())])
     scores: dict[tuple[str, ...], dict[str, Cell]] = {}
     for data, mine in by_set(groups):
         for group in mine:
             row = scores.setdefault((data.label, group.traffic, group.planner), {})
             row[group.noise] = group.estimate()
-    notes = [*(data.rules for data in distinct_sets(groups)), _seeds_note(groups)]
+    counts = sorted({len(group.seeds) for group in groups if group.noise != "none"})
+    seeds = f"the mean over {' or '.join(map(str, counts))} seeds; clean has none"
+    deviation = f"± sample standard deviation (n − 1) of {seeds}"
+    notes = [data.rules for data in distinct_sets(groups)]
+    notes.append("one seed: no deviation" if counts == [1] else deviation)
     if published is not None:
-        scores |= _published_robustness(published)
         notes.append(f"published: {published.source}")
+        scores |= {
+            (f"{_SETS[name]} {PUBLISHED}", traffic, planner): {
+                noise: Number(mean, std=std[0] if std else None)
+                for noise, (mean, *std) in zip(published.noises, values, strict=True)
+            }
+            for traffic, sets in published.robustness.items()
+            for name, planners in sets.items()
+            for planner, values in planners.items()
+        }
     rows = [(*labels, *map(row.get, noises)) for labels, row in scores.items()]
     header = ("set", "traffic", "planner", *noises)
     title, best = "Noise robustness: closed-loop score × 100", dict.fromkeys(noises, max)
     return Table("noise-robustness", title, header, rows, 3, notes, best=best)
-
-
-def _seeds_note(groups: Sequence[Group]) -> str:
-    counts = sorted({len(group.seeds) for group in groups if group.noise != "none"})
-    seeds = " or ".join(map(str, counts))
-    if counts == [1]:
-        return "one seed: no deviation"
-    return f"± sample standard deviation (n − 1) of the mean over {seeds} seeds; clean has none"
-
-
-def _published_robustness(published: Published) -> dict[tuple[str, ...], dict[str, Cell]]:
-    """The paper's scores by noise, of every set, traffic mode and planner."""
-    return {
-        (f"{_SETS[name]} {PUBLISHED}", traffic, planner): {
-            noise: Number(mean, std=std[0] if std else None)
-            for noise, (mean, *std) in zip(published.noises, values, strict=True)
-        }
-        for traffic, sets in published.robustness.items()
-        for name, planners in sets.items()
-        for planner, values in planners.items()
-    }

@@ -5,30 +5,16 @@ metric without a score counts as 0. With several seeds it is the mean of the see
 are printed times 100. Where tasks failed or are missing no score is printed, or one that says so.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pyarrow.compute as pc
 
-from shiftsim.report.groups import (
-    COLUMNS,
-    Group,
-    planner_identities,
-    read_groups,
-    seed_deviation,
-)
+from shiftsim.report import words
+from shiftsim.report.groups import COLUMNS, Group, planner_identities, read_groups, seed_deviation
 from shiftsim.report.tables import Cell, Number, Row, Table, text
-from shiftsim.report.words import (
-    Violation,
-    rows_by_task,
-    severity,
-    task_of,
-    violations,
-    worst_of,
-    worst_violation,
-)
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
 
@@ -73,9 +59,8 @@ def scores(groups: Sequence[Group], *, by: str | None = None) -> Table:
     return Table("scores", title, header, rows, len(heading), notes, **more)
 
 
-def planner_notes(runs: Iterable[Run]) -> list[str]:
+def planner_notes(runs: Sequence[Run]) -> list[str]:
     """What a reader must know of planners: their weights, who saw the recording, who drove."""
-    runs = list(runs)
     found = [pair for run in runs for pair in planner_identities(run).items()]
     made_up = {n for n, one in found if str(one.get("checkpoint")).startswith("deterministic:")}
     own = {f"{n}, {one['weights']}" for n, one in found if one.get("weights")}
@@ -139,24 +124,23 @@ def worst_rollouts(run: Run, count: int = 10) -> list[dict[str, Any]]:
     scores = run.scores.select([*keys, "cls", "log_name"]).join(lowest, "token")
     scores = scores.filter(pc.equal(scores["cls"], scores["cls_min"]))
     below = run.metrics.filter(pc.less(run.metrics["score"], 1.0))
-    metrics = rows_by_task(below.join(scores.select(keys), keys, join_type="left semi"))
+    metrics = words.rows_by_task(below.join(scores.select(keys), keys, join_type="left semi"))
     rows = []
     for row in scores.to_pylist():
-        cause = worst_violation(violations(metrics.get(task_of(row), [])))
+        cause = words.worst_violation(words.violations(metrics.get(words.task_of(row), [])))
         known = {"cause": "", "severity": (), "reason": "", "log": row["log_name"]}
         if cause is not None:
-            known |= {"cause": cause.reason, "severity": severity(cause), "reason": _words(cause)}
+            # one that does not multiply the score stands with its own, times 100
+            score = "" if cause.is_multiplier else f" {100.0 * cause.row['score']:.2f}"
+            time = "" if cause.time is None else f" {cause.time:.1f} s"
+            known |= {"cause": cause.reason, "severity": words.severity(cause)}
+            known |= {"reason": f"{cause.reason}{score}{time}"}
         rows.append(row | known)
     return [
-        {**task_of(row)._asdict(), "cls": row["cls"], "reason": row["reason"], "others": others}
-        for row, others in worst_of(rows, count)
+        words.task_of(row)._asdict()
+        | {"cls": row["cls"], "reason": row["reason"], "others": others}
+        for row, others in words.worst_of(rows, count)
     ]
-
-
-def _words(cause: Violation) -> str:
-    """A violation with its time; one that does not multiply the score with its own, times 100."""
-    score = "" if cause.is_multiplier else f" {100.0 * cause.row['score']:.2f}"
-    return f"{cause.reason}{score}{'' if cause.time is None else f' {cause.time:.1f} s'}"
 
 
 def summary(run: Run) -> dict[str, Any]:
@@ -198,5 +182,4 @@ def failures(run: Run) -> list[dict[str, Any]]:
     """Tasks that failed or are missing: key, status, error and hint."""
     names = [*Task._fields, "status", "error", "hint"]
     failed = run.tasks.filter(pc.not_equal(run.tasks["status"], "ok"))
-    rows: list[dict[str, Any]] = failed.select(names).to_pylist()
-    return rows
+    return list(failed.select(names).to_pylist())

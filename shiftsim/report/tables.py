@@ -4,7 +4,7 @@ import csv
 import html
 import io
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from textwrap import wrap
@@ -128,7 +128,7 @@ def text(table: Table, width: int = 0, mark: Callable[[str], str] = str) -> str:
 
     `mark` changes the look, not the width, of the best numbers of each setting.
     """
-    columns, best = [], _best_of_planners(table) if mark is not str else ()
+    columns, best = [], _best(table) if mark is not str else ()
     for index, cells in enumerate(zip(*table.lines, strict=True)):
         side, size = "<" if index < table.num_labels else ">", max(map(len, cells))
         padded = [f"{cell:{side}{size}}" for cell in cells]
@@ -185,7 +185,10 @@ def _csv(table: Table) -> str:
         parts = [_parts(row[index]) for row in table.rows]
         endings = dict.fromkeys(chain(*parts)) or [""]
         columns += [[f"{name}{end}", *(each.get(end, "") for each in parts)] for end in endings]
-    labels = [_labels(row, table.header) for row in table.rows]
+    labels = [
+        "; ".join(f"{n} {c.label}" for n, c in named if isinstance(c, Number) and c.label)
+        for named in (zip(table.header, row, strict=True) for row in table.rows)
+    ]
     if any(labels):
         columns.append(["label", *labels])
     if table.notes:
@@ -198,11 +201,6 @@ def _csv(table: Table) -> str:
 def _parts(cell: Cell) -> dict[str, str]:
     """What CSV holds of a cell, by the ending of the column's name."""
     return {"": cell} if isinstance(cell, str) else {} if cell is None else cell.parts
-
-
-def _labels(row: Row, header: Sequence[str]) -> str:
-    named = zip(header, row, strict=True)
-    return "; ".join(f"{n} {c.label}" for n, c in named if isinstance(c, Number) and c.label)
 
 
 _TEXT = "backslash asciitilde asciicircum less greater bar".split()
@@ -226,7 +224,7 @@ def _latex(table: Table) -> str:
     """A float for a paper of two columns; the best numbers are bold, notes stand below."""
     table = _for_paper(table)
     settings = [row[: table.num_labels - 1] if table.best else () for row in table.rows]
-    bold = _best(table, settings)
+    bold = _best(table)
     body, before = list[str](), None
     for number, (row, setting) in enumerate(zip(table.rows, settings, strict=True)):
         cells = [_latex_cell(cell, is_bold=(number, i) in bold) for i, cell in enumerate(row)]
@@ -239,7 +237,10 @@ def _latex(table: Table) -> str:
     columns = [*zip(*table.lines, strict=True)]
     sides = "".join("l" if i < table.num_labels else "r" for i in range(len(columns)))
     heads = [_stacked(name, cells) for name, *cells in columns]
-    names = [_latex_heading(head, side) for head, side in zip(heads, sides, strict=True)]
+    names = []
+    for head, side in zip(heads, sides, strict=True):
+        name = r" \\ ".join(map(_latex_cell, head))
+        names.append(f"\\shortstack[{side}]{{{name}}}" if len(head) > 1 else name)
     # a subscript is about as wide as its text would be without blanks
     sizes = [
         max(map(len, (*head, *(cell.replace(" ± ", "±") for cell in cells))))
@@ -256,7 +257,7 @@ def _for_paper(table: Table) -> Table:
     planner, stand together.
     """
     table = table.paper or table
-    shared = _shared(table)
+    shared, said = _shared(table)
     names = list(enumerate(table.header))
     kept = [i for i, name in names[: table.num_labels] if name not in shared]
     if table.best:
@@ -269,7 +270,7 @@ def _for_paper(table: Table) -> Table:
     left_out = {name for i, name in names if i not in (*kept, *measured)}
     return replace(
         table,
-        title="; ".join(filter(None, (table.title, _said(table, shared)))),
+        title="; ".join(filter(None, (table.title, said))),
         header=[table.header[i] for i in (*kept, *measured)],
         rows=rows,
         num_labels=len(kept),
@@ -278,20 +279,27 @@ def _for_paper(table: Table) -> Table:
     )
 
 
-def _shared(table: Table) -> dict[str, str]:
-    """Settings among the labels that are the same in all rows, with their value."""
+def _shared(table: Table) -> tuple[Collection[str], str]:
+    """Settings among the labels that all rows share; in words, those that the title lacks."""
     columns = {name: {row[i] for row in table.rows} for i, name in enumerate(table.header)}
     labels = [name for name in table.header[: table.num_labels] if name in _SETTINGS]
-    return {name: shown(*columns[name]) for name in labels if len(columns[name]) == 1}
+    shared = {name: shown(*columns[name]) for name in labels if len(columns[name]) == 1}
+    said = (f"{name} {value}" for name, value in shared.items() if value not in table.title)
+    return shared, ", ".join(said)
 
 
-def _said(table: Table, shared: Mapping[str, str]) -> str:
-    """Shared settings in words, those that the title does not say."""
-    return ", ".join(f"{name} {of}" for name, of in shared.items() if of not in table.title)
+def _best(table: Table) -> set[tuple[int, int]]:
+    """Row and column of the best numbers of planners by setting, as printed, if any is worse.
 
-
-def _best(table: Table, settings: Sequence[Row]) -> set[tuple[int, int]]:
-    """Row and column of the best numbers under each setting, as printed, if any is worse."""
+    Rows below that of a planner, such as deviations, are compared with nothing.
+    """
+    if "planner" not in table.header:
+        return set()
+    planner, labels = list(table.header).index("planner"), range(table.num_labels)
+    settings: list[Row] = [
+        tuple(row[i] for i in labels if i != planner) if row[planner] else (str(number),)
+        for number, row in enumerate(table.rows)
+    ]
     out = set()
     for setting in dict.fromkeys(settings):
         for name, choose in table.best.items():
@@ -308,20 +316,6 @@ def _best(table: Table, settings: Sequence[Row]) -> set[tuple[int, int]]:
                 best = choose(numbers.values())
                 out |= {place for place, value in numbers.items() if value == best}
     return out
-
-
-def _best_of_planners(table: Table) -> set[tuple[int, int]]:
-    """Row and column of the best numbers of a table as people read it."""
-    best = table.best or (table.paper.best if table.paper else {})
-    if not best or "planner" not in table.header:
-        return set()
-    planner, labels = list(table.header).index("planner"), range(table.num_labels)
-    # rows below that of a planner, such as deviations, have a setting of their own
-    settings: list[Row] = [
-        tuple(row[i] for i in labels if i != planner) if row[planner] else (str(number),)
-        for number, row in enumerate(table.rows)
-    ]
-    return _best(replace(table, best=best), settings)
 
 
 def _float(table: Table, tabular: Sequence[str], sizes: Sequence[int]) -> str:
@@ -365,13 +359,6 @@ def _latex_cell(cell: Cell, *, is_bold: bool = False) -> str:
     return f"{{{text}}}" if text.startswith("[") else text
 
 
-def _latex_heading(lines: Sequence[str], side: str) -> str:
-    """A heading of one line or of several; `side` is where its column is aligned."""
-    cells = [_latex_cell(line) for line in lines]
-    text = r" \\ ".join(cells)
-    return f"\\shortstack[{side}]{{{text}}}" if len(cells) > 1 else text
-
-
 def _stacked(name: str, cells: Sequence[str]) -> list[str]:
     """The lines of a heading that is not much wider than its column."""
     words = name.split()
@@ -398,17 +385,10 @@ def _html(table: Table) -> str:
     The planner comes first, the best numbers of each setting are bold, and settings that all rows
     share stand above the table.
     """
-    shared, names = _shared(table), table.header
+    (shared, said), names = _shared(table), table.header
     places = [i for i, name in enumerate(names) if i >= table.num_labels or name not in shared]
     places.sort(key=lambda i: names[i] != "planner")
-    others = [i for i in places if i < table.num_labels and names[i] != "planner"]
-    bold = _best(
-        table,
-        [  # lines below a planner's are compared with nothing
-            tuple(row[i] for i in others) if shown(row[places[0]]) else (f"line {number}",)
-            for number, row in enumerate(table.rows)
-        ],
-    )
+    bold = _best(table)
 
     def line(number: int, cells: Sequence[str], tag: str) -> str:
         parts = []
@@ -424,9 +404,7 @@ def _html(table: Table) -> str:
         return f"<small>{html.escape(words)}</small> {name}" if words else html.escape(name)
 
     head, *rows = table.lines
-    title, above = (
-        html.escape(words) for words in (table.title or table.name, _said(table, shared))
-    )
+    title, above = html.escape(table.title or table.name), html.escape(said)
     lines = [
         f'<section id="{html.escape(table.name)}">',
         f"<h2>{title}</h2>",
@@ -441,5 +419,4 @@ def _html(table: Table) -> str:
     return "\n".join([*lines, "</section>"])
 
 
-_WRITERS: dict[str, Callable[[Table], str]]
 _WRITERS = {"md": _markdown, "csv": _csv, "latex": _latex, "html": _html}

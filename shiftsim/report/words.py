@@ -42,9 +42,7 @@ UNITS = {  # nuPlan's names, shortened
     "meters_per_second_cubed": "m/s³",
     "radians_per_second": "rad/s",
     "radians_per_second_squared": "rad/s²",
-    "count": "",
-    "ratio": "",
-    "boolean": "",
+    **dict.fromkeys(("count", "ratio", "boolean"), ""),
 }
 
 

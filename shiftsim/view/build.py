@@ -1,6 +1,7 @@
 """Replays of runs: which rollouts belong on one page, and a folder of pages with a list of them."""
 
 import html
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -13,16 +14,8 @@ import numpy as np
 from shiftsim.errors import ConfigError, DataError, ShiftsimError, beginning
 from shiftsim.files import safe_join, write_text
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES
+from shiftsim.report import words
 from shiftsim.report.palette import planner_styles
-from shiftsim.report.words import (
-    REASONS,
-    noise_order,
-    rows_by_task,
-    severity,
-    violations,
-    worst_moment,
-    worst_violation,
-)
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
 from shiftsim.view.page import MAX_ROLLOUTS, Page, framed, replay_page
@@ -31,7 +24,8 @@ from shiftsim.view.thumbnails import thumbnails
 
 _ENDS = [*Task._fields, "status", "error", "scenario_type"]
 _NO_PAGE = {"page": None, "index": 0}
-_WRONG = {SHORT_NAMES[name]: reason for name, reason in REASONS.items()}  # in words, in their order
+# what went wrong, in the order of metrics
+_WRONG = {SHORT_NAMES[name]: reason for name, reason in words.REASONS.items()}
 
 
 @dataclass(frozen=True)
@@ -92,8 +86,8 @@ class Gallery:
                     f"run {run.path.name!r} was made with another store than {str(store.path)!r}",
                     hint="name the store that its manifest.json names",
                 )
-            scores, metrics = rows_by_task(run.scores), rows_by_task(run.metrics)
-            ends = rows_by_task(run.tasks.select(_ENDS))
+            tables = (run.scores, run.metrics, run.tasks.select(_ENDS))
+            scores, metrics, ends = map(words.rows_by_task, tables)
             for key, place in run.rollout_places.items():
                 planner = f"{key.planner} ({name})" if name else key.planner
                 (end,), (score,) = ends[key], scores.get(key, [{}])
@@ -137,8 +131,8 @@ class Gallery:
         more = [f"{failed} failed"] if failed else []
         more += [f"{lone - failed} not stored"] if lone > failed else []
         more += [f"only {self.choice}"] if any(vars(self.choice).values()) else []
-        words = ", ".join([f"{here} of {total} rollouts shown", *more])
-        return words if here < total or more else ""
+        shown = ", ".join([f"{here} of {total} rollouts shown", *more])
+        return shown if here < total or more else ""
 
     def find(self, text: str) -> str:
         """A scenario by its token or an unambiguous beginning of it.
@@ -186,31 +180,33 @@ class Gallery:
     def settings_words(self, token: str, part: int = 0) -> str:
         """How the rollouts of a page were driven and scored."""
         manifests = [self._rollouts[task].run.manifest for task in self.tasks(token, part)]
-        words = (
+        settings = (
             f"traffic {made['config']['traffic']} · controller {made['config']['controller']} · "
             f"thresholds {made['config']['thresholds']} · shiftsim {made['versions']['shiftsim']}"
             for made in manifests
         )
-        return "; ".join(dict.fromkeys(words))
+        return "; ".join(dict.fromkeys(settings))
 
-    def pages(self, token: str, *, back: str = "", fork: bool = False) -> dict[str, Page]:
+    def pages(
+        self, token: str, *, back: str = "", fork: bool = False, alone: bool = False
+    ) -> dict[str, Page]:
         """The replays of one scenario as HTML by file name, all rollouts that can be drawn.
+
+        The first page `alone` has no links to others.
 
         Raises:
             ConfigError: There are none, or their forks cannot be driven.
         """
         self.tasks(token)
         scenario, links, first = self.store.read(token), [], 1
-        parts = range(len(self.parts(token)))
-        shown = [self.shown(token, scenario, part, fork=fork) for part in parts]
-        seeds = list(chain(*shown))
         for part, tasks in enumerate(self.parts(token)):
             links.append((f"{first}–{first + len(tasks) - 1}", page_name(token, part)))
             first += len(tasks)
-        out = {}
-        for part, (_, name) in enumerate(links):
-            more = {"parts": links if len(links) > 1 else [], "part": part}
-            more |= {
+        shown = [self.shown(token, scenario, part, fork=fork) for part in range(len(links))]
+        seeds, out = list(chain(*shown)), {}
+        for part, (_, name) in enumerate(links[:1] if alone else links):
+            linked = {"parts": links if len(links) > 1 else [], "part": part}
+            more = ({} if alone else linked) | {
                 "shown": self.shown_words(token, part),
                 "settings": self.settings_words(token, part),
             }
@@ -219,10 +215,7 @@ class Gallery:
 
     def page(self, token: str) -> Page:
         """The first replay of one scenario as HTML, alone."""
-        scenario, parts = self.store.read(token), range(len(self.parts(token)))
-        shown = [self.shown(token, scenario, part) for part in parts or [0]]
-        more = {"shown": self.shown_words(token), "settings": self.settings_words(token)}
-        return replay_page(scenario, shown[0], seeds=list(chain(*shown)), more=more)
+        return next(iter(self.pages(token, alone=True).values()))
 
     def rows(self, token: str, *, with_pages: bool = True) -> list[dict[str, Any]]:
         """Rows of the scenario list: labels, scores and violated metrics of every rollout."""
@@ -241,7 +234,8 @@ class Gallery:
         driven = {}
         for task in tasks:
             one = self._rollouts[task]
-            rows, worst = one.run.rollout_rows(one.key), worst_moment(violations(one.metrics))
+            rows = one.run.rollout_rows(one.key)
+            worst = words.worst_moment(words.violations(one.metrics))
             path = np.stack([rows[name].to_numpy() for name in ("x_m", "y_m")], axis=1)
             seconds = 1e-6 * (rows["time_us"].to_numpy() - rows["time_us"][0].as_py())
             at = None if worst is None else worst.time
@@ -261,8 +255,8 @@ class Gallery:
 
     def _row(self, task: Task) -> dict[str, Any]:
         one = self._rollouts[task]
-        found = violations(one.metrics)
-        worst, cause = worst_moment(found), worst_violation(found)
+        found = words.violations(one.metrics)
+        worst, cause = words.worst_moment(found), words.worst_violation(found)
         status, error, kind = (one.end[name] for name in ("status", "error", "scenario_type"))
         row = {
             **task._asdict(),
@@ -270,7 +264,7 @@ class Gallery:
             "cls": one.score.get("cls"),
             "failed": "" if status == "ok" else f"{status}: {error}" if error else status,
             "cause": cause.reason if cause else "",
-            "severity": severity(cause) if cause else (),
+            "severity": words.severity(cause) if cause else (),
             "violated": {one.short: one.time for one in found},
             "at": worst and worst.time,
         }
@@ -282,9 +276,7 @@ def page_name(token: str, part: int = 0) -> str:
 
     Further pages of the scenario have a number, from 2.
     """
-    safe = "".join(
-        c if c.isascii() and (c.isalnum() or c in "-_") else f"~{ord(c):x}" for c in token
-    )
+    safe = re.sub(r"[^A-Za-z0-9_-]", lambda found: f"~{ord(found[0]):x}", token)
     return f"{safe}.{part + 1}.html" if part else f"{safe}.html"
 
 
@@ -299,7 +291,7 @@ def list_page(
     scenes = {one: n for n, one in enumerate(dict.fromkeys(row.get("scene") for row in rows))}
     looks = {
         "multipliers": [SHORT_NAMES[name] for name in MULTIPLIERS],
-        "noises": noise_order(row["noise"] for row in rows),
+        "noises": words.noise_order(row["noise"] for row in rows),
         "styles": planner_styles(sorted({row["planner"] for row in rows})),
         "scenes": list(scenes),
     }
@@ -339,8 +331,8 @@ def write_site(
         for token in gallery.listed
         for row in gallery.rows(token, with_pages=(gallery, token) in drawn)
     ]
-    words = _left_out(galleries, len(found), len(drawable), rows)
-    write_text(folder / "index.html", list_page(title, rows, above=above, shown=words))
+    shown = _left_out(galleries, len(found), len(drawable), rows)
+    write_text(folder / "index.html", list_page(title, rows, above=above, shown=shown))
     return len(found)
 
 
@@ -379,8 +371,7 @@ def _names(runs: Sequence[Run]) -> list[str]:
     Nothing where the names of the planners do already, in the same traffic.
     """
     planners = [name for run in runs for name in run.manifest["config"]["planners"]]
-    modes = {run.manifest["determining"]["traffic"] for run in runs}
-    if len(modes) == 1 and len({*planners}) == len(planners):
-        return [""] * len(runs)
     traffic = [str(run.manifest["determining"]["traffic"]) for run in runs]
+    if len(set(traffic)) == 1 and len({*planners}) == len(planners):
+        return [""] * len(runs)
     return traffic if len(set(traffic)) == len(runs) else [run.path.name for run in runs]

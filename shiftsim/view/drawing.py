@@ -220,18 +220,10 @@ def draw_violation(
     box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": style.colour, "lw": 0.9}
     leader = {"arrowstyle": "-", "color": style.colour, "lw": 0.8, "shrinkA": 0, "shrinkB": 4}
     words = violation_words(worst.row, item.log.tracks)
-    label = axes.annotate(
-        words.partition(",")[0] if in_short else words,
-        place,
-        xytext=(6, 6),
-        textcoords="offset points",
-        fontsize=SMALL,
-        bbox=box,
-        arrowprops=leader,
-        zorder=10,
-        annotation_clip=False,
-        in_layout=False,
-    )
+    words = words.partition(",")[0] if in_short else words
+    at: dict[str, Any] = {"xytext": (6, 6), "textcoords": "offset points", "zorder": 10}
+    at |= {"annotation_clip": False, "in_layout": False}
+    label = axes.annotate(words, place, fontsize=SMALL, bbox=box, arrowprops=leader, **at)
     return Mark(worst.time, burst, label)
 
 

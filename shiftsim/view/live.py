@@ -5,8 +5,9 @@ a thread answers the page, which asks twice a second. Nothing is read from disk 
 opened, and nothing is added to what the workers do.
 """
 
-from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
+from operator import itemgetter
 from threading import Event, Lock, Thread
 from time import monotonic
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from shiftsim.report.palette import planner_styles
-from shiftsim.report.statistics import bootstrap_interval
+from shiftsim.report.statistics import bootstrap_interval, cluster_codes
 from shiftsim.report.words import noise_order, violations
 from shiftsim.runs.execute import Progress
 from shiftsim.runs.rollouts.files import complete_rollout, decode_rows
@@ -48,8 +49,8 @@ class LiveRun:
         self._progress = Progress(0, total, 0)
         self._number = 0  # of results so far
         self._first: int | None = None  # tasks that were done before
-        # scores by planner, noise and traffic, and by recording
-        self._scores: dict[tuple[str, str, str], dict[str, list[float]]] = {}
+        # recordings and their scores by planner, noise and traffic
+        self._scores: dict[tuple[str, str, str], list[tuple[str, float]]] = {}
         self._summaries: dict[tuple[str, str, str], dict[str, Any]] = {}
         # the lowest scores by scenario: the score, the number of the result, the result
         self._worst: dict[str, tuple[float, int, TaskResult]] = {}
@@ -75,8 +76,7 @@ class LiveRun:
             return
         score = float(result.scores["cls"])
         group = (planner, noise, result.scores["traffic"])
-        by_recording = self._scores.setdefault(group, defaultdict(list))
-        by_recording[result.scores["log_name"]].append(score)
+        self._scores.setdefault(group, []).append((result.scores["log_name"], score))
         self._summaries.pop(group, None)  # made anew when somebody looks
         if score < (self._worst[token][0] if token in self._worst else 1.0):
             self._worst[token] = (score, self._number, result)
@@ -134,23 +134,22 @@ class LiveRun:
         """
         with self._lock:
             worst = self._worst.values()
-            found = [r for _, n, r in worst if str(n) == str(number) and r.rollout]
-        if not found:
+            found = (r for _, n, r in worst if str(n) == str(number) and r.rollout)
+            result = next(found, None)
+        if result is None:
             return None
-        (result,) = found
         scenario = self._read(result.task.token)
         log = complete_rollout(decode_rows(result.rollout), scenario, result.task)
-        planner, noise, seed, _ = result.task
-        shown = ShownRollout(planner, noise, seed, log, result.scores["cls"], result.metrics)
+        key = result.task[:3]  # without its scenario
+        shown = ShownRollout(*key, log, result.scores["cls"], result.metrics)
         return replay_page(scenario, [shown])
 
 
-def _statistics(scores: Mapping[str, list[float]]) -> dict[str, Any]:
-    """Mean and bootstrap interval x 100 of scores by recording, as a report has them."""
-    recordings = sorted(scores)
-    values = np.array([100.0 * score for name in recordings for score in scores[name]])
-    codes = np.repeat(np.arange(len(recordings)), [len(scores[name]) for name in recordings])
-    interval = bootstrap_interval(values, codes, draws=_DRAWS)
+def _statistics(scores: Sequence[tuple[str, float]]) -> dict[str, Any]:
+    """Mean and bootstrap interval x 100 of recordings and their scores, as a report has them."""
+    recordings, found = zip(*sorted(scores, key=itemgetter(0)), strict=True)
+    values = 100.0 * np.array(found)
+    interval = bootstrap_interval(values, cluster_codes(recordings), draws=_DRAWS)
     ends = [] if interval is None else [interval.low, interval.high]
     return {"done": len(values), "mean": float(values.mean()), "interval": ends}
 

@@ -106,12 +106,7 @@ def replay_page(
 
 
 def framed(
-    name: str,
-    *,
-    title: str,
-    images: str = "",
-    data: Mapping[str, Any] | None = None,
-    **parts: str,
+    name: str, *, title: str, images: str = "", data: Mapping[str, Any] | None = None, **parts: str
 ) -> Page:
     """A whole page of the name, with one head for all pages.
 
@@ -119,18 +114,22 @@ def framed(
         name: The page, as in `_FILES`.
         title: Its title, also within the page.
         images: Where the images of a page that is a file may come from.
-        data: What its script reads, by name: packed text, or JSON values.
+        data: What its script reads, packed text or JSON values, of the elements `data-name`.
         parts: What else its file leaves open, as HTML.
     """
     styles, scripts = _FILES[name]
-    elements = "\n".join(_data_element(key, value) for key, value in (data or {}).items())
+    elements = []
+    for key, value in (data or {}).items():
+        kind = "text/plain" if isinstance(value, str) else "application/json"
+        packed = value if isinstance(value, str) else json_text(value)
+        elements.append(f'<script type="{kind}" id="data-{key}">{packed}</script>')
     title = html.escape(title)
     text = fill(
         _asset("frame.html"),
         title=title,
         meta=_POLICY.format(images=images) if images else "",
         style="".join(map(_asset, styles)),
-        body=fill(_asset(f"{name}.html"), title=title, data=elements, **parts),
+        body=fill(_asset(f"{name}.html"), title=title, data="\n".join(elements), **parts),
         script="\n".join(map(_asset, scripts)),
     )
     return Page(text)
@@ -151,12 +150,3 @@ def json_text(value: Any) -> str:
     """JSON that can stand inside a script element whatever its strings hold."""
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-
-
-def _data_element(name: str, value: Any) -> str:
-    """Packed text, or a value as JSON, in an element `data-name`, which a page's script reads."""
-    if isinstance(value, str):
-        kind, text = "text/plain", value
-    else:
-        kind, text = "application/json", json_text(value)
-    return f'<script type="{kind}" id="data-{name}">{text}</script>'

@@ -5,22 +5,18 @@ The only file written is the review; every change is on disk before its answer.
 
 import getpass
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from shiftsim._version import __version__
+from shiftsim.data.store import review as reviews
 from shiftsim.data.store.reading import open_store
-from shiftsim.data.store.review import (
-    Review,
-    parse_review,
-    read_reviews,
-    require_blocks,
-    route_problems,
-    write_reviews,
-)
+from shiftsim.data.store.review import Review, write_reviews
 from shiftsim.errors import ConfigError
 from shiftsim.runs.filter import read_filter_results
 from shiftsim.sim.log import as_recorded
@@ -37,23 +33,24 @@ _NUMBERS = ("max_outside_m", "path_m", "progress_m", "first_violation_s", "partn
 
 
 class ReviewService:
-    """The reviews of one store, and what is needed to make them."""
+    """The reviews of one store, and what is needed to make them.
+
+    Methods raise `DataError` where the store has no such scenario.
+    """
 
     def __init__(self, store: Path, reviewer: str = "") -> None:
-        """Open the store.
-
-        Args:
-            store: Its folder.
-            reviewer: Who reviews; the user's login name when empty.
+        """Open the store of a folder; an empty `reviewer` is the user's login name.
 
         Raises:
             DataError: There is no store, or its filter results or reviews are damaged.
         """
         self.store = open_store(store)
-        self.reviewer = reviewer or _login()
+        self.reviewer = reviewer
+        with suppress(OSError, KeyError):  # there may be no login name
+            self.reviewer = reviewer or getpass.getuser()
         filtered = read_filter_results(self.store.path, self.store.hash)
         self._filter_results = {row["token"]: row for row in (filtered.rows if filtered else ())}
-        self._reviews = read_reviews(self.store.path)
+        self._reviews = reviews.read_reviews(self.store.path)
 
     def listing(self) -> dict[str, Any]:
         """All scenarios with their filter result and review."""
@@ -76,23 +73,24 @@ class ReviewService:
         }
 
     def scenario(self, token: str) -> dict[str, Any]:
-        """Everything the page draws of one scenario.
-
-        Raises:
-            DataError: The store has no such scenario.
-        """
+        """Everything the page draws of one scenario."""
         recorded = self.store.read_recorded(token)
         replay = scene.Replay(
             recorded, [scene.ShownRollout("recorded", "none", 0, as_recorded(recorded))]
         )
-        blocks = _blocks_near(replay)
+        layer = recorded.map.blocks
+        route = (layer.index[name] for name in recorded.route if name in layer.index)
+        blocks = sorted({*scene.indices_near(layer, replay.box), *route})
+        rings = [layer.rings(block) for block in blocks]
+        counts = Quantised(np.array([*map(len, rings)], float), 1.0)  # of rings per block
+        outlines = scene.line_fields("blocks", list(chain(*rings)), replay.origin)
         result = self._filter_results.get(token) or {}
         return {
             "meta": scene.describe_scene(replay),
             "scene": pack(scene.scene_fields(replay)),
             "rollout": pack(scene.rollout_fields(replay, 0)),
-            "blocks": pack(_block_fields(replay, blocks)),
-            "blockIds": [recorded.map.blocks.ids[block] for block in blocks],
+            "blocks": pack({"blocks.rings": counts, **outlines}),
+            "blockIds": [layer.ids[block] for block in blocks],
             "recordedRoute": list(recorded.route),
             "numbers": {name: result[name] for name in _NUMBERS if result.get(name) is not None},
             **self._state(token),
@@ -100,11 +98,7 @@ class ReviewService:
         }
 
     def thumbnail(self, token: str) -> dict[str, Any]:
-        """The small picture of one scenario.
-
-        Raises:
-            DataError: The store has no such scenario.
-        """
+        """The small picture of one scenario."""
         recorded = self.store.read_recorded(token)
         return thumbnails(recorded, {token: (recorded.expert[:, :2], None)})[token]
 
@@ -113,16 +107,22 @@ class ReviewService:
 
         Raises:
             ConfigError: It is no list of names.
-            DataError: The store has no such scenario.
         """
         if not isinstance(route, list) or not all(isinstance(name, str) for name in route):
             raise ConfigError("a route is a list of roadblocks")
-        return _check_route(self.store.read_recorded(token), route)
+        return self._checked_route(self.store.read_recorded(token), route)
 
-    def _checked_route(self, recorded: Scenario) -> dict[str, Any]:
-        """The route of the review, or the recorded one, with what is wrong with it."""
+    def _checked_route(
+        self, recorded: Scenario, given: Sequence[str] | None = None
+    ) -> dict[str, Any]:
+        """A route, else that of the review, else the recorded one, with what is wrong with it."""
         review = self._reviews.get(recorded.token)
-        return _check_route(recorded, (review and review.route) or recorded.route)
+        route = (review and review.route) or recorded.route if given is None else given
+        # it starts in the block under the ego; in one on the route where there are several
+        found = recorded.map.blocks.containing(*recorded.expert[0, :2]).tolist()
+        on_route = [block for block in found if recorded.map.blocks.ids[block] in recorded.route]
+        problems = reviews.route_problems(recorded.map, route, next(iter(on_route or found), None))
+        return {"current": list(route), "problems": problems}
 
     def keep(self, token: str, values: Any) -> dict[str, Any]:
         """Put a review on disk; returns what is kept.
@@ -141,52 +141,16 @@ class ReviewService:
             raise ConfigError(f"the fields of a review are {', '.join(sorted(_CHANGED))}")
         before = asdict(self._reviews.get(token, Review(token)))
         before["route"] = before["route"] and list(before["route"])
-        review = parse_review({**before, **values}, "the review")
+        review = reviews.parse_review({**before, **values}, "the review")
         if len(review.comment) > MAX_COMMENT:
             raise ConfigError(f"a comment has up to {MAX_COMMENT} characters")
-        require_blocks(recorded.map, review, "the review")
+        reviews.require_blocks(recorded.map, review, "the review")
         route = None if review.route == recorded.route else review.route
         review = replace(review, route=route, reviewer=self.reviewer, version=__version__)
-        reviews = self._reviews.with_review(review)
-        write_reviews(self.store.path, reviews)
-        self._reviews = reviews
+        changed = self._reviews.with_review(review)
+        write_reviews(self.store.path, changed)
+        self._reviews = changed
         return self._state(token) | self._checked_route(recorded)
-
-
-def _login() -> str:
-    try:
-        return getpass.getuser()
-    except (OSError, KeyError):
-        return ""
-
-
-def _check_route(recorded: Scenario, route: Sequence[str]) -> dict[str, Any]:
-    problems = route_problems(recorded.map, route, _start_block(recorded))
-    return {"current": list(route), "problems": problems}
-
-
-def _start_block(scenario: Scenario) -> int | None:
-    """The block under the ego at the first iteration; one on the route where there are several."""
-    x, y = scenario.expert[0, :2]
-    found = scenario.map.blocks.containing(x, y).tolist()
-    on_route = [b for b in found if scenario.map.blocks.ids[b] in scenario.route]
-    return next(iter(on_route or found), None)
-
-
-def _blocks_near(replay: scene.Replay) -> list[int]:
-    """Blocks that share a point with the box that is drawn, and those of the route."""
-    layer = replay.scenario.map.blocks
-    route = (layer.index[name] for name in replay.scenario.route if name in layer.index)
-    return sorted({*scene.indices_near(layer, replay.box), *route})
-
-
-def _block_fields(replay: scene.Replay, blocks: list[int]) -> scene.Fields:
-    """Outlines of the blocks: rings per block, vertices per ring, vertices."""
-    layer = replay.scenario.map.blocks
-    rings = [layer.rings(block) for block in blocks]
-    count = Quantised(np.array([len(group) for group in rings], float), 1.0)
-    flat = [ring for group in rings for ring in group]
-    return {"blocks.rings": count, **scene.line_fields("blocks", flat, replay.origin)}
 
 
 def review_server(service: ReviewService, port: int = 0) -> LocalServer:

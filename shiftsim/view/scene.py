@@ -3,7 +3,7 @@
 Positions are relative to a whole-metre origin near the scene, so that quantised values are small.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import permutations
@@ -113,8 +113,12 @@ def scene_fields(replay: Replay) -> Fields:
     Tracks are left out when every rollout carries its own.
     """
     origin = replay.origin
-    layers = map_lines(replay.scenario.map, replay.scenario.route, replay.box)
-    layers["lights"] = _light_lines(replay.scenario)
+    road, nothing = replay.scenario.map, np.zeros((0, 2))
+    layers = map_lines(road, replay.scenario.route, replay.box)
+    layers["lights"] = [
+        road.baselines.at(road.edges.index[name]) if name in road.edges.index else nothing
+        for name in replay.scenario.traffic_lights.connector_ids
+    ]
     fields: Fields = {}
     for name, lines in layers.items():
         fields |= line_fields(name, lines, origin)
@@ -159,8 +163,8 @@ def _tube_fields(name: str, paths: Sequence[FloatArray]) -> Fields:
 
 def rollout_fields(replay: Replay, index: int) -> Fields:
     """What belongs to one rollout."""
-    origin = replay.origin
-    log = replay.shown[index].log
+    origin, item = replay.origin, replay.shown[index]
+    log, branches = item.log, item.fork.branches if item.fork else ()
     fields = _poses("ego", log.ego[:, None, :3], origin)
     fields["speed"] = Quantised(speeds(log.ego), _SPEED)
     fields["accel"] = Quantised(log.ego[:, AX].copy(), _SPEED)
@@ -169,8 +173,7 @@ def rollout_fields(replay: Replay, index: int) -> Fields:
     fields["rest"] = Quantised(plans[:, _FIRST_SECOND - 1 :], _COARSE)
     fields["noise"] = Quantised(log.noise, _RADIANS)
     fields["degraded"] = log.degraded
-    fork = replay.shown[index].fork
-    for number, branch in enumerate(fork.branches if fork else ()):
+    for number, branch in enumerate(branches):
         fields |= _poses(f"branch{number}", branch.poses[:, None], origin)
     if replay.own_tracks:
         fields |= _track_fields(log.tracks, origin)
@@ -204,12 +207,15 @@ def describe_scene(replay: Replay) -> dict[str, Any]:
                 "noise": item.noise,
                 "seed": item.seed,
                 "cls": item.cls,
-                "colour": styles[item.planner].colour,
-                "marker": styles[item.planner].marker,
+                **styles[item.planner]._asdict(),
                 "violations": describe_violations(item),
                 "losses": _losses(item),
                 "fork": _describe_fork(item, styles),
-                "scores": _scores(item.metrics),
+                "scores": {
+                    SHORT_NAMES[row["metric"]]: row["score"]
+                    for row in item.metrics
+                    if row["metric"] in SHORT_NAMES and row["score"] is not None
+                },
                 "degraded": int(item.log.degraded.sum()),
                 "seen": item.log.seen is not None,
                 "tracks": _track_names(item.log.tracks) if own else None,
@@ -243,15 +249,10 @@ def line_fields(name: str, lines: Sequence[FloatArray], origin: FloatArray) -> F
 
 
 def _poses(name: str, poses: FloatArray, origin: FloatArray) -> Fields:
-    """(T, N, 3) poses as positions and continuous headings."""
-    heading = poses[:, :, 2].copy()
-    known = ~np.isnan(heading)
-    for column in range(heading.shape[1]):
-        rows = known[:, column]
-        heading[rows, column] = np.unwrap(heading[rows, column])
+    """(T, N, 3) poses, none missing, as positions and continuous headings."""
     return {
         f"{name}.xy": Quantised(poses[:, :, :2] - origin, _METRES),
-        f"{name}.heading": Quantised(heading, _RADIANS),
+        f"{name}.heading": Quantised(np.unwrap(poses[:, :, 2], axis=0), _RADIANS),
     }
 
 
@@ -262,14 +263,11 @@ def _track_fields(tracks: Tracks, origin: FloatArray, name: str = "tracks") -> F
     first = valid.argmax(axis=0)
     rows = np.maximum.accumulate(np.where(valid, np.arange(len(valid))[:, None], 0), axis=0)
     rows = np.maximum(rows, first)  # before its first sample: that one
-    columns = np.arange(valid.shape[1])
-    poses = tracks.poses[:, used][rows, columns]
-    sizes = tracks.sizes[:, used][first, columns]
     return {
         f"{name}.valid": valid,
         f"{name}.kind": tracks.kinds[used].astype(np.uint8),
-        f"{name}.size": Quantised(sizes, _METRES),
-        **_poses(name, np.array(poses), origin),
+        f"{name}.size": Quantised(tracks.sizes[first, used], _METRES),
+        **_poses(name, tracks.poses[rows, used], origin),
     }
 
 
@@ -330,15 +328,6 @@ def _describe_fork(item: ShownRollout, styles: Mapping[str, Style]) -> dict[str,
     return {"t": float(seconds[start]), "row": start, "branches": branches}
 
 
-def _scores(metrics: Iterable[Mapping[str, Any]]) -> dict[str, float]:
-    """Scores by short name."""
-    return {
-        SHORT_NAMES[row["metric"]]: row["score"]
-        for row in metrics
-        if row["metric"] in SHORT_NAMES and row["score"] is not None
-    }
-
-
 def _finite(value: float | None) -> float | None:
     """JSON has no infinity."""
     return value if value is not None and np.isfinite(value) else None
@@ -382,8 +371,6 @@ def indices_near(layer: Layer, box: FloatArray) -> list[int]:
 
 def _rings(polygons: list[shapely.Polygon], box: FloatArray) -> list[FloatArray]:
     """Outlines of the union, so that overlapping polygons do not show their seams."""
-    if not polygons:
-        return []
     clipped = shapely.clip_by_rect(np.array(polygons, object), *box)
     union = shapely.union_all(shapely.make_valid(clipped), grid_size=_MAP_STEP)
     parts = shapely.get_parts(shapely.simplify(union, _TOLERANCE))
@@ -398,18 +385,7 @@ def _rings(polygons: list[shapely.Polygon], box: FloatArray) -> list[FloatArray]
 def _lines(lines: list[FloatArray], box: FloatArray) -> list[FloatArray]:
     """Lines inside the box, each once: neighbouring lanes share a boundary."""
     strings = [shapely.LineString(line) for line in lines if len(line) > 1]
-    if not strings:
-        return []
     clipped = shapely.clip_by_rect(np.array(strings, object), *box)
     parts = shapely.get_parts(shapely.simplify(clipped, _TOLERANCE))
     found = {part.normalize().wkb: part for part in parts if part.geom_type == "LineString"}
     return [coords for part in found.values() if len(coords := shapely.get_coordinates(part)) > 1]
-
-
-def _light_lines(scenario: Scenario) -> list[FloatArray]:
-    """Centre lines of the connectors that lights govern, in the order of the lights."""
-    road = scenario.map
-    return [
-        road.baselines.at(road.edges.index[name]) if name in road.edges.index else np.zeros((0, 2))
-        for name in scenario.traffic_lights.connector_ids
-    ]

@@ -49,9 +49,7 @@ class LocalServer(ThreadingHTTPServer):
     def __init__(self, routes: Mapping[str, Route], port: int = 0) -> None:
         """Bind to a port of the loopback interface; 0 chooses a free one.
 
-        Args:
-            routes: What answers by method and path, as in `GET /` and `POST /api/review`.
-            port: The port.
+        `routes` answer by method and path, as in `GET /` and `POST /api/review`.
         """
         self.routes, self.turn = routes, Lock()
         self.token = secrets.token_urlsafe(24)

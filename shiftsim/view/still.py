@@ -299,8 +299,7 @@ def _words(scenario: Scenario) -> str:
 
 def _heading(axes: Any, scenario: Scenario, time: float, form: FigureFormat) -> None:
     words = "" if form.plain else f"{_words(scenario)}  {time:.1f} s"
-    length = characters(axes.figure.get_figwidth(), TEXT)
-    axes.set_title(_wrapped(words, length), fontsize=TEXT)
+    axes.set_title(_wrapped(words, characters(axes.figure.get_figwidth(), TEXT)), fontsize=TEXT)
 
 
 @palette.in_format
@@ -354,26 +353,22 @@ def _following(scenario: Scenario, shown: Sequence[ShownRollout]) -> tuple[View,
 
 
 def _writer(path: Path, speed: float) -> tuple[Any, int]:
-    """What writes a film, and every how many samples it has a picture."""
+    """What writes a film, and every how many samples it has a picture.
+
+    The ffmpeg of an mp4 is the system's, or that of the package imageio-ffmpeg.
+    """
+    from matplotlib import rcParams
     from matplotlib.animation import FFMpegWriter, PillowWriter
 
     step = math.ceil(_FPS * speed / _MOST_FPS)
     fps: Any = _FPS * speed / step
     if path.suffix.lower() != ".mp4":
         return PillowWriter(fps=fps), step
-    if not _has_ffmpeg(FFMpegWriter):
+    if not FFMpegWriter.isAvailable() and find_spec("imageio_ffmpeg"):
+        rcParams["animation.ffmpeg_path"] = import_module("imageio_ffmpeg").get_ffmpeg_exe()
+    if not FFMpegWriter.isAvailable():
         raise MissingExtraError(
             "mp4 needs ffmpeg",
             hint="install ffmpeg, or pip install imageio-ffmpeg, or write a .gif",
         )
     return FFMpegWriter(fps=fps, extra_args=["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2"]), step
-
-
-def _has_ffmpeg(writer: Any) -> bool:
-    """Whether there is ffmpeg, the system's or that of the package imageio-ffmpeg."""
-    if not writer.isAvailable() and find_spec("imageio_ffmpeg"):
-        from matplotlib import rcParams
-
-        found = import_module("imageio_ffmpeg").get_ffmpeg_exe()
-        rcParams["animation.ffmpeg_path"] = found
-    return bool(writer.isAvailable())
