@@ -186,7 +186,8 @@ class Drift:
         if self.senses and self.noise.kind == "none":
             out["kind"] = "sensing"  # has seeds
         for name, model in (("perception", self.perception), ("localization", self.localization)):
-            out |= {name: asdict(model)} if model.acts else {}
+            finite = {key: value for key, value in asdict(model).items() if value != inf}
+            out |= {name: finite} if model.acts else {}
         return out | ({"latency": self.latency} if self.latency else {})
 
 
