@@ -7,7 +7,7 @@ import zlib
 
 import numpy as np
 
-from shiftsim.view.pack import MISSING
+from shiftsim.view.scene import MISSING
 
 
 def unpack(text):

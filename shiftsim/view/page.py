@@ -10,8 +10,14 @@ from typing import Any
 
 from shiftsim.files import write_text
 from shiftsim.sim.log import SimulationLog
-from shiftsim.view.pack import pack
-from shiftsim.view.scene import Replay, ShownRollout, describe_scene, rollout_fields, scene_fields
+from shiftsim.view.scene import (
+    Replay,
+    ShownRollout,
+    describe_scene,
+    pack,
+    rollout_fields,
+    scene_fields,
+)
 from shiftsim.world.scenario import Scenario, require_scenario
 
 MAX_ROLLOUTS = 6  # of a replay

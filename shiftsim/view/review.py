@@ -21,8 +21,8 @@ from shiftsim.errors import ConfigError
 from shiftsim.runs.filter import read_filter_results
 from shiftsim.sim.log import as_recorded
 from shiftsim.view import scene
-from shiftsim.view.pack import Quantised, pack
 from shiftsim.view.page import framed
+from shiftsim.view.scene import Quantised, pack
 from shiftsim.view.serving import LocalServer
 from shiftsim.view.thumbnails import thumbnails
 from shiftsim.world.scenario import Scenario

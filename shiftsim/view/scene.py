@@ -1,8 +1,17 @@
 """What a replay shows: map clippings, tracks, lights and rollouts of one scenario, as arrays.
 
 Positions are relative to a whole-metre origin near the scene, so that quantised values are small.
+
+A page holds sections of them as text: base64 of a zlib stream of the length of the JSON header
+(uint32, little endian), the header (a list of fields), and the fields' bytes one after the other. A
+quantised field holds int32 differences along its first axis as four byte planes, least significant
+first: neighbouring samples differ little, so that three of the planes are nearly constant.
+`codec.js` reads it.
 """
 
+import base64
+import json
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,20 +29,30 @@ from shiftsim.report.explain import losses
 from shiftsim.report.palette import Style, planner_styles
 from shiftsim.report.words import REASONS, violation_words, violations
 from shiftsim.sim.log import SimulationLog
-from shiftsim.view.pack import Quantised
 from shiftsim.world.layers import Layer
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AX, PACIFICA, AgentKind, Tracks, speeds
 
-Fields: TypeAlias = dict[str, Quantised | np.ndarray]
-
+MISSING = -(2**31)  # stands for NaN
+_LARGEST = 2**31 - 1
 MARGIN = 100.0  # m of map around everything the ego does
 _METRES, _RADIANS, _SPEED, _SECONDS = 0.01, 0.001, 0.01, 0.001
 _COARSE = 0.05  # m, of plans beyond their first second
 _FIRST_SECOND = 11  # poses of a plan up to 1 s ahead
 _MAP_STEP = 0.05  # m
 _TOLERANCE = 0.05  # m, of simplified map lines
+
+
+@dataclass(frozen=True, slots=True)
+class Quantised:
+    """An array to be stored as multiples of a step."""
+
+    values: FloatArray  # (T, …) the values; NaN is kept
+    step: float  # resolution, in the unit of the values
+
+
+Fields: TypeAlias = dict[str, Quantised | np.ndarray]
 
 
 class Branch(NamedTuple):
@@ -389,3 +408,31 @@ def _lines(lines: list[FloatArray], box: FloatArray) -> list[FloatArray]:
     parts = shapely.get_parts(shapely.simplify(clipped, _TOLERANCE))
     found = {part.normalize().wkb: part for part in parts if part.geom_type == "LineString"}
     return [coords for part in found.values() if len(coords := shapely.get_coordinates(part)) > 1]
+
+
+def pack(fields: Mapping[str, Quantised | np.ndarray]) -> str:
+    """One section: quantised arrays, and byte arrays (bool or uint8) as they are."""
+    header = []
+    chunks = []
+    for name, value in fields.items():
+        if isinstance(value, Quantised):
+            shape, step = value.values.shape, value.step
+            chunks.append(_planes(value))
+        else:
+            shape, step = value.shape, 0.0
+            chunks.append(np.ascontiguousarray(value, np.uint8).tobytes())
+        header.append({"name": name, "shape": list(shape), "step": step})
+    text = json.dumps(header, separators=(",", ":")).encode()
+    body = len(text).to_bytes(4, "little") + text + b"".join(chunks)
+    return base64.b64encode(zlib.compress(body, 9)).decode("ascii")
+
+
+def _planes(field: Quantised) -> bytes:
+    missing = np.isnan(field.values)
+    scaled = np.rint(np.where(missing, 0.0, field.values) / field.step)
+    steps = np.clip(scaled, -_LARGEST, _LARGEST).astype(np.int64)
+    steps[missing] = MISSING
+    if len(steps) > 1:
+        steps[1:] -= steps[:-1].copy()
+    wrapped = (steps & 0xFFFFFFFF).astype("<u4")
+    return wrapped.reshape(-1, 1).view(np.uint8).T.tobytes()

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from pages import unpack
 
-from shiftsim.view.pack import Quantised, pack
+from shiftsim.view.scene import Quantised, pack
 
 
 @given(
