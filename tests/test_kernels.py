@@ -123,6 +123,10 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
             Rollout(scenario, load("constant-velocity")).snapshot(), np.zeros((2, 8, 3)), 5
         ),
         "environment": compile_environment,
+        "sensing": lambda: simulate(
+            scenario, load("constant-velocity"), noise="perception-low+miss-low"
+        ),
+        "way back": lambda: come_back(scenario),
         "edited": drive_edited,
         "conversion": convert,
         "tracks and check": convert_table,
@@ -139,6 +143,13 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
         "lines": lambda: look_along(scenario),
         "nearest": lambda: nearest(scenario.map.edges.polygons, 0.0, 0.0, np.inf),
     }
+
+
+def come_back(scenario: Scenario) -> None:
+    """The way back of an ego that was moved."""
+    from shiftsim.train.samples import way_back  # needs torch
+
+    way_back(3.0, scenario.ego[:81, :3] - scenario.ego[0, :3])
 
 
 def measure_realism(scenario: Scenario) -> None:

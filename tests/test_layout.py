@@ -38,7 +38,7 @@ BUDGETS = {
     "shiftsim/compat": 3_900,  # goal 2_300
     "shiftsim/verify": 1_270,  # goal 1_200
     "shiftsim/cli": 2_770,  # goal 2_300
-    "benchmarks": 820,  # goal 700; the track finding brings 30
+    "benchmarks": 830,  # goal 700; the tracks finding and sensor-drift bring 40
 }
 MOST_LINES, MOST_MODULES, MOST_KERNELS = 66_150, 300, 220  # the goal is 52_000 lines
 LONGEST_MODULE, CROWDED = 450, 16

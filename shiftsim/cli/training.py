@@ -8,7 +8,7 @@ from typing import Any
 from typer import Argument, Option
 
 from shiftsim import cli
-from shiftsim.cli import Json, Quiet, echo, new_app, print_result
+from shiftsim.cli import Json, Quiet, echo, new_app, plural, print_result
 from shiftsim.train.folder import (
     BEST,
     FeatureSettings,
@@ -123,7 +123,8 @@ def features(
 
     chosen = FeatureSettings(store=store, **settings)
     index = write_features(chosen, _on_message(quiet))
-    lines = [f"{index['samples']} samples in {len(index['files'])} files: {chosen.out}"]
+    files = plural(len(index["files"]), "file")
+    lines = [f"{index['samples']} samples in {files}: {chosen.out}"]
     lines += [f"not made: {number} {reason}" for reason, number in index["failed"].items()]
     print_result(index, iter(lines), as_json=as_json)
 
