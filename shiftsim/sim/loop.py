@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from copy import copy, deepcopy
 from dataclasses import replace
 from time import perf_counter
-from typing import Any, ParamSpec, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeAlias, TypeVar, cast
 
 import numpy as np
 
@@ -30,10 +30,12 @@ from shiftsim.sim.planner import (
     rollout_rows,
     scene_info,
 )
-from shiftsim.sim.sensing import Latency, Sensing
 from shiftsim.sim.traffic import BatchTraffic, Move, make_traffic
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import NUM_STATE, Command, Trajectory, center_poses
+
+if TYPE_CHECKING:
+    from shiftsim.sim.sensing import Latency, Sensing
 
 T = TypeVar("T")
 P = ParamSpec("P")
@@ -92,11 +94,16 @@ class Rollout:
         self._traffic.start(scenario, self._tracks, start)
         drift, seed, token = setting.drift, setting.seed, scenario.token
         truth = self._ego, self._tracks
-        self._sensing = Sensing(drift, seed, token, truth) if drift.senses else None
+        self._sensing: Sensing | None = None
+        self._latency: Latency | None = None
+        if drift.senses or drift.latency:  # few runs need them
+            from shiftsim.sim import sensing
+
+            self._sensing = sensing.Sensing(drift, seed, token, truth) if drift.senses else None
+            past, present = self._ego[: start + 1], int(self._time_us[start])
+            self._latency = sensing.Latency(drift.latency, past, present)
         ego, tracks = (self._sensing.ego, self._sensing.tracks) if self._sensing else truth
         self._observations = ObservationBuilder(self._time_us, ego, tracks, self._lights)
-        present = int(self._time_us[start])
-        self._latency = Latency(drift.latency, self._ego[: start + 1], present)
         self._noise = sample_noise(drift.noise, seed=seed, token=token, num_steps=self.num_samples)
         self._commands = np.full((self.num_samples, 2), np.nan)
         self._plans = np.full((self.num_samples, len(KEPT_US), 3), np.nan)
@@ -136,7 +143,7 @@ class Rollout:
             plan = self._checked(plan)
         if iteration + 1 == self.num_samples:
             return None
-        if plan is not None:
+        if plan is not None and self._latency is not None:
             plan = self._latency.exchange(plan, int(self._time_us[row + 1]))
         # nuPlan rule 13: the ego moves first, and the traffic sees where it was before
         self._move_ego(plan)
