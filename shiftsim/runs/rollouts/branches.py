@@ -119,6 +119,7 @@ def branch(
 
     Example:
         ```python
+        import numpy as np
         from shiftsim.sim.loop import Rollout
 
         scenario = shiftsim.open_store("demo")["01f13e"]
