@@ -100,6 +100,7 @@ def test_with_vehicles_every_car_that_drives_is_an_ego(scenes, name):
 def test_the_route_of_py123d_is_that_of_the_log_from_its_begin_on(scenes):
     scene = scenes["py123d"]
     groups = known_route(demo_content())
+    assert [from_s for from_s, _ in scene.routes] == pytest.approx([0.0, 1.0], abs=1e-9)
     wanted = {str(n["id"]) for n in demo_content()["lanes"] if n["group"] in groups}
     (window,) = convert_recording(scene).windows  # it begins after 2 s
     road = scene.map.road
