@@ -16,6 +16,7 @@ from shiftsim.train.stream import Stream, load_blocks
 
 pytestmark = [pytest.mark.learned, pytest.mark.thorough]
 STEPS, BATCH = 6, 8
+both = pytest.mark.parametrize("planner", ["plantf", "pluto"])  # what they share is the third's too
 each = pytest.mark.parametrize("planner", ["plantf", "pluto", "diffusion-planner"])
 
 
@@ -47,7 +48,7 @@ def train(settings, **options):
     return lines
 
 
-@each
+@both
 def test_the_same_seed_gives_the_same_network_for_any_number_of_workers(small, planner):
     one, two, other = (
         small(name, planner=planner, **changes)
@@ -59,7 +60,7 @@ def test_the_same_seed_gives_the_same_network_for_any_number_of_workers(small, p
     assert networks[0] == networks[1] != networks[2]
 
 
-@each
+@both
 def test_a_training_that_was_ended_goes_on_as_if_it_had_not(small, monkeypatch, planner):
     whole, ended = small("whole", planner=planner), small("ended", planner=planner)
     monkeypatch.setattr(recipe, "_WRITE_EVERY", 0.0)
