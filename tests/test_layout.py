@@ -20,7 +20,7 @@ BUDGETS = {
     "shiftsim/geometry": 1_030,  # goal 1_000
     "shiftsim/world": 2_070,  # goal 1_800
     "shiftsim/edits": 2_170,  # goal 2_100
-    "shiftsim/sim": 2_550,  # goal 1_600
+    "shiftsim/sim": 2_560,  # goal 1_600
     "shiftsim/sim/traffic": 2_350,  # goal 2_200
     "metrics": 2_930,
     "shiftsim/runs": 6_030,  # goal 3_300
@@ -34,10 +34,10 @@ BUDGETS = {
     "shiftsim/report": 3_370,  # goal 2_200
     "shiftsim/view": 2_510,  # goal 1_800
     "shiftsim/env": 1_450,
-    "shiftsim/train": 3_510,  # goal 1_600
+    "shiftsim/train": 3_520,  # goal 1_600
     "shiftsim/compat": 3_900,  # goal 2_300
     "shiftsim/verify": 1_270,  # goal 1_200
-    "shiftsim/cli": 2_770,  # goal 2_300
+    "shiftsim/cli": 2_760,  # goal 2_300
     "benchmarks": 830,  # goal 700; the tracks finding and sensor-drift bring 40
 }
 MOST_LINES, MOST_MODULES, MOST_KERNELS = 66_150, 300, 220  # the goal is 52_000 lines

@@ -41,37 +41,24 @@ def carl(
 _LEARNT = [item for item in ImitationSettings.__dataclass_fields__ if item != "planner"]
 
 
-@app.command()
-@cli.with_settings(*_LEARNT, of=ImitationSettings)
-def plantf(
-    settings: cli.Settings,
-    resume: bool = Option(False, "--resume", help="Go on where it was ended."),
-    quiet: Quiet = False,
-) -> None:
-    """Train PlanTF from recordings."""
-    _imitate(ImitationSettings(**settings), resume, quiet)
+_IMITATED = {"plantf": "PlanTF", "pluto": "PLUTO", "diffusion-planner": "Diffusion Planner"}
 
 
-@app.command()
-@cli.with_settings(*_LEARNT, of=ImitationSettings)
-def pluto(
-    settings: cli.Settings,
-    resume: bool = Option(False, "--resume", help="Go on where it was ended."),
-    quiet: Quiet = False,
-) -> None:
-    """Train PLUTO from recordings."""
-    _imitate(ImitationSettings(planner="pluto", **settings), resume, quiet)
+def _add_imitation(planner: str, words: str) -> None:
+    """The command that trains a planner from recordings."""
+
+    @app.command(planner, help=f"Train {words} from recordings.")
+    @cli.with_settings(*_LEARNT, of=ImitationSettings)
+    def train(
+        settings: cli.Settings,
+        resume: bool = Option(False, "--resume", help="Go on where it was ended."),
+        quiet: Quiet = False,
+    ) -> None:
+        _imitate(ImitationSettings(planner=planner, **settings), resume, quiet)
 
 
-@app.command()
-@cli.with_settings(*_LEARNT, of=ImitationSettings)
-def diffusion_planner(
-    settings: cli.Settings,
-    resume: bool = Option(False, "--resume", help="Go on where it was ended."),
-    quiet: Quiet = False,
-) -> None:
-    """Train Diffusion Planner from recordings."""
-    _imitate(ImitationSettings(planner="diffusion-planner", **settings), resume, quiet)
+for _planner, _words in _IMITATED.items():
+    _add_imitation(_planner, _words)
 
 
 def _imitate(chosen: ImitationSettings, resume: bool, quiet: bool) -> None:

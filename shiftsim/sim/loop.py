@@ -210,11 +210,7 @@ class Rollout:
             DataError: The rollout has ended.
             ConfigError: What is seen drifts, or plans are late: those under way are not kept.
         """
-        if self._sensing is not None or self.setting.drift.latency:
-            raise ConfigError(
-                "there are no snapshots under perception, localization or latency",
-                hint="take it from a rollout without, or with actuation noise only",
-            )
+        self._require_truth()
         if self.done:
             raise DataError(f"the rollout of {self.scenario.token!r} has ended")
         # views: nobody writes to the rows that lie behind
@@ -254,8 +250,16 @@ class Rollout:
             self._traffic.step(self.iteration, self._ego[row], self._tracks, row + 1)
             self._go_on()
 
+    def _require_truth(self) -> None:
+        if self._latency is not None:
+            raise ConfigError(
+                "there are no snapshots and forks under perception, localization or latency",
+                hint="take them from a rollout without, or with actuation noise only",
+            )
+
     def fork(self) -> "Rollout":
-        """Another rollout that has come as far, without a planner."""
+        """Another rollout that has come as far, without a planner; errors as of `snapshot`."""
+        self._require_truth()
         other, scenario = copy(self), self.scenario
         for name in ("_ego", "_tracks", "_commands", "_plans", "_seconds", "_degraded"):
             setattr(other, name, getattr(self, name).copy())

@@ -241,8 +241,11 @@ def _number(part: str, text: str) -> int:
 
 
 def _joined(found: Drift, model: NoiseModel | Perception | Localization) -> Drift:
-    names = {NoiseModel: "noise", Perception: "perception", Localization: "localization"}
-    return replace(found, **{names[type(model)]: model})  # type: ignore[arg-type]
+    if isinstance(model, NoiseModel):
+        return replace(found, noise=model)
+    if isinstance(model, Perception):
+        return replace(found, perception=model)
+    return replace(found, localization=model)
 
 
 def make_drift(

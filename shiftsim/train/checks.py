@@ -58,9 +58,11 @@ def check(planner: Planner, scenarios: Iterable[Scenario]) -> list[dict[str, Any
                 line = scene.route_line(seen.ego.pose)
             except MapError:  # no lane to follow: nothing to expect
                 continue
-            for case in _cases(scenario, seen, line):
-                planner.reset(scene)
-                before = planner.plan(seen)
+            if not (cases := list(_cases(scenario, seen, line))):
+                continue
+            planner.reset(scene)
+            before = planner.plan(seen)
+            for case in cases:
                 planner.reset(scene)
                 after = planner.plan(case.changed)
                 passed[case.check].append(_is_passed(scenario, case, before, after))

@@ -100,11 +100,11 @@ class BlockMaker:
             failed[type(error).__name__] += 1
             return made
         as_recorded = None, _draw(scenario, key)
-        driven = [self._drive(*one, scenario, key) for one in self._driven.get(token, ())]
+        driven = [_draw_driven(*one, scenario, key) for one in self._driven.get(token, ())]
         for states, iterations in (as_recorded, *driven):
+            how: dict[str, Any] = {"as_published": self._stream.as_published, "driven": states}
             for iteration in iterations.tolist():
                 random = np.random.default_rng([*key, iteration + 1])
-                how: dict[str, Any] = {"as_published": self._stream.as_published, "driven": states}
                 try:
                     one = make_sample(self._planner, scenario, iteration, random, **how)
                 except ShiftsimError as error:
@@ -115,21 +115,28 @@ class BlockMaker:
                     made.append(one)
         return made
 
-    def _drive(
-        self, run: Run, task: Task, scenario: Scenario, key: list[int]
-    ) -> tuple[FloatArray, IntArray]:
-        """States of a rollout (K, 11), and some iterations of it."""
-        states = run.rollout(task, scenario).ego
-        drawn = np.random.default_rng([*key, 0, task.seed]).random(len(states)) < DRIVEN
-        return states, np.flatnonzero(drawn)
+
+def _usable(scenario: Scenario) -> IntArray:
+    """Iterations after which 8 s are recorded."""
+    later = scenario.iteration_rows + STEPS * scenario.row_step
+    return np.flatnonzero(later < len(scenario.time_us))
+
+
+def _draw_driven(
+    run: Run, task: Task, scenario: Scenario, key: list[int]
+) -> tuple[FloatArray, IntArray]:
+    """States of a rollout (K, 11), and some of its iterations that have a future."""
+    states, usable = run.rollout(task, scenario).ego, _usable(scenario)
+    usable = usable[usable < len(states)]
+    drawn = np.random.default_rng([*key, 0, task.seed]).random(len(usable)) < DRIVEN
+    return states, usable[drawn]
 
 
 def _draw(scenario: Scenario, key: list[int]) -> IntArray:
     """Some iterations of a scenario that have a future, most of those that are rare on a road."""
-    rows = scenario.iteration_rows
-    later = rows + STEPS * scenario.row_step
-    usable = np.flatnonzero(later < len(scenario.time_us))
-    changes = scenario.ego[later[usable], :3] - scenario.ego[rows[usable], :3]
+    usable = _usable(scenario)
+    rows = scenario.iteration_rows[usable]
+    changes = scenario.ego[rows + STEPS * scenario.row_step, :3] - scenario.ego[rows, :3]
     turning = np.abs(wrap_angles(changes[:, 2])) > TURNING
     standing = np.hypot(changes[:, 0], changes[:, 1]) < STANDING
     share = np.select([turning, ~standing], DRAWN[:2], DRAWN[2])

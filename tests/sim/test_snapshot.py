@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import shiftsim
-from shiftsim.errors import DataError
+from shiftsim.errors import ConfigError, DataError
 from shiftsim.sim.loop import Rollout, drive
 from shiftsim.sim.traffic.mixed import ConstantVelocity
 
@@ -84,3 +84,13 @@ def test_what_does_not_fit_is_refused(scenario):
 def test_views_show_the_noise_of_the_whole_rollout(scenario):
     rollout = Rollout(scenario, shiftsim.load_planner("idm"), noise="ou-high", seed=2)
     assert np.abs(rollout.log().noise).max() > 0.0
+
+
+@pytest.mark.parametrize(
+    "drift", [{"perception": "low"}, {"localization": "low"}, {"latency": 200}]
+)
+def test_under_a_drift_there_are_no_snapshots_and_forks(scenario, drift):
+    rollout = Rollout(scenario, shiftsim.load_planner("constant-velocity"), **drift)
+    for take in (rollout.snapshot, rollout.fork):
+        with pytest.raises(ConfigError, match="no snapshots and forks"):
+            take()
