@@ -507,6 +507,7 @@ function noiseCurves(members) {
   const found = []; // {data, of: rollouts}
   for (const index of members.filter((i) => isNoisy(meta.rollouts[i]))) {
     const { data } = rollouts[index].get("noise");
+    if (!data.some(Boolean)) continue; // what is seen drifts, or plans are late: nothing is added
     const same = found.find((one) => one.data.every((value, i) => value === data[i]));
     if (same) same.of.push(index);
     else found.push({ data, of: [index] });
