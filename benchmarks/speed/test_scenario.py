@@ -22,7 +22,7 @@ from shiftsim.runs.rollouts import Task
 from shiftsim.runs.task import TaskRunner
 from shiftsim.sim import loop
 from shiftsim.sim.loop import simulate
-from shiftsim.sim.noise import parse_noise
+from shiftsim.sim.perception import parse_drift
 from shiftsim.sim.planner import HISTORY_SAMPLES, History, Observation, ObservationBuilder
 
 GOLDEN = Path(__file__).resolve().parents[2] / "tests" / "golden" / "nuplan.tar.xz"
@@ -57,7 +57,7 @@ def runner(scenes, tmp_path_factory):
             place = (scene.route, scene.mission_goal, scene.mapping)
             writer.add_window(Window(name, scene.scenario_type, name, "ego", *rows, *place))
     planners = {"constant-velocity": run_planner("constant-velocity", {})}
-    noises = {"none": parse_noise("none")}
+    noises = {"none": parse_drift("none")}
     runner = TaskRunner(make_config({"planners": [*planners]}), str(path), planners, noises)
     runner.path = str(path)
     return runner
