@@ -75,10 +75,11 @@ def inspect_checkpoint(spec: str) -> Inspection:
     )
 
 
-def convert_checkpoint(spec: str, out: Path) -> Inspection:
+def convert_checkpoint(spec: str, out: Path, *, half: bool = False) -> Inspection:
     """Write the weights that a planner loads, and nothing else, to a safetensors file.
 
-    Its metadata names planner, args and the hash of the source. Returns what is in the new file.
+    Its metadata names planner, args and the hash of the source. With `half` its numbers are
+    float16, for half the size; planners compute with float32. Returns what is in the new file.
 
     Raises:
         CheckpointError: The source is not complete, or of no planner known here.
@@ -98,5 +99,7 @@ def convert_checkpoint(spec: str, out: Path) -> Inspection:
     metadata = {"planner": planner, "source_sha256": checkpoint.file_hash(found.path)}
     if args is not None:
         metadata["args"] = json.dumps(args, sort_keys=True)
+    if half:
+        state = {n: v.half() if v.is_floating_point() else v for n, v in state.items()}
     save_file({name: value.contiguous().clone() for name, value in state.items()}, out, metadata)
     return inspect_checkpoint(str(out))

@@ -108,10 +108,11 @@ def inspect(path: Source, as_json: Json = False) -> None:
 def convert(
     path: Source,
     out: Path = Argument(metavar="OUT", help="File to write: ….safetensors"),
+    half: bool = Option(False, "--half", help="As float16, for half the size."),
     as_json: Json = False,
 ) -> None:
     """Write the weights that the planner loads, and nothing else, to a safetensors file."""
     from shiftsim.planners.learned.convert import convert_checkpoint
 
-    converted = convert_checkpoint(path, out)
+    converted = convert_checkpoint(path, out, half=half)
     print_result(converted.to_dict(), converted.lines(), as_json=as_json)

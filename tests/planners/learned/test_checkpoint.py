@@ -329,6 +329,19 @@ def test_a_converted_file_loads_with_equal_tensors(tmp_path, planner):
     assert weights.args == load_weights(str(source), planner).args
 
 
+def test_a_file_of_half_size_holds_the_nearest_numbers(tmp_path, plantf):
+    source = save(lightning_entries(plantf), tmp_path / "a.ckpt")
+    out, half = tmp_path / "a.safetensors", tmp_path / "half.safetensors"
+    convert_checkpoint(str(source), out)
+    assert convert_checkpoint(str(source), half, half=True).problem == ""
+    assert half.stat().st_size < 0.52 * out.stat().st_size
+    exact, near = (load_weights(str(path), "plantf").state for path in (out, half))
+    for name, value in exact.items():
+        assert near[name].dtype == value.dtype
+        wanted = value.half().to(value.dtype) if value.is_floating_point() else value
+        assert near[name].equal(wanted)
+
+
 def test_what_is_not_complete_is_not_converted(tmp_path, plantf):
     entries = lightning_entries(plantf)
     del entries["state_dict"]["model.norm.bias"]
