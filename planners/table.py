@@ -106,6 +106,7 @@ _ENTRIES = (
         "imitation with a transformer over agents and map",
         _NETWORK,
         Published("planTF.ckpt", "jchengai/planTF", "planTF.ckpt", megabytes=8),
+        "planners/learned/plantf/shiftsim.safetensors",
     ),
     PlannerEntry(
         "pluto",

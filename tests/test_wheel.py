@@ -15,10 +15,10 @@ from shiftsim.data.synthetic.store import demo_store
 from shiftsim.planners.table import SHIPPED_NOTE
 
 MOST = 3.0e6  # bytes, without weights
-SHIPPED = "shiftsim/planners/learned/carl/shiftsim.safetensors"
+SHIPPED = [f"shiftsim/planners/learned/{name}/shiftsim.safetensors" for name in ("carl", "plantf")]
 HEADLINE = "shiftsim run --planner carl --noise ou-high"
 MOST_SECONDS = 180.0  # from the command to its table
-MOST_OF_WEIGHTS = 9.0e6  # bytes: a network of CaRL in single precision
+MOST_OF_WEIGHTS = 13.0e6  # bytes: a network of CaRL in single precision, others in half of it
 
 
 def tracked():
@@ -55,7 +55,7 @@ def test_a_wheel_holds_the_package_with_its_data_and_weights_and_is_small(wheel)
     with zipfile.ZipFile(wheel) as archive:
         sizes = {info.filename: info.compress_size for info in archive.infolist()}
     for name in (
-        SHIPPED,
+        *SHIPPED,
         "shiftsim/py.typed",
         "shiftsim/benchmarks/published.toml",
         "shiftsim/report/cite.bib",
@@ -66,7 +66,7 @@ def test_a_wheel_holds_the_package_with_its_data_and_weights_and_is_small(wheel)
     sources = {path.relative_to(copy) for path in (copy / "shiftsim").rglob("*.py")}
     assert {str(name) for name in sources} <= modules
     assert not [name for name in sizes if "/tests/" in name or "/speed/" in name]
-    assert sizes.pop(SHIPPED) < MOST_OF_WEIGHTS
+    assert sum(map(sizes.pop, SHIPPED)) < MOST_OF_WEIGHTS
     assert sum(sizes.values()) < MOST
 
 

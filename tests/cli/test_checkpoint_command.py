@@ -104,15 +104,21 @@ def test_what_cannot_be_done_is_two_lines(place, words, fact, hint):
 def test_planners_says_what_is_wanted_and_what_is_ready(place):
     done = call(place, "planners")
     assert done.returncode == 0, done.stderr
-    own = shipped_file("carl") is not None
+    own = {name: shipped_file(name) is not None for name in LEARNED}
     wanted = "planTF.ckpt (weights of 8 MB) from the project jchengai/planTF"
     assert wanted in done.stdout
-    assert f"no checkpoint: give one, or put it at {place / 'mine' / 'planTF.ckpt'}" in done.stdout
-    assert f"{6 + own} of 10 are ready to run" in done.stdout
+    assert (
+        f"no checkpoint: give one, or put it at {place / 'mine' / 'diffusion-planner'}"
+        in done.stdout
+    )
+    assert f"{6 + sum(own.values())} of 10 are ready to run" in done.stdout
     (place / "mine").mkdir()
     (place / "mine" / "planTF.ckpt").symlink_to(place / "planTF.ckpt")
     rows = {row["name"]: row for row in json.loads(call(place, "planners", "--json").stdout)}
     assert rows["plantf"]["ready"]
-    assert [rows[name]["ready"] for name in LEARNED] == [own, False, True, False]
+    own["plantf"] = True
+    assert {name: rows[name]["ready"] for name in LEARNED} == own
     assert rows["carl"]["checkpoint"]["project"] == "autonomousvision/CaRL"
-    assert f"{7 + own} of 10 are ready to run" in call(place, "planners", "list").stdout
+    assert (
+        f"{6 + sum(own.values())} of 10 are ready to run" in call(place, "planners", "list").stdout
+    )
