@@ -42,8 +42,7 @@ class ScenarioFilter:
 def read_filter(path: Path) -> ScenarioFilter:
     """Read a scenario filter (.yaml, .yml) or a list of tokens, one per line (any other ending).
 
-    Raises:
-        ConfigError: The file cannot be read, or asks for something that is not supported.
+    Raises ConfigError: the file cannot be read, or asks for something that is not supported.
     """
     if Path(path).suffix not in (".yaml", ".yml"):
         lines = [line.split("#")[0].strip() for line in _read_text(path).splitlines()]

@@ -83,11 +83,7 @@ def mapping_of(scenario_type: str) -> Mapping:
 
 
 def parse_mapping(text: str) -> Mapping:
-    """A mapping from `DURATION,OFFSET,RATIO`, such as `15,0,0.5`.
-
-    Raises:
-        ConfigError: It does not consist of three sensible numbers.
-    """
+    """A mapping from `DURATION,OFFSET,RATIO`, such as `15,0,0.5`; else a ConfigError."""
     hint = "write DURATION,OFFSET,RATIO in seconds, such as 15,0,0.5; 0 < RATIO <= 1"
     try:
         duration, offset, ratio = (float(part) for part in text.split(","))

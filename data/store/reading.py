@@ -232,8 +232,7 @@ def _limit(opened: dict[Any, Any]) -> None:
 def open_store(path: str | Path) -> ScenarioStore:
     """Open the store in a folder, or behind the URL of one.
 
-    Raises:
-        DataError: There is no store, or it is damaged or of another version.
+    Raises DataError: there is no store, or it is damaged or of another version.
     """
     if "://" in str(path):
         from shiftsim.data.store.remote import RemoteFiles

@@ -28,10 +28,7 @@ def select_tasks(
 
     The token may be an unambiguous beginning of one. Rows are those of `tasks.parquet`, with `cls`,
     `why` and `metrics` added; every metric has its `role` (`multiplier`, `weighted` or empty) and
-    `weight`.
-
-    Raises:
-        ConfigError: There is no such task, or several scenarios begin like that.
+    `weight`. It is a ConfigError if there is no such task, or several scenarios begin like that.
     """
     tokens = set(run.tasks["token"].to_pylist())
     full = beginning(f"run {run.path.name!r}", "scenario", token, tokens)
@@ -109,8 +106,7 @@ def explain_tasks(
 ) -> dict[str, list[dict[str, Any]]]:
     """The tasks of one scenario, as `select_tasks` gives them, by the name of their run.
 
-    Raises:
-        ConfigError: None of the runs has such a task.
+    Raises ConfigError: none of the runs has such a task.
     """
     found: dict[str, list[dict[str, Any]]] = {}
     for run in runs:

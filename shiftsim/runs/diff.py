@@ -100,10 +100,8 @@ def diff_runs(
     """Compare two runs, and look into a number of changes, the largest of the score first.
 
     Rollouts part where a quantity differs by more than the tolerance [m, rad, …]. Planners are
-    paired by name; two runs of one planner each are compared whatever their names.
-
-    Raises:
-        ConfigError: They have no rollout in common.
+    paired by name; two runs of one planner each are compared whatever their names. It is a
+    ConfigError if they have no rollout in common.
     """
     planners = [run.manifest["config"]["planners"] for run in (first, second)]
     single = len(planners[0]) == len(planners[1]) == 1
@@ -236,8 +234,7 @@ def find_departure(
 ) -> Departure | None:
     """The first step at which two stored rollouts differ by more than a tolerance, if any.
 
-    Raises:
-        ValueError: One is damaged.
+    It is a ValueError if one is damaged.
     """
     rows = min(len(first), len(second))
     tokens = sorted({*_track_tokens(first), *_track_tokens(second)})

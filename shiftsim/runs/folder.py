@@ -60,10 +60,8 @@ class RunWriter:
         """Begin a run, or `resume` one: keep what is finished.
 
         The manifest is written as `running`, unless a complete run is there, which stays as it is
-        until this one has finished as well.
-
-        Raises:
-            ConfigError: Another process works on this folder.
+        until this one has finished as well. It is a ConfigError if another process works on the
+        folder.
         """
         self.path = path
         path.mkdir(parents=True, exist_ok=True)
@@ -105,8 +103,7 @@ class RunWriter:
     def add(self, result: TaskResult) -> None:
         """Put one result on disk; a file of another run that holds its rollout is linked to.
 
-        Raises:
-            OSError: The disk is full; what is there already stays.
+        Raises OSError: the disk is full; what is there already stays.
         """
         if result.location is not None:
             file = self._link(result.location.file)

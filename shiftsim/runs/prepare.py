@@ -93,9 +93,7 @@ def prepare(
     """Resolve every name and check everything that a run needs.
 
     Classes or instances of planners, drifts, and edits take the place of the names in the settings.
-
-    Raises:
-        ShiftsimError: Something is unknown, missing or contradictory.
+    It is a ShiftsimError if something is unknown, missing or contradictory.
     """
     models = list(noises) or make_drifts(*(getattr(config, name) for name in DRIFT))
     values: dict[str, Any] = {one.name: one.default for one in fields(config) if one.name in DRIFT}

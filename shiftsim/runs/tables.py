@@ -164,11 +164,7 @@ def _rows_by_task(path: Path) -> Iterator[tuple[Task, list[dict[str, Any]]]]:
 
 
 def read_table(path: Path) -> pa.Table:
-    """A table of a run.
-
-    Raises:
-        DataError: It is missing or damaged.
-    """
+    """A table of a run, or a DataError."""
     schema = TABLES[path.stem]
     return pa.Table.from_batches((batch.select(schema.names) for batch in _batches(path)), schema)
 

@@ -256,11 +256,7 @@ CHECKS = {
 
 
 def check_reference(name: str, report: Report) -> None:
-    """Compare with one file, a name in `CHECKS`.
-
-    Raises:
-        DataError: The file is missing or damaged.
-    """
+    """Compare with one file, a name in `CHECKS`; a DataError if it is missing or damaged."""
     path = REFERENCE / name
     try:
         with np.load(path, allow_pickle=False) as archive:

@@ -167,8 +167,7 @@ def _require_msgpack(files: Iterable[Path]) -> None:
 def log_source(path: Path) -> Rollouts | None:
     """The rollouts of a log, or of all logs in a folder; None where there is none.
 
-    Raises:
-        MissingExtraError: They cannot be read without the extra `nuplan`.
+    Raises MissingExtraError: they cannot be read without the extra `nuplan`.
     """
     files = sorted(path.rglob("*.xz")) if path.is_dir() else [path] * (path.suffix == ".xz")
     if not files:
@@ -206,11 +205,7 @@ def _driven(path: Path) -> Driven:
 
 
 def read_simulation_log(path: Path, report: Report) -> Recorded:
-    """Read one log.
-
-    Raises:
-        DataError: It is damaged, or not as the known version of the devkit writes it.
-    """
+    """Read one log; a DataError if it is damaged, or not as the known devkit writes it."""
     try:
         reader = _LogReader(_unpacked(path))
         return _recorded(reader.load(), report, frozenset(reader.left_out))

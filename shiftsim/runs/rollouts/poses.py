@@ -97,15 +97,9 @@ def rollout_of(
 ) -> tuple[SimulationLog, tuple[str, ...]]:
     """The rollout that poses in a scenario are, and what a reader of its score must know.
 
-    Args:
-        driven: The poses, with states and boxes as far as they are given.
-        scenario: Where they were driven.
-        point: Which of `POINTS` the poses are of.
-        recorded: Whether the others did what was recorded, if no boxes are given.
-        partial: Whether it may end before the scenario: the expert then ends as well.
-
-    Raises:
-        DataError: Something cannot be right; the message names the row.
+    The poses are of one of `POINTS`; `recorded`: the others did what was recorded, if no boxes are
+    given; `partial`: it may end before the scenario, and the expert then ends as well. Raises
+    DataError: something cannot be right; the message names the row.
     """
     _check_rows(driven)
     states, remarks = np.array(driven.states), [*driven.remarks]

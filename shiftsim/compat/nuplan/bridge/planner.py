@@ -137,10 +137,8 @@ def to_trajectory(plan: Any, now_us: int, next_us: int, planner: str) -> Traject
     """What a planner returned, as ours; the times are those of this iteration and the next [us].
 
     The states of an `InterpolatedTrajectory` are taken as they are. Another kind of trajectory is
-    asked for its states wherever the simulation looks at it.
-
-    Raises:
-        PlannerError: It is no trajectory of ego states.
+    asked for its states wherever the simulation looks at it. It is a PlannerError if the states are
+    not those of an ego.
     """
     if not isinstance(plan, AbstractTrajectory):
         raise PlannerError(
@@ -194,8 +192,7 @@ class NuplanPlanner:
     def reset(self, scene: SceneInfo) -> None:
         """Initialize the planner; of a class a new one, unless the present one is still unused.
 
-        Raises:
-            ConfigError: It asks for sensor data.
+        Raises ConfigError: it asks for sensor data.
         """
         if self._scene is not None:
             self.close()
@@ -212,11 +209,7 @@ class NuplanPlanner:
         self._planner.initialize(PlannerInitialization(list(scene.route), goal, _maps(scene.map)))
 
     def plan(self, observation: Observation) -> Trajectory:
-        """The planner's trajectory.
-
-        Raises:
-            PlannerError: It returned something else.
-        """
+        """The planner's trajectory; a PlannerError where it returned something else."""
         if self._scene is None or self._history is None:
             raise PlannerError(f"planner {self.name!r}: plan() was called before reset()")
         found = self._planner.compute_trajectory(self._history.planner_input(observation))
