@@ -88,8 +88,7 @@ def add_interplan(
 ) -> MetricResult:
     """The result with interPlan's metrics and its score.
 
-    Raises:
-        DataError: The ego or the expert was never on the route.
+    Raises DataError: the ego or the expert was never on the route.
     """
     lanes = lane_changes_to_goal(road, log)
     final = float("nan") if lanes.final is None else float(lanes.final)
@@ -128,8 +127,7 @@ def share_of_obstacles(expert: FloatArray, obstacles: FloatArray) -> float:
 def lane_changes_to_goal(road: VectorMap, log: SimulationLog) -> LaneChanges:
     """Lane changes needed at the start and at the end of a rollout.
 
-    Raises:
-        DataError: The ego or the expert was never on the route.
+    Raises DataError: the ego or the expert was never on the route.
     """
     count = len(log.ego)
     # nuPlan rule 717: the expert counts only as long as the ego drove

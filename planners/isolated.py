@@ -54,11 +54,7 @@ class Isolated:
         return Isolated, self._given
 
     def identify(self) -> dict[str, Any]:
-        """The fingerprint of the planner, which is made to see that it works.
-
-        Raises:
-            PlannerError: It cannot be made.
-        """
+        """The fingerprint of the planner, which is made to see that it works, or a PlannerError."""
         return dict(self._started()[0])
 
     @property

@@ -72,9 +72,7 @@ def _construct(name: str, make: Callable[[], Any]) -> Any:
 def planner_factory(spec: str) -> Any:
     """The class, or other callable, that makes the planner `spec` (see `load_planner`).
 
-    Raises:
-        ConfigError: There is none.
-        MissingExtraError: It needs more of nuPlan's devkit than its shims have.
+    Raises ConfigError: there is none. MissingExtraError: it needs more than nuPlan's shims have.
     """
     for prefix, adapter in _ADAPTERS.items():
         if spec.startswith(prefix):
@@ -114,16 +112,11 @@ def planner_factory(spec: str) -> Any:
 
 
 def planner_fingerprint(spec: str, arguments: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """All that tells one planner from another, as JSON values.
+    """All that tells one planner from another, as JSON values; errors are those of `load_planner`.
 
     Custom planners carry the hash of their module's source, policies and file arguments that of the
     file, learned planners that of their checkpoint and the kind of their device; what else they
     depend on is not seen.
-
-    Raises:
-        ConfigError: The planner or an argument is wrong.
-        CheckpointError: A learned planner has no checkpoint.
-        MissingExtraError: A learned planner needs PyTorch.
     """
     entry = PLANNERS.get(spec)
     factory = planner_factory(spec)
@@ -218,10 +211,8 @@ class RunPlanner:
 def run_planner(source: Any, arguments: Mapping[str, Any], name: str = "") -> RunPlanner:
     """A planner given by name, class or instance; it is made here, to see that it works.
 
-    It is called `name` in tables, by default as `planner_name` says.
-
-    Raises:
-        ShiftsimError: It does not exist, or cannot be made.
+    It is called `name` in tables, by default as `planner_name` says. It is a ShiftsimError if it
+    does not exist, or cannot be made.
     """
     name = name or planner_name(source)
     if isinstance(source, str):

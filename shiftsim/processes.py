@@ -65,11 +65,7 @@ class Process:
             self.connection.send(value)
 
     def receive(self) -> Any:
-        """The next value that the process sends.
-
-        Raises:
-            ProcessEndedError: It has ended.
-        """
+        """The next value that the process sends, or a ProcessEndedError."""
         try:
             return self.connection.recv()
         except (EOFError, OSError, pickle.UnpicklingError) as error:

@@ -167,11 +167,7 @@ class ScenarioStore:
         return scene
 
     def map(self, city: str) -> VectorMap:
-        """A map; kept for the next scenario of that city.
-
-        Raises:
-            DataError: The store has no such map, or its file is damaged.
-        """
+        """A map, kept for the next scenario of that city; a DataError if missing or damaged."""
         if city not in self._maps:
             self._maps[city] = read_map_file(self.map_file(city))
         return self._maps[city]

@@ -75,10 +75,8 @@ def load_weights(spec: str, planner: str, *, device: str = "cpu") -> Weights:
     `DETERMINISTIC`; `official`, `shiftsim`, or empty for the first of these two. The tensors go to
     the `device`, as in `resolve_device`, where torch is set up for inference.
 
-    Raises:
-        CheckpointError: There is no such file, it is damaged, or it is of another network.
-        ConfigError: There is no such device.
-        MissingExtraError: PyTorch is not installed.
+    Raises CheckpointError: there is no such file, it is damaged, or it is of another network.
+    ConfigError: there is no such device. MissingExtraError: PyTorch is not installed.
     """
     require_torch(f"planner {planner!r}")
     import torch

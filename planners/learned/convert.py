@@ -49,9 +49,7 @@ class Inspection:
 def inspect_checkpoint(spec: str) -> Inspection:
     """Look into a checkpoint: a file, a folder that holds one, or a name in their folder.
 
-    Raises:
-        CheckpointError: It is no checkpoint, or it is damaged.
-        MissingExtraError: PyTorch is not installed.
+    Raises CheckpointError: it is no checkpoint, or it is damaged.
     """
     require_torch("reading a checkpoint")
     found = checkpoint.open_checkpoint(checkpoint.find_checkpoint(spec))
@@ -78,10 +76,8 @@ def inspect_checkpoint(spec: str) -> Inspection:
 def convert_checkpoint(spec: str, out: Path) -> Inspection:
     """Write the weights that a planner loads, and nothing else, to a safetensors file.
 
-    Its metadata names planner, args and the hash of the source. Returns what is in the new file.
-
-    Raises:
-        CheckpointError: The source is not complete, or of no planner known here.
+    Its metadata names planner, args and the hash of the source. Returns what is in the new file. It
+    is a CheckpointError if the source is not complete, or of no planner known here.
     """
     require_torch("converting a checkpoint")
     from safetensors.torch import save_file

@@ -165,11 +165,7 @@ class PdmClosed:
         self.seen: Seen | None = None
 
     def reset(self, scene: SceneInfo) -> None:
-        """Look up the route; it is corrected at the first plan.
-
-        Raises:
-            PlannerError: The route is empty or unknown to the map.
-        """
+        """Look up the route, or a PlannerError; it is corrected at the first plan."""
         known_blocks(scene.map, scene.route, scene.token, self.name)
         self._scene = scene
         self.collided = []

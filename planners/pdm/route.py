@@ -38,8 +38,7 @@ class Route(NamedTuple):
 def start_route(road: VectorMap, ids: Sequence[str], ego: FloatArray, token: str) -> Route:
     """Correct a route, given by roadblock ids, at the start of a scenario, from an ego state (11,).
 
-    Raises:
-        PlannerError: The route is empty, unknown to the map, or has no lanes.
+    Raises PlannerError: the route is empty, unknown to the map, or has no lanes.
     """
     blocks = known_blocks(road, ids, token, "pdm-closed")
     square = square_around(float(ego[0]), float(ego[1]), START_HALF_WIDTH)

@@ -57,10 +57,8 @@ def apply_edit(
     """The scenario that an edit makes of a recorded one.
 
     Codes of interPlan need `driven_lanes`, such as `metrics.interplan.driven_lanes`, and what
-    begins in traffic that reacts needs a `replay` of it.
-
-    Raises:
-        ConfigError: It cannot be applied; the message names scenario, edit and reason.
+    begins in traffic that reacts needs a `replay` of it. It is a ConfigError if it cannot be
+    applied; the message names scenario, edit and reason.
     """
     try:
         if edit.start is not None:

@@ -273,8 +273,7 @@ def _plain(value: Any) -> str:
 def make_edit(table: Mapping[str, Any], where: str) -> Edit:
     """An edit from its table; `where` is for messages.
 
-    Raises:
-        ConfigError: A key is unknown or missing, or a value is wrong.
+    Raises ConfigError: a key is unknown or missing, or a value is wrong.
     """
     edit = make_table(Edit, _renamed(table), where, _check)
     where = f"{where} {edit.name!r}"

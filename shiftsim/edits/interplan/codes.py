@@ -125,10 +125,8 @@ def import_names(
     """The table of an `edits.toml` for a list of interPlan's names and its modifications.
 
     Both are what the files of interPlan's repository hold, which are not part of this package. The
-    `window` is the duration of the scenarios [s], 0 for the recorded one.
-
-    Raises:
-        ConfigError: They do not hold it, or a code is wrong.
+    `window` is the duration of the scenarios [s], 0 for the recorded one. It is a ConfigError if
+    the files do not hold it, or a code is wrong.
     """
     listed, details = names.get("scenario_tokens"), modifications.get(DETAILS)
     if not isinstance(listed, list) or not isinstance(details, dict):
