@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from shiftsim.data.nuplan.geopackage import FeatureLayer, write_geopackage
-from shiftsim.data.nuplan.sqlite import Value
+from shiftsim.data.nuplan.sqlite import FeatureLayer, Value, write_geopackage
 from shiftsim.errors import ConversionError
 from shiftsim.world.layers import Layer, Polylines
 from shiftsim.world.map import NONE, VectorMap

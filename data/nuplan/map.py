@@ -8,8 +8,7 @@ from typing import Any
 
 import shapely
 
-from shiftsim.data.nuplan.geopackage import REPAIR, GeoPackage, LayerTable
-from shiftsim.data.nuplan.sqlite import open_database
+from shiftsim.data.nuplan.sqlite import REPAIR, GeoPackage, LayerTable, open_database
 from shiftsim.data.polygons import shared_areas
 from shiftsim.errors import DataError, MapError
 from shiftsim.kernels import FloatArray

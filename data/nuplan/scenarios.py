@@ -8,8 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.data.nuplan.boxes import make_tracks, read_boxes
-from shiftsim.data.nuplan.log import Log, has_goals, read_ego, read_lights, read_route, read_types
+from shiftsim.data.nuplan.log import (
+    Log,
+    has_goals,
+    make_tracks,
+    read_boxes,
+    read_ego,
+    read_lights,
+    read_route,
+    read_types,
+)
 from shiftsim.data.nuplan.map import read_map
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.errors import ConfigError, ConversionError, DataError
