@@ -23,12 +23,7 @@ from shiftsim.errors import ConfigError, DataError, one_of
 from shiftsim.files import DEFAULT_STORE, store_path, write_text
 from shiftsim.report import build
 from shiftsim.report.figures import figures
-from shiftsim.report.groups import (
-    Group,
-    KnownSet,
-    read_groups,
-    token_digest,
-)
+from shiftsim.report.groups import Group, KnownSet, read_groups, token_digest
 from shiftsim.report.palette import DEFAULT_FORM, FigureFormat
 from shiftsim.report.tables import FORMATS, Table
 from shiftsim.runs.avoidable import grade

@@ -11,13 +11,7 @@ from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.planners.proposals.areas import Areas, index_ranks, make_areas
 from shiftsim.planners.proposals.places import EgoBox
 from shiftsim.planners.routes.correction import Start, correct_route, find_start, known_blocks
-from shiftsim.planners.routes.graph import (
-    HINT,
-    Search,
-    deviation,
-    lane_at,
-    search_cheapest,
-)
+from shiftsim.planners.routes.graph import HINT, Search, deviation, lane_at, search_cheapest
 from shiftsim.world.layers import square_around
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import HEADING, X, Y

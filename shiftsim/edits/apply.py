@@ -21,14 +21,7 @@ from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.events import CAUTIOUS, FOLLOW, OFF, STOPPED, ScriptedPedestrian
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import (
-    HEADING,
-    NUM_STATE,
-    AgentKind,
-    LightStatus,
-    Tracks,
-    TrafficLights,
-)
+from shiftsim.world.state import HEADING, NUM_STATE, AgentKind, LightStatus, Tracks, TrafficLights
 
 SIZES = {  # length, width [m]
     "vehicle": (4.6, 1.9),

@@ -10,11 +10,7 @@ import numpy as np
 
 from shiftsim.compat.nuplan.shims.boxes import CarFootprint, OrientedBox, VehicleParameters
 from shiftsim.compat.nuplan.shims.geometry import StateSE2, StateVector2D, TimePoint, part
-from shiftsim.compat.nuplan.shims.objects import (
-    AgentState,
-    SceneObjectMetadata,
-    TrackedObjectType,
-)
+from shiftsim.compat.nuplan.shims.objects import AgentState, SceneObjectMetadata, TrackedObjectType
 from shiftsim.compat.nuplan.shims.transforms import (
     approximate_derivatives,
     lateral_projection,
