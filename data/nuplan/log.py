@@ -17,16 +17,9 @@ from shiftsim.data.nuplan.sqlite import Database, open_database
 from shiftsim.data.recording import sort_tracks
 from shiftsim.errors import ConversionError, DataError
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
+from shiftsim.world import state
 from shiftsim.world.ranges import NUPLAN_LOG, STORE, require
-from shiftsim.world.state import (
-    LAST_AGENT_KIND,
-    NUM_STATE,
-    AgentKind,
-    LightStatus,
-    Tracks,
-    TrafficLights,
-    tracks_of_boxes,
-)
+from shiftsim.world.state import AgentKind, LightStatus, Tracks, TrafficLights, tracks_of_boxes
 
 LIDAR_CHANNEL = "MergedPointCloud"
 _REPAIR = "the log is damaged or not a nuPlan log; get it again from its source"
@@ -245,7 +238,7 @@ def read_ego(log: Log, first: int, last: int, flaws: Counter[str] | None = None)
     values = as_numbers(log.path, "ego_pose", rows)
     with np.errstate(invalid="ignore"):
         heading = yaw_of(values[:, 2:6])
-    states = np.zeros((len(values), NUM_STATE))
+    states = np.zeros((len(values), state.NUM_STATE))
     states[:, :2], states[:, 2], states[:, 3:7] = values[:, :2], heading, values[:, 6:10]
     bad = np.flatnonzero(~np.isfinite(states).all(axis=1))
     if len(bad):
@@ -413,7 +406,7 @@ def make_tracks(boxes: Boxes, first: int, last: int, flaws: Counter[str]) -> Tra
     place = np.argsort(order)
     dense = np.full((last - first, len(index), 7), np.nan)
     dense[frame, place[track]] = boxes.values[:, :7]
-    dense[:, kinds[order] > LAST_AGENT_KIND, 3:5] = np.nan  # nuPlan rule 420
+    dense[:, kinds[order] > state.LAST_AGENT_KIND, 3:5] = np.nan  # nuPlan rule 420
     tokens = np.array(list(index), object)[order].tolist()
     tracks = tracks_of_boxes(dense, kinds[order], tokens)
     twice = int(len(frame) - tracks.valid.sum())

@@ -16,14 +16,8 @@ from shiftsim._version import __version__
 from shiftsim.data import open_store
 from shiftsim.errors import ConfigError, one_of
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
-from shiftsim.planners.registry import (
-    PLANNERS,
-    RunPlanner,
-    own_name,
-    planner_name,
-    run_planner,
-    takes_argument,
-)
+from shiftsim.planners import registry
+from shiftsim.planners.registry import PLANNERS, RunPlanner, planner_name, takes_argument
 from shiftsim.runs.config import DRIFT, RunConfig, Value, default_workers, parse_shard, split_label
 from shiftsim.runs.manifest import State, check_resumable, check_target, code_digest
 from shiftsim.runs.rollouts import Task
@@ -170,7 +164,7 @@ def _traffic(config: RunConfig) -> tuple[RunPlanner | None, dict[str, Any], bool
         arguments: dict[str, Value] = dict(config.planner_args.get(name, {}))
         if takes_argument(name, "device"):
             arguments.setdefault("device", config.device)
-        planner = run_planner(name, arguments)
+        planner = registry.run_planner(name, arguments)
         return planner, {"traffic_made_of": dict(planner.fingerprint)}, False
     try:
         model = make_traffic(config.traffic, config.device)
@@ -206,7 +200,7 @@ def _planners(config: RunConfig, given: Sequence[Any]) -> list[RunPlanner]:
             arguments.setdefault("device", config.device)
         size = 0 if isolates or takes_argument(source, "batch_size") else _batch_size(arguments)
         isolated = _isolated(config, source, arguments) if isolates else source
-        entry = run_planner(isolated, arguments, name)
+        entry = registry.run_planner(isolated, arguments, name)
         if size and not entry.in_batches:
             raise ConfigError(
                 f"planner {name!r} takes no batch_size: it answers for one scenario at a time",
@@ -216,7 +210,7 @@ def _planners(config: RunConfig, given: Sequence[Any]) -> list[RunPlanner]:
             entry.batch_size, entry.fingerprint = size, {**entry.fingerprint, "batch_size": size}
         entries.append(entry)
         is_custom = isinstance(source, str) and source == name and source not in PLANNERS
-        names.append(own_name(entry) if is_custom else name)
+        names.append(registry.own_name(entry) if is_custom else name)
     for entry, name in zip(entries, names, strict=True):
         entry.name = name if names.count(name) == 1 else entry.name
     return entries
