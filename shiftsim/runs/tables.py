@@ -96,6 +96,7 @@ class TaskResult:
         None  # where the rollout is stored, where it is in a file already
     )
     warning: str = ""  # why the first plan is most likely not what was meant
+    remarks: tuple[str, ...] = ()  # what a reader must know of a rollout that was driven elsewhere
 
     def rows(self) -> dict[str, list[dict[str, Any]]]:
         """Its rows by table."""

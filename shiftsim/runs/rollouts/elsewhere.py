@@ -52,7 +52,7 @@ class Entry(NamedTuple):
     """A rollout that waits to be scored."""
 
     task: Task
-    read: Callable[[], Driven]
+    read: Any = None  # makes the `Driven` of one that was driven elsewhere
 
 
 @dataclass(frozen=True)
