@@ -69,7 +69,6 @@ class ObservedTracks(DetectionsTracks):
 
     @cached_property
     def tracked_objects(self) -> Any:
-        """The objects."""
         present = np.flatnonzero(self._tracks.valid[0]).tolist()
         return TrackedObjects([self._object(track) for track in present])
 
