@@ -72,7 +72,8 @@ def plan_bench(
     """
     values = dict(settings)
     resumes = values.pop("resume", False)
-    modes = given_modes(values.pop("traffic", None)) or list(track.traffic)
+    given = values.pop("traffic", None) or list(track.traffic)
+    modes = [given] if isinstance(given, str) else [*given]
     edits_of = str(values.pop("edits", ""))
     values = {
         # where others are given there is no noise but what is given
@@ -122,11 +123,6 @@ def plan_bench(
     edited = _prepared(track, changed, drivable, folder, edits)
     lists = (_list_of(unlimited), _list_of(_without_limit(next(iter(edited.values())))))
     return Plan(track, folder, runs | edited, lists, text)
-
-
-def given_modes(traffic: str | Sequence[str] | None) -> list[str]:
-    """Traffic modes that were given, one or a list."""
-    return [traffic] if isinstance(traffic, str) else [*(traffic or ())]
 
 
 def _plan_towns(track: Track, values: Mapping[str, Any], modes: Sequence[str], out: str) -> Plan:

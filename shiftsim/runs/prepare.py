@@ -60,12 +60,6 @@ class RunPlan:
         """All tasks whose scenario exists."""
         return tuple(task for batch in self.batches for task in batch)
 
-    @property
-    def is_serial(self) -> bool:
-        """Whether this process does all tasks itself."""
-        config = self.config
-        return config.executor == "processes" and self.workers <= 1 and not config.timeout
-
     def runner(self) -> "partial[TaskRunner]":
         """What makes the function that does batches, in this process or in another one."""
         given = (self.config, self.store, self.planners, self.noises, self.selection.edits)
@@ -149,7 +143,7 @@ def prepare(
         workers=workers,
         shared=shared if workers > 1 else (),
     )
-    if not plan.is_serial:
+    if config.executor != "processes" or workers > 1 or config.timeout:  # others do the tasks
         plan.close_planners()
     return plan
 

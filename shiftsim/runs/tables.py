@@ -142,7 +142,10 @@ def stored_location(
 
 def stored_results(run: Path) -> Iterator[TaskResult]:
     """The results that the tables of a run hold, in their order, without those that are missing."""
-    found = {name: _rows_by_task(run / f"{name}.parquet") for name in TABLES}
+    found = {}
+    for name in TABLES:
+        rows_of = (row for batch in _batches(run / f"{name}.parquet") for row in batch.to_pylist())
+        found[name] = ((task, list(group)) for task, group in groupby(rows_of, task_of))
     for task, tasks in found["tasks"]:
         status, rows = tasks[0]["status"], {"tasks": tasks}
         for name in ("scores", "metrics"):
@@ -157,11 +160,6 @@ def _next_rows(task: Task, rows: Iterator[Any], table: Path) -> list[dict[str, A
         what = f"the rows of {describe(task)} are missing"
         raise damaged(table.with_suffix(".parquet"), what)
     return list(values)
-
-
-def _rows_by_task(path: Path) -> Iterator[tuple[Task, list[dict[str, Any]]]]:
-    rows = (row for batch in _batches(path) for row in batch.to_pylist())
-    return ((task, list(group)) for task, group in groupby(rows, task_of))
 
 
 def read_table(path: Path) -> pa.Table:
