@@ -109,13 +109,8 @@ class MetricResult:
 def measure(log: SimulationLog, map: VectorMap) -> Measurements:
     """Measure one rollout; `evaluate` applies thresholds to the result.
 
-    Args:
-        log: The rollout.
-        map: Map it was driven on.
-
-    Raises:
-        DataError: The rollout is too short, or a state is not finite.
-        MapError: The map is such that nuPlan's own code stops.
+    Raises DataError: the rollout is too short, or a state is not finite. MapError: the map is such
+    that nuPlan's own code stops.
     """
     tracks = collision.flat_tracks(log.tracks)
     _check(log, tracks)

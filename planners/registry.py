@@ -32,21 +32,13 @@ _NO_PICKLE = (pickle.PicklingError, TypeError, AttributeError, NotImplementedErr
 
 
 def load_planner(spec: str, arguments: Mapping[str, Any] | None = None) -> Planner:
-    """A new planner.
+    """A new planner, or the errors of `shiftsim.load_planner`.
 
-    Args:
-        spec: Registered name, or `package.module:Class` of a custom planner, which may lie in the
-            current directory, or `file.py:Class`; with `nuplan:` before it where it is written for
-            nuPlan. Or `policy:FILE` (see `shiftsim.env.policy`).
-        arguments: Arguments of its constructor; texts are converted to what it asks for.
-
-    A learned planner without a `checkpoint` takes its published file from the folder of
-    checkpoints, else our own weights where there are any.
-
-    Raises:
-        ConfigError: The name, the module, the class or an argument is wrong.
-        CheckpointError: A learned planner has no checkpoint, or the wrong one.
-        MissingExtraError: A learned planner needs PyTorch.
+    `spec` is a registered name, or `package.module:Class` of a custom planner, which may lie in the
+    current directory, or `file.py:Class`; with `nuplan:` before it where it is written for nuPlan.
+    Or `policy:FILE` (see `shiftsim.env.policy`). Texts among the arguments are converted to what
+    its constructor asks for. A learned planner without a `checkpoint` takes its published file from
+    the folder of checkpoints, else our own weights where there are any.
     """
     factory = planner_factory(spec)
     values = _bind(spec, factory, arguments or {})

@@ -38,10 +38,8 @@ class Process:
     def __init__(self, words: Sequence[str], env: Mapping[str, str] | None = None) -> None:
         """Start a program; its last two arguments are the parent's process id and its socket.
 
-        On Windows the socket comes through the standard input instead.
-
-        Raises:
-            OSError: The program cannot be started.
+        On Windows the socket comes through the standard input instead. It is an OSError if the
+        program cannot be started.
         """
         ours, theirs = socket.socketpair()
         with ours, theirs:

@@ -48,13 +48,7 @@ class TaskRecord(NamedTuple):
 
 
 class RunWriter:
-    """The folder of a run under way.
-
-    Attributes:
-        path: The folder.
-        rollouts: The folder of its rollouts.
-        ended: What has ended so far, in an earlier attempt included.
-    """
+    """The folder of a run under way; what has `ended` so far includes an earlier attempt."""
 
     def __init__(self, path: Path, manifest: dict[str, Any], *, resume: bool = False) -> None:
         """Begin a run, or `resume` one: keep what is finished.
@@ -177,10 +171,7 @@ class RunWriter:
         """Put the rollouts of a run that ends into files, those of a scenario together.
 
         A file from an earlier attempt stays as it is, unless some of its rollouts have been made
-        again: then the others move.
-
-        Returns:
-            Where they are.
+        again: then the others move. Returns where they are.
         """
         order = sorted(self.ended, key=lambda task: (task.token, task))
         records = [(task, self.ended[task]) for task in order]

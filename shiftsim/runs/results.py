@@ -32,16 +32,11 @@ _MANIFEST = {  # what is read of it, and its type
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run on disk.
+    """A finished run on disk."""
 
-    Attributes:
-        path: Its folder.
-        manifest: Everything the run depended on, and its counts.
-        labels: What planners are called, by their names on disk, where that is something else.
-    """
-
-    path: Path
-    manifest: dict[str, Any]
+    path: Path  # its folder
+    manifest: dict[str, Any]  # everything the run depended on, and its counts
+    # what planners are called, by their names on disk, where that is something else
     labels: Mapping[str, str] = field(default_factory=dict, repr=False)
 
     def labelled(self, labels: Mapping[str, str]) -> Self:
