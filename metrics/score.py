@@ -201,10 +201,7 @@ def weight_of(metric: str) -> float | None:
 def closed_loop_score(
     scores: Mapping[str, float | None], weigh: Callable[[str], float | None] = weight_of
 ) -> float:
-    """Product of the multipliers times the weighted mean of the other metrics.
-
-    A metric without a score is left out of numerator and weights.
-    """
+    """Product of the multipliers times the weighted mean of other metrics that have a score."""
     product, total, weights = 1.0, 0.0, 0.0
     for metric, score in scores.items():
         if score is None:

@@ -185,10 +185,7 @@ class RunPlanner:
 
     @property
     def can_travel(self) -> bool:
-        """Whether it can be sent to a worker process.
-
-        A class defined in the main script cannot: workers do not import that script.
-        """
+        """Whether workers can be sent it: they do not import a class of the main script."""
         if isinstance(self.source, str):
             return True
         if _class_of(self.source).__module__ == "__main__":

@@ -76,10 +76,7 @@ def expand(name: str) -> Path:
 
 
 def safe_join(folder: Path, name: str) -> Path:
-    """The place of something in a folder by its relative path.
-
-    It is a DataError if that is outside of the folder, by its name or by a link.
-    """
+    """The place of something in a folder by its relative path; a DataError if it is outside."""
     place = folder / name
     try:
         if place.resolve().is_relative_to(folder.resolve()):

@@ -128,11 +128,7 @@ def close(function: object) -> None:
 
 @contextmanager
 def in_background(make: Callable[[], object]) -> Iterator[None]:
-    """Keep what `make` makes in a process of its own, which is started again when it ends.
-
-    Raises:
-        ConfigError: It cannot be made there.
-    """
+    """Keep what `make` makes in a process that is started again when it ends; or a ConfigError."""
     payload, leaving = packed(make), Event()
     process = start(payload)
 

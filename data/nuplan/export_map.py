@@ -56,10 +56,7 @@ def epsg_of(road: VectorMap) -> int:
 
 
 def write_nuplan_map(path: Path, road: VectorMap, version: str) -> None:
-    """Write a map in nuPlan's layers as `map.gpkg`. Ids stay as they are.
-
-    Raises ConversionError: the map has something that nuPlan's format has no place for.
-    """
+    """Write a map in nuPlan's layers as `map.gpkg`, with its ids, or a ConversionError."""
     layers = {name: _layer(name, *text.split()) for name, text in _LAYERS.items()}
     _Writer(road, layers).write()
     meta = {

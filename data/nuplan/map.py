@@ -25,10 +25,7 @@ _DRIVABLE_LAYERS = ("road_segments", "intersections", "generic_drivable_areas", 
 
 
 def read_map(path: Path, name: str) -> VectorMap:
-    """Read a nuPlan map from `map.gpkg`; it is in metres.
-
-    Flaws that nuPlan tolerates are counted in its `flaws`; others are a DataError.
-    """
+    """A nuPlan map from `map.gpkg`, in metres; its `flaws` count what nuPlan tolerates, too."""
     with open_database(Path(path)) as database:
         try:
             return _assemble(GeoPackage(database), name)

@@ -70,10 +70,7 @@ class Database:
     def query(
         self, sql: str, what: str, parameters: Sequence[object] = ()
     ) -> list[tuple[Any, ...]]:
-        """All rows of a query whose names are ours or were checked by `require`.
-
-        Raises DataError: the file cannot be read; the message says `what` is read.
-        """
+        """All rows of a query, with names of ours or checked by `require`; or a DataError."""
         try:
             return self._connection.execute(sql, tuple(parameters)).fetchall()
         except (sqlite3.Error, UnicodeDecodeError) as error:

@@ -226,10 +226,7 @@ def _limit(opened: dict[Any, Any]) -> None:
 
 
 def open_store(path: str | Path) -> ScenarioStore:
-    """Open the store in a folder, or behind the URL of one.
-
-    Raises DataError: there is no store, or it is damaged or of another version.
-    """
+    """Open the store in a folder, or behind the URL of one, or a DataError."""
     if "://" in str(path):
         from shiftsim.data.store.remote import RemoteFiles
 

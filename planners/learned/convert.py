@@ -47,10 +47,7 @@ class Inspection:
 
 
 def inspect_checkpoint(spec: str) -> Inspection:
-    """Look into a checkpoint: a file, a folder that holds one, or a name in their folder.
-
-    Raises CheckpointError: it is no checkpoint, or it is damaged.
-    """
+    """Look into a checkpoint: a file, a folder with one, or a name; or a CheckpointError."""
     require_torch("reading a checkpoint")
     found = checkpoint.open_checkpoint(checkpoint.find_checkpoint(spec))
     planner, problem = checkpoint.most_like(checkpoint.shapes_of(found.state)), ""

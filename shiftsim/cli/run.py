@@ -127,10 +127,7 @@ def progress_of(
 
 @contextmanager
 def _compiling_shown(show: Callable[[str], None]) -> Iterator[None]:
-    """Say in one line that a first run compiles, how far it is, and that this happens once.
-
-    Nothing is said where the kernels of a run are there already.
-    """
+    """Say in one line that kernels are compiled, once per version, and how far it is."""
     from shiftsim.kernels import machine_code
 
     ended = threading.Event()

@@ -80,10 +80,7 @@ def losses(rows: Iterable[Mapping[str, Any]]) -> list[tuple[dict[str, Any], floa
 
 
 def with_roles(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """The metrics of a task with role and weight, by role, then in the order of all tables.
-
-    Those of interPlan differ from nuPlan's.
-    """
+    """The metrics of a task, nuPlan's or interPlan's, with role and weight, by role."""
     listed = [dict(row) for row in rows]
     names = {row["metric"] for row in listed}
     sorts = next((name.removeprefix(SORTS) for name in names if name.startswith(SORTS)), "")
@@ -104,10 +101,7 @@ def with_roles(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def explain_tasks(
     runs: Sequence[Run], token: str, **wanted: Any
 ) -> dict[str, list[dict[str, Any]]]:
-    """The tasks of one scenario, as `select_tasks` gives them, by the name of their run.
-
-    Raises ConfigError: none of the runs has such a task.
-    """
+    """The tasks of one scenario by the name of their run, or a ConfigError: `select_tasks`."""
     found: dict[str, list[dict[str, Any]]] = {}
     for run in runs:
         try:

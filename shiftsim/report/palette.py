@@ -97,10 +97,7 @@ def characters(width: float, size: float = SMALL) -> int:
 
 
 def save_picture(figure: Any, path: Path) -> None:
-    """Write a figure without time stamps: the same picture has the same bytes.
-
-    Raises ConfigError: the ending is none that can be drawn.
-    """
+    """Write a figure, with equal bytes for equal ones; a ConfigError if the ending is unknown."""
     kind = path.suffix.lower()
     if kind[1:] not in figure.canvas.get_supported_filetypes():
         raise ConfigError(f"{path}: no picture ends in {kind!r}", hint="use .png, .svg or .pdf")

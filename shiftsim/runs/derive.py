@@ -144,11 +144,7 @@ class Rescorer:
 
 
 def tasks_with_rollouts(run: Run) -> list[Task]:
-    """The tasks of a run that have a score, as their rollouts lie in files.
-
-    Raises:
-        DataError: Rollouts of some of them were not stored.
-    """
+    """The tasks of a run that have a score; a DataError unless all of their rollouts are stored."""
     statuses = zip(run.rollout_places.items(), run.tasks["status"].to_pylist(), strict=True)
     done = {task: place for (task, place), status in statuses if status == OK}
     if without := sum(place is None for place in done.values()):

@@ -232,10 +232,7 @@ def _largest_distance(first: pa.RecordBatch, second: pa.RecordBatch) -> tuple[fl
 def find_departure(
     first: pa.RecordBatch, second: pa.RecordBatch, *, tolerance: float = 0.0
 ) -> Departure | None:
-    """The first step at which two stored rollouts differ by more than a tolerance, if any.
-
-    It is a ValueError if one is damaged.
-    """
+    """The first step at which two rollouts differ by more than a tolerance, or a ValueError."""
     rows = min(len(first), len(second))
     tokens = sorted({*_track_tokens(first), *_track_tokens(second)})
     ours, theirs = (_quantities(table, rows, tokens) for table in (first, second))

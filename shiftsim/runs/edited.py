@@ -176,10 +176,7 @@ class EditedStore(ScenarioStore):
         return self.edited[token].base
 
     def read(self, token: str, *, validate: bool = True) -> Scenario:
-        """One edited scenario; a ConfigError where the edit cannot be applied.
-
-        Raises DataError: there is none of that id, or a file is missing or damaged.
-        """
+        """One edited scenario; a ConfigError where it cannot be made, a DataError if missing."""
         recorded = super().read(self.base(token), validate=validate)
         return apply_edit(recorded, self.edited[token].edit, driven_lanes, _replay)
 

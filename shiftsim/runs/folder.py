@@ -95,10 +95,7 @@ class RunWriter:
         return TaskResult.from_rows(rows, self.rollouts)
 
     def add(self, result: TaskResult) -> None:
-        """Put one result on disk; a file of another run that holds its rollout is linked to.
-
-        Raises OSError: the disk is full; what is there already stays.
-        """
+        """Put a result on disk; a file of another run that holds its rollout is linked to."""
         if result.location is not None:
             file = self._link(result.location.file)
             result = replace(result, location=result.location._replace(file=file))

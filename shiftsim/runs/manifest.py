@@ -164,10 +164,7 @@ def difference(manifest: dict[str, Any], fingerprint: dict[str, Any], shard: str
 
 
 def check_resumable(folder: Path, fingerprint: dict[str, Any], *, shard: str = "") -> None:
-    """Refuse to begin anew where an unfinished run with other settings seems to be meant.
-
-    The ConfigError says what differs.
-    """
+    """Refuse to begin anew where an unfinished run with other settings seems to be meant."""
     prefix = folder.name.rpartition("_")[0]
     for other in sorted(folder.parent.glob(f"{prefix}_*")) if prefix else ():
         try:

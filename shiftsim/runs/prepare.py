@@ -149,10 +149,7 @@ def prepare(
 
 
 def _traffic(config: RunConfig) -> tuple[RunPlanner | None, dict[str, Any], bool]:
-    """The planner that drives other vehicles, if one does, and what identifies the traffic.
-
-    Last, whether a network of it moves several rollouts at once.
-    """
+    """The planner that drives others, if any, what identifies traffic, and if a network does."""
     name = config.traffic.removeprefix(PLANNER)
     if name != config.traffic:
         arguments: dict[str, Value] = dict(config.planner_args.get(name, {}))

@@ -133,10 +133,7 @@ class Run:
 
 
 def open_run(path: str | Path) -> Run:
-    """A run folder; a ConfigError where there is none.
-
-    Raises DataError: it is not a run folder, one of another format, or the run is not finished.
-    """
+    """A run folder; a ConfigError where there is none, a DataError if it cannot be read."""
     folder = Path(path)
     if not folder.is_dir():
         near = (

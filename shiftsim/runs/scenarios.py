@@ -119,10 +119,7 @@ def bundle_run(run: Run, store: str | None = None) -> ScenarioStore:
 
 
 def open_edits(name: str, store: ScenarioStore) -> "EditSet":
-    """Edits by the path of a file, or by the name of one in `edits/` of a store; splits resolved.
-
-    Raises ConfigError: there is no such file, or it is wrong.
-    """
+    """Edits by a file, or a name in `edits/` of a store, splits resolved; or a ConfigError."""
     from shiftsim.runs.edited import read_edits
 
     path = Path(store.path)

@@ -170,10 +170,7 @@ def plan_at(plans: Source, iteration: int) -> Trajectory:
 
 
 class RecordedRun:
-    """What a planner saw in a recorded run, from its ego states and its own objects.
-
-    A run that is not reactive shows the objects of the log.
-    """
+    """What a planner saw: the run's ego states, and its own objects where traffic is reactive."""
 
     def __init__(self, scenario: Scenario, ego: Source, objects: Source, challenge: str) -> None:
         self.scenario, self.ego = scenario, read_ego(ego)

@@ -143,11 +143,7 @@ class Recorded:
 
 
 def find_simulation_logs(folder: Path) -> dict[tuple[str, str], Path]:
-    """The logs in a result folder by token and planner.
-
-    Raises:
-        MissingExtraError: There are some that cannot be read without the extra `nuplan`.
-    """
+    """The logs in a result folder by token and planner, or a MissingExtraError."""
     root = folder / "simulation_log"
     found = {
         (path.name.partition(".")[0], path.relative_to(root).parts[0]): path
@@ -165,10 +161,7 @@ def _require_msgpack(files: Iterable[Path]) -> None:
 
 
 def log_source(path: Path) -> Rollouts | None:
-    """The rollouts of a log, or of all logs in a folder; None where there is none.
-
-    Raises MissingExtraError: they cannot be read without the extra `nuplan`.
-    """
+    """The rollouts of a log, or of all logs in a folder; None where there is none."""
     files = sorted(path.rglob("*.xz")) if path.is_dir() else [path] * (path.suffix == ".xz")
     if not files:
         return None

@@ -77,10 +77,7 @@ def require_lanes(od: OpenDrive, built: BuiltMap) -> None:
 
 
 def _prepare(od: records.OpenDrive, warnings: Counter[str]) -> records.OpenDrive:
-    """The file in the frame of its header, without roads that cannot be drawn; counts them.
-
-    Raises MapError: the file has more road than one map can hold.
-    """
+    """The file in the frame of its header, without roads that cannot be drawn; or a MapError."""
     roads = {}
     fast: list[str] = []  # roads of towns with limits that cannot be meant
     for name, road in od.roads.items():

@@ -89,10 +89,7 @@ def scenario_type(changes: Mapping[str, Any], details: Mapping[str, Any]) -> str
 
 
 def group_names(names: Iterable[str]) -> dict[str, list[str]]:
-    """Codes by token, of names such as `2d62c3139aa95007-s0`, in their order.
-
-    Raises ConfigError: some names have codes and others have none.
-    """
+    """Codes by token, of names such as `2d62c3139aa95007-s0`, all or none of them with codes."""
     listed = list(names)
     if len({"-" in name for name in listed}) > 1:
         raise ConfigError("some names have codes and others have none", "all or none need one")

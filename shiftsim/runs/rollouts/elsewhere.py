@@ -202,10 +202,7 @@ def _read_table(path: Path) -> pa.Table:
 def table_source(
     table: pa.Table, where: str, boxes: pa.Table | None = None, where_boxes: str = "tracks"
 ) -> Source:
-    """The rollouts in a table of poses, among the boxes of another one.
-
-    Raises DataError: a column is missing, or holds something else.
-    """
+    """The rollouts in a table of poses, among the boxes of another one, or a DataError."""
     point = (table.schema.metadata or {}).get(b"point", b"").decode()
     if point:
         one_of(f"{where}: point", point, POINTS)

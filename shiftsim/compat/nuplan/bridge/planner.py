@@ -189,10 +189,7 @@ class NuplanPlanner:
         return self._source(**self._arguments) if fresh else self._source
 
     def reset(self, scene: SceneInfo) -> None:
-        """Initialize the planner; of a class a new one, unless the present one is still unused.
-
-        Raises ConfigError: it asks for sensor data.
-        """
+        """Initialize the planner, of a class a new one; a ConfigError if it wants sensor data."""
         if self._scene is not None:
             self.close()
             self._planner = self._make()
