@@ -43,10 +43,7 @@ def _list_tables(wanted: bool) -> None:
 
 Labels = Annotated[
     list[str] | None,
-    Option(
-        "--label",
-        help="NAME=LABEL, or RUN/NAME=LABEL: what a planner is called; repeatable.",
-    ),
+    Option("--label", help="NAME=LABEL, or RUN/NAME=LABEL: what a planner is called; repeatable."),
 ]
 Width = Annotated[
     str | None,

@@ -97,8 +97,7 @@ class RunConfig:
         ("none",), "none, awgn-low … ou-high, all; repeatable. [none]", "--noise", "-n"
     )
     perception: tuple[str, ...] = setting(
-        ("none",),
-        "Boxes as seen: low, mid, high, miss-…, dropout-…, range-60; repeatable. [none]",
+        ("none",), "Boxes as seen: low, mid, high, miss-…, dropout-…, range-60; repeatable. [none]"
     )
     localization: tuple[str, ...] = setting(
         ("none",), "Errors of the ego's own pose: low, mid, high; repeatable. [none]"
@@ -119,9 +118,7 @@ class RunConfig:
         "nonreactive (nr), reactive (r), constant-velocity, or package.module:Model. [nonreactive]",
     )
     controller: str = setting(
-        "lqr",
-        "lqr, perfect or log-playback. [lqr]",
-        choices=("lqr", "perfect", "log-playback"),
+        "lqr", "lqr, perfect or log-playback. [lqr]", choices=("lqr", "perfect", "log-playback")
     )
     thresholds: str = setting("nuplan", "nuplan or deepplan. [nuplan]")
     planner_args: dict[str, dict[str, Value]] = field(
