@@ -62,11 +62,7 @@ class Track:
 
 
 def load_track(name: str) -> Track:
-    """A track by its name.
-
-    Raises:
-        ConfigError: There is none of that name.
-    """
+    """A track by its name; a ConfigError where there is none."""
     one_of("track", name, TRACKS)
     table = _read(name.replace("-", "_"))
     sets, drawn = table["sets"], table.get("drawn")

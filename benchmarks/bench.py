@@ -23,12 +23,7 @@ from shiftsim.errors import ConfigError, DataError, one_of
 from shiftsim.files import DEFAULT_STORE, store_path, write_text
 from shiftsim.report import build
 from shiftsim.report.figures import figures
-from shiftsim.report.groups import (
-    Group,
-    KnownSet,
-    read_groups,
-    token_digest,
-)
+from shiftsim.report.groups import Group, KnownSet, read_groups, token_digest
 from shiftsim.report.palette import DEFAULT_FORM, FigureFormat
 from shiftsim.report.tables import FORMATS, Table
 from shiftsim.runs.avoidable import grade
@@ -69,18 +64,16 @@ class Plan:
 def plan_bench(
     track: Track, settings: Mapping[str, Any], *, reference: str = "", out: str = ""
 ) -> Plan:
-    """Check all runs of a track before the first one starts.
+    """Check all runs of a track before the first one starts; a ShiftsimError if anything is wrong.
 
     Traffic, noise, seeds and thresholds are the track's unless the settings, of `RunConfig`, give
     them. `reference` is the store, or `STORE:SPLIT`, with the scenarios of the track's published
     list, empty to leave it out; `out` the folder, by default `runs/<id>`.
-
-    Raises:
-        ShiftsimError: A setting is wrong, or something is missing.
     """
     values = dict(settings)
     resumes = values.pop("resume", False)
-    modes = given_modes(values.pop("traffic", None)) or list(track.traffic)
+    given = values.pop("traffic", None) or list(track.traffic)
+    modes = [given] if isinstance(given, str) else [*given]
     edits_of = str(values.pop("edits", ""))
     values = {
         # where others are given there is no noise but what is given
@@ -130,11 +123,6 @@ def plan_bench(
     edited = _prepared(track, changed, drivable, folder, edits)
     lists = (_list_of(unlimited), _list_of(_without_limit(next(iter(edited.values())))))
     return Plan(track, folder, runs | edited, lists, text)
-
-
-def given_modes(traffic: str | Sequence[str] | None) -> list[str]:
-    """Traffic modes that were given, one or a list."""
-    return [traffic] if isinstance(traffic, str) else [*(traffic or ())]
 
 
 def _plan_towns(track: Track, values: Mapping[str, Any], modes: Sequence[str], out: str) -> Plan:
@@ -322,11 +310,9 @@ class OpenedRuns(NamedTuple):
         """Write tables and pictures to a folder, and return the files.
 
         There is a file per format, of all formats where none is given; with `pages` there are HTML
-        pages in place of these: tables, pictures, and every scenario with its replay.
-
-        Raises:
-            ConfigError: There is no such format.
-            MissingExtraError: Pictures are asked for, and matplotlib is missing.
+        pages in place of these: tables, pictures, and every scenario with its replay. It is a
+        ConfigError if there is no such format, a MissingExtraError if matplotlib is missing for
+        pictures.
         """
         for name in formats:
             one_of("format", name, FORMATS)
@@ -358,10 +344,8 @@ def _store_of(run: Run) -> Any:
 def open_runs(folders: Iterable[Path], labels: Iterable[str] = ()) -> OpenedRuns:
     """The runs of folders, where the folder of a benchmark stands for all of its runs.
 
-    `labels`, as those of `label_runs`, are what planners are called.
-
-    Raises:
-        ShiftsimError: A folder is neither, or damaged.
+    `labels`, as those of `label_runs`, are what planners are called. It is a ShiftsimError if a
+    folder is neither, or damaged.
     """
     out = OpenedRuns([], [], [])
     for folder in folders:
@@ -379,10 +363,8 @@ def open_runs(folders: Iterable[Path], labels: Iterable[str] = ()) -> OpenedRuns
 def paired_runs(first: Path, second: Path, labels: Iterable[str] = ()) -> list[tuple[Run, Run]]:
     """Two run folders, or the runs of two benchmarks that have the same name.
 
-    `labels`, as those of `label_runs`, are what planners are called.
-
-    Raises:
-        ShiftsimError: A folder is neither, or there is no such pair.
+    `labels`, as those of `label_runs`, are what planners are called. It is a ShiftsimError if a
+    folder is neither, or there is no such pair.
     """
     ours, theirs = (open_runs([folder]).runs for folder in (first, second))
     runs = label_runs([*ours, *theirs], labels)
@@ -400,11 +382,7 @@ def paired_runs(first: Path, second: Path, labels: Iterable[str] = ()) -> list[t
 
 
 def _read_manifest(folder: Path) -> dict[str, Any] | None:
-    """What `bench.json` says; None where there is none.
-
-    Raises:
-        DataError: It is damaged.
-    """
+    """What `bench.json` says, None where there is none; a DataError if it is damaged."""
     path = folder / MANIFEST
     if not path.is_file():
         return None

@@ -103,10 +103,7 @@ def _rows(track: str, stores: list[Row]) -> Iterator[Row]:
 
 
 def coverage(track: Track, groups: Sequence[Group]) -> Table:
-    """Finished rollouts of the track's contract, by set of scenarios and planner.
-
-    A score is the track's score only where all of them are there.
-    """
+    """Rollouts finished of those that the track's score needs, by set of scenarios and planner."""
     inside = [group for group in groups if _belongs(group, track)]
     sets = {data.name: (data.label, data.whole) for data in distinct_sets(inside)}
     if listed := track.reference:

@@ -68,11 +68,7 @@ def compute_metrics(
 
 
 def load_metric(spec: str | CustomMetric) -> CustomMetric:
-    """The callable that `module:attribute` names, or the callable itself.
-
-    Raises:
-        ConfigError: It cannot be imported, or is not callable.
-    """
+    """The callable that `module:attribute` names, or the callable itself; else a ConfigError."""
     if not isinstance(spec, str):
         return spec
     spec = NAMED.get(spec, spec)
@@ -95,8 +91,7 @@ def add_metrics(
 ) -> MetricResult:
     """The same result with the rows of custom metrics in `extra`; the score stays as it is.
 
-    Raises:
-        ConfigError: A metric cannot be loaded, or two rows have the same name.
+    Raises ConfigError: a metric cannot be loaded, or two rows have the same name.
     """
     rows = [row for metric in metrics for row in _run(load_metric(metric), log, road)]
     taken = {*result.scores, *SHORT_NAMES}

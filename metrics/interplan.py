@@ -37,11 +37,7 @@ class LaneChanges:
 
     @property
     def score(self) -> float:
-        """Share of them that the ego made.
-
-        Raises:
-            DataError: Some are needed at the start, and at the end it is not known how many.
-        """
+        """Share of them that the ego made; a DataError where that is not known."""
         if self.initial == 0:
             return 1.0 if self.final == 0 else 0.5
         if self.initial is None:
@@ -86,11 +82,7 @@ def final_score(types: Sequence[tuple[int, float]], weights: Sequence[float]) ->
 def add_interplan(
     result: MetricResult, log: SimulationLog, road: VectorMap, script: RolloutEvents
 ) -> MetricResult:
-    """The result with interPlan's metrics and its score.
-
-    Raises:
-        DataError: The ego or the expert was never on the route.
-    """
+    """The result with interPlan's metrics and score; a DataError where nobody was on the route."""
     lanes = lane_changes_to_goal(road, log)
     final = float("nan") if lanes.final is None else float(lanes.final)
     rows = [MetricRow(LANES, lanes.score, final, "count", 0.0, None)]
@@ -126,11 +118,7 @@ def share_of_obstacles(expert: FloatArray, obstacles: FloatArray) -> float:
 
 
 def lane_changes_to_goal(road: VectorMap, log: SimulationLog) -> LaneChanges:
-    """Lane changes needed at the start and at the end of a rollout.
-
-    Raises:
-        DataError: The ego or the expert was never on the route.
-    """
+    """Lane changes needed at the start and the end; a DataError where nobody was on the route."""
     count = len(log.ego)
     # nuPlan rule 717: the expert counts only as long as the ego drove
     expert = driven_route(road, center_poses(log.expert_ego[:count, :3]))

@@ -124,12 +124,9 @@ class FrameWorld:
 
 
 def frame_world(scenario: Scenario, iteration: int = 0, version: str = "v2") -> FrameWorld:
-    """The world of a scenario from one iteration on.
+    """The world of a scenario from one iteration on; a PlannerError if PDM-Closed has no route.
 
-    Raises:
-        ConfigError: There is no such version.
-        DataError: Less than 1.5 s was recorded before the frame, or 4 s (v1: 5 s) after it.
-        PlannerError: PDM-Closed cannot follow the route.
+    Raises DataError: less than 1.5 s was recorded before the frame, or 4 s (v1: 5 s) after it.
     """
     rules = VERSIONS[one_of("version", version, VERSIONS)]
     row, step = int(scenario.iteration_rows[iteration]), FRAMES * scenario.row_step

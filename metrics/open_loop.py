@@ -72,9 +72,7 @@ def metric_rows(plans: Sequence[Poses], scenario: Scenario) -> list[MetricRow]:
     """Rows of the plans of a scenario whose 8 s were recorded; the last one counts them.
 
     nuPlan scores all plans or none: where the count is below its bound, the score is not nuPlan's.
-
-    Raises:
-        DataError: A plan, or the recording behind the first of them, is too short.
+    It is a DataError if a plan, or the recording behind the first of them, is too short.
     """
     expert = recording(scenario)
     count = max(1, min(len(plans), len(expert.time_us) - HORIZONS[-1]))
@@ -87,13 +85,9 @@ def metric_rows(plans: Sequence[Poses], scenario: Scenario) -> list[MetricRow]:
 def open_loop(plans: Sequence[Poses], expert: Poses, token: str = "") -> OpenLoopResult:
     """Compare plans, made a second apart, with the recording.
 
-    Args:
-        plans: The plan of every tenth iteration but the last, which no planner is asked at.
-        expert: Recorded poses, as by `recording`.
-        token: Scenario that an error names.
-
-    Raises:
-        DataError: A plan, or the recording behind it, is too short.
+    `plans` are those of every tenth iteration but the last, which no planner is asked at, and
+    `expert` recorded poses, as by `recording`. It is a DataError, with the scenario's `token`, if a
+    plan or the recording behind it is too short.
     """
     distances, turns = np.empty((2, HORIZONS[-1], len(plans)))
     for frame, plan in enumerate(plans):

@@ -59,11 +59,7 @@ PROFILES = {profile.name: profile for profile in (NUPLAN, DEEPPLAN)}
 
 
 def thresholds_of(profile: str | Thresholds) -> Thresholds:
-    """The profile of a name, or the thresholds themselves.
-
-    Raises:
-        ConfigError: There is no profile of that name.
-    """
+    """The profile of a name, or the thresholds themselves; else a ConfigError."""
     if isinstance(profile, Thresholds):
         return profile
     return PROFILES[one_of("threshold profile", profile, PROFILES)]

@@ -109,13 +109,8 @@ class MetricResult:
 def measure(log: SimulationLog, map: VectorMap) -> Measurements:
     """Measure one rollout; `evaluate` applies thresholds to the result.
 
-    Args:
-        log: The rollout.
-        map: Map it was driven on.
-
-    Raises:
-        DataError: The rollout is too short, or a state is not finite.
-        MapError: The map is such that nuPlan's own code stops.
+    Raises DataError: the rollout is too short, or a state is not finite. MapError: the map is such
+    that nuPlan's own code stops.
     """
     tracks = collision.flat_tracks(log.tracks)
     _check(log, tracks)
@@ -206,10 +201,7 @@ def weight_of(metric: str) -> float | None:
 def closed_loop_score(
     scores: Mapping[str, float | None], weigh: Callable[[str], float | None] = weight_of
 ) -> float:
-    """Product of the multipliers times the weighted mean of the other metrics.
-
-    A metric without a score is left out of numerator and weights.
-    """
+    """Product of the multipliers times the weighted mean of other metrics that have a score."""
     product, total, weights = 1.0, 0.0, 0.0
     for metric, score in scores.items():
         if score is None:

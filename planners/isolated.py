@@ -54,11 +54,7 @@ class Isolated:
         return Isolated, self._given
 
     def identify(self) -> dict[str, Any]:
-        """The fingerprint of the planner, which is made to see that it works.
-
-        Raises:
-            PlannerError: It cannot be made.
-        """
+        """The fingerprint of the planner, which is made to see that it works, or a PlannerError."""
         return dict(self._started()[0])
 
     @property
@@ -92,11 +88,7 @@ class Isolated:
         return self._about
 
     def reset(self, scene: SceneInfo) -> None:
-        """Send the scene; its map only where it is another one than before.
-
-        Raises:
-            PlannerError: The planner failed, or its process ended.
-        """
+        """Send the scene, its map only where it is another one than before; or a PlannerError."""
         self._started()
         if self._map is not scene.map:
             self._ask("map", scene.map)
@@ -106,11 +98,7 @@ class Isolated:
         self._ask("reset", replace(scene, map=nothing, expert=expert))
 
     def plan(self, observation: Observation) -> Trajectory | Command:
-        """What the planner in the child returns.
-
-        Raises:
-            PlannerError: The planner failed, or its process ended.
-        """
+        """What the planner in the child returns, or a PlannerError."""
         plan: Trajectory | Command
         plan, self.degraded = self._ask("plan", observation)
         return plan

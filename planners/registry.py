@@ -32,21 +32,13 @@ _NO_PICKLE = (pickle.PicklingError, TypeError, AttributeError, NotImplementedErr
 
 
 def load_planner(spec: str, arguments: Mapping[str, Any] | None = None) -> Planner:
-    """A new planner.
+    """A new planner, or the errors of `shiftsim.load_planner`.
 
-    Args:
-        spec: Registered name, or `package.module:Class` of a custom planner, which may lie in the
-            current directory, or `file.py:Class`; with `nuplan:` before it where it is written for
-            nuPlan. Or `policy:FILE` (see `shiftsim.env.policy`).
-        arguments: Arguments of its constructor; texts are converted to what it asks for.
-
-    A learned planner without a `checkpoint` takes its published file from the folder of
-    checkpoints, else our own weights where there are any.
-
-    Raises:
-        ConfigError: The name, the module, the class or an argument is wrong.
-        CheckpointError: A learned planner has no checkpoint, or the wrong one.
-        MissingExtraError: A learned planner needs PyTorch.
+    `spec` is a registered name, or `package.module:Class` of a custom planner, which may lie in the
+    current directory, or `file.py:Class`; with `nuplan:` before it where it is written for nuPlan.
+    Or `policy:FILE` (see `shiftsim.env.policy`). Texts among the arguments are converted to what
+    its constructor asks for. A learned planner without a `checkpoint` takes its published file from
+    the folder of checkpoints, else our own weights where there are any.
     """
     factory = planner_factory(spec)
     values = _bind(spec, factory, arguments or {})
@@ -72,9 +64,7 @@ def _construct(name: str, make: Callable[[], Any]) -> Any:
 def planner_factory(spec: str) -> Any:
     """The class, or other callable, that makes the planner `spec` (see `load_planner`).
 
-    Raises:
-        ConfigError: There is none.
-        MissingExtraError: It needs more of nuPlan's devkit than its shims have.
+    Raises ConfigError: there is none. MissingExtraError: it needs more than nuPlan's shims have.
     """
     for prefix, adapter in _ADAPTERS.items():
         if spec.startswith(prefix):
@@ -114,16 +104,11 @@ def planner_factory(spec: str) -> Any:
 
 
 def planner_fingerprint(spec: str, arguments: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """All that tells one planner from another, as JSON values.
+    """All that tells one planner from another, as JSON values; errors are those of `load_planner`.
 
     Custom planners carry the hash of their module's source, policies and file arguments that of the
     file, learned planners that of their checkpoint and the kind of their device; what else they
     depend on is not seen.
-
-    Raises:
-        ConfigError: The planner or an argument is wrong.
-        CheckpointError: A learned planner has no checkpoint.
-        MissingExtraError: A learned planner needs PyTorch.
     """
     entry = PLANNERS.get(spec)
     factory = planner_factory(spec)
@@ -200,10 +185,7 @@ class RunPlanner:
 
     @property
     def can_travel(self) -> bool:
-        """Whether it can be sent to a worker process.
-
-        A class defined in the main script cannot: workers do not import that script.
-        """
+        """Whether workers can be sent it: they do not import a class of the main script."""
         if isinstance(self.source, str):
             return True
         if _class_of(self.source).__module__ == "__main__":
@@ -218,10 +200,8 @@ class RunPlanner:
 def run_planner(source: Any, arguments: Mapping[str, Any], name: str = "") -> RunPlanner:
     """A planner given by name, class or instance; it is made here, to see that it works.
 
-    It is called `name` in tables, by default as `planner_name` says.
-
-    Raises:
-        ShiftsimError: It does not exist, or cannot be made.
+    It is called `name` in tables, by default as `planner_name` says. It is a ShiftsimError if it
+    does not exist, or cannot be made.
     """
     name = name or planner_name(source)
     if isinstance(source, str):

@@ -82,11 +82,7 @@ class MissingExtraError(ShiftsimError, ImportError):
 
 
 def import_extra(module: str, extra: str) -> ModuleType:
-    """A module that an extra of shiftsim brings.
-
-    Raises:
-        MissingExtraError: It is not installed.
-    """
+    """A module that an extra of shiftsim brings, or a MissingExtraError."""
     try:
         return import_module(module)
     except ImportError as error:
@@ -106,11 +102,7 @@ def listed(names: Sequence[str], most: int = 8) -> str:
 
 
 def one_of(what: str, value: str, choices: Iterable[str]) -> str:
-    """The value, when it is among the choices.
-
-    Raises:
-        ConfigError: It is not; the hint names the nearest choice.
-    """
+    """The value, when it is among the choices, or a ConfigError, which names the nearest."""
     valid = sorted(choices)
     if value in valid:
         return value
@@ -120,11 +112,7 @@ def one_of(what: str, value: str, choices: Iterable[str]) -> str:
 
 
 def beginning(where: str, what: str, text: str, choices: Iterable[str]) -> str:
-    """The choice that is the text, or the only one that begins with it.
-
-    Raises:
-        ConfigError: There is none, or there are several; the hint names some.
-    """
+    """The choice that is the text, or the only one that begins with it; else a ConfigError."""
     valid = sorted(choices)
     if text in valid:
         return text

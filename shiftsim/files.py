@@ -76,11 +76,7 @@ def expand(name: str) -> Path:
 
 
 def safe_join(folder: Path, name: str) -> Path:
-    """The place of something in a folder by its relative path.
-
-    Raises:
-        DataError: It is outside of the folder, by its name or by a link.
-    """
+    """The place of something in a folder by its relative path; a DataError if it is outside."""
     place = folder / name
     try:
         if place.resolve().is_relative_to(folder.resolve()):
@@ -125,10 +121,8 @@ def write_text(path: Path, text: str) -> None:
 def read_json_lines(path: Path) -> Iterator[tuple[str, Any]]:
     """Where each line is, in words, and its JSON value; blank lines are left out.
 
-    A line ends at a line feed and nowhere else: JSON may hold the other separators of Unicode.
-
-    Raises:
-        DataError: A line is not JSON in UTF-8.
+    A line ends at a line feed and nowhere else: JSON may hold the other separators of Unicode. It
+    is a DataError if one is not JSON in UTF-8.
     """
     for number, line in enumerate(path.read_bytes().split(b"\n"), 1):
         where = f"{path}: line {number}"
@@ -144,10 +138,8 @@ def read_json_lines(path: Path) -> Iterator[tuple[str, Any]]:
 def lock(path: Path) -> BinaryIO:
     """A file, made if needed, that one process at a time has open here; closing it lets others in.
 
-    Where the system or the file system has no locks, nobody is kept out.
-
-    Raises:
-        BlockingIOError: Another process has it.
+    Where the system or the file system has no locks, nobody is kept out. It is a BlockingIOError if
+    another process has it.
     """
     while True:
         file = path.open("a+b", buffering=0)
@@ -169,11 +161,7 @@ def lock(path: Path) -> BinaryIO:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The table in a TOML file.
-
-    Raises:
-        ConfigError: There is no such file, or it is not TOML.
-    """
+    """The table in a TOML file, or a ConfigError."""
     try:
         with path.open("rb") as file:
             return tomllib.load(file)
@@ -191,10 +179,8 @@ def make_table(cls: type[_T], table: Any, where: str, check: Check = lambda *_: 
     """A dataclass from plain values, such as those of TOML or JSON: its fields are their keys.
 
     Lists become tuples, and tables dataclasses; one table where a list is wanted is a list of one.
-    Types are checked strictly, but that an integer is a number, and a path a text.
-
-    Raises:
-        ConfigError: A key is unknown or missing, or a value is of another type.
+    Types are checked strictly, but that an integer is a number, and a path a text. It is a
+    ConfigError if a key is unknown or missing, or a value is of another type.
     """
     if not isinstance(table, Mapping):
         raise ConfigError(f"{where}: {table!r} is not a table")
@@ -249,10 +235,8 @@ def import_named(module: str) -> ModuleType:
     """A module by its name, or by its file, `folder/name.py`.
 
     One that the user has named may lie in the current folder, and what it imports, too. Nothing
-    else is ever imported from there: a stray file is not code.
-
-    Raises:
-        ImportError: There is none, it fails, or it ends the process.
+    else is ever imported from there: a stray file is not code. It is an ImportError if there is
+    none, it fails, or it ends the process.
     """
     name, folder = (module, Path.cwd()) if not module.endswith(".py") else _module_of(Path(module))
     if not name.startswith("shiftsim.") and str(folder) not in sys.path:
@@ -349,11 +333,7 @@ def place_of(error: BaseException) -> str:
 
 
 def load_attribute(what: str, name: str, hint: str) -> Any:
-    """What a user names as `module:attribute`; `what` it is and the hint go into the message.
-
-    Raises:
-        ConfigError: It cannot be imported.
-    """
+    """What a user names as `module:attribute`; `what` it is and a hint go into the ConfigError."""
     module, _, attribute = name.rpartition(":")
     try:
         return getattr(import_named(module), attribute)

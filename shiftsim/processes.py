@@ -38,10 +38,8 @@ class Process:
     def __init__(self, words: Sequence[str], env: Mapping[str, str] | None = None) -> None:
         """Start a program; its last two arguments are the parent's process id and its socket.
 
-        On Windows the socket comes through the standard input instead.
-
-        Raises:
-            OSError: The program cannot be started.
+        On Windows the socket comes through the standard input instead. It is an OSError if the
+        program cannot be started.
         """
         ours, theirs = socket.socketpair()
         with ours, theirs:
@@ -65,11 +63,7 @@ class Process:
             self.connection.send(value)
 
     def receive(self) -> Any:
-        """The next value that the process sends.
-
-        Raises:
-            ProcessEndedError: It has ended.
-        """
+        """The next value that the process sends, or a ProcessEndedError."""
         try:
             return self.connection.recv()
         except (EOFError, OSError, pickle.UnpicklingError) as error:
@@ -134,11 +128,7 @@ def close(function: object) -> None:
 
 @contextmanager
 def in_background(make: Callable[[], object]) -> Iterator[None]:
-    """Keep what `make` makes in a process of its own, which is started again when it ends.
-
-    Raises:
-        ConfigError: It cannot be made there.
-    """
+    """Keep what `make` makes in a process that is started again when it ends; or a ConfigError."""
     payload, leaving = packed(make), Event()
     process = start(payload)
 

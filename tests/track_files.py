@@ -6,8 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pc
 
-from shiftsim.data.readers.annotations import read_recording
-from shiftsim.data.readers.dsc3d import find_map, open_site
+from shiftsim.data.readers.dsc3d import find_map, open_site, read_recording
 from shiftsim.data.synthetic.recordings import generate_town, write_recordings
 from shiftsim.data.synthetic.store import DEMO_TOWNS
 

@@ -30,11 +30,7 @@ _APPROACH = 5.0  # m before the end of a lane, where a stop polygon lies
 
 
 def build_lane_map(source: MapSource) -> BuiltMap:
-    """The semantic map of what a data set tells of its lanes.
-
-    Raises:
-        MapError: There is no lane, an id occurs twice, or the map spreads wider than one can.
-    """
+    """The semantic map of what a data set tells of its lanes, or a MapError."""
     if not source.pieces:
         what = f"map {source.name!r} has no lane that cars may use"
         raise MapError(what, "leave this scene out: without lanes there is no route")

@@ -61,10 +61,7 @@ def states_of_lists(
 
 
 def light_rows(states: LightStates, lights: Mapping[str, str], time_us: IntArray) -> TrafficLights:
-    """Status of every connector with a light at some times; not listed before the first state.
-
-    `lights` holds the name of the light by connector.
-    """
+    """Status of connectors at some times, by the name of the light that each has, if any."""
     column = {name: i for i, name in enumerate(states.names)}
     known = {connector: column[name] for connector, name in lights.items() if name in column}
     at = np.searchsorted(states.time_us, time_us, side="right") - 1

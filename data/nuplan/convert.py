@@ -9,9 +9,17 @@ from functools import partial
 from pathlib import Path
 
 from shiftsim.data.nuplan import scenarios
-from shiftsim.data.nuplan.filter import KEY_OF, LISTED, THINNED, ScenarioFilter, read_filter
+from shiftsim.data.nuplan.filter import (
+    KEY_OF,
+    LISTED,
+    THINNED,
+    ScenarioFilter,
+    is_taken,
+    judgements,
+    read_filter,
+    thin_out,
+)
 from shiftsim.data.nuplan.log import Log, open_log
-from shiftsim.data.nuplan.sampling import is_taken, judgements, thin_out
 from shiftsim.data.recording import Window
 from shiftsim.data.store.tables import MANIFEST, SCENARIOS
 from shiftsim.data.store.writing import StoreWriter

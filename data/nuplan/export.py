@@ -78,10 +78,8 @@ def export_nuplan(
     """Write scenarios and their maps in nuPlan's formats. The same input gives the same bytes.
 
     Maps that are in the folder already stay listed. Only the scenarios `tokens` are written, all
-    where None; `progress` is called with scenarios done, scenarios in all, and the log's name.
-
-    Raises:
-        DataError: The store is damaged, or holds something that the formats have no place for.
+    where None; `progress` is called with scenarios done, scenarios in all, and the log's name. It
+    is a DataError if the store is damaged, or holds something that the formats have no place for.
     """
     chosen = store.tokens if tokens is None else tuple(tokens)
     windows = {token: store.window(token) for token in chosen}

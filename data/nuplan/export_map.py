@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from shiftsim.data.nuplan.geopackage import FeatureLayer, write_geopackage
-from shiftsim.data.nuplan.sqlite import Value
+from shiftsim.data.nuplan.sqlite import FeatureLayer, Value, write_geopackage
 from shiftsim.errors import ConversionError
 from shiftsim.world.layers import Layer, Polylines
 from shiftsim.world.map import NONE, VectorMap
@@ -57,11 +56,7 @@ def epsg_of(road: VectorMap) -> int:
 
 
 def write_nuplan_map(path: Path, road: VectorMap, version: str) -> None:
-    """Write a map in nuPlan's layers as `map.gpkg`. Ids stay as they are.
-
-    Raises:
-        ConversionError: The map has something that nuPlan's format has no place for.
-    """
+    """Write a map in nuPlan's layers as `map.gpkg`, with its ids, or a ConversionError."""
     layers = {name: _layer(name, *text.split()) for name, text in _LAYERS.items()}
     _Writer(road, layers).write()
     meta = {

@@ -8,8 +8,7 @@ from typing import Any
 
 import shapely
 
-from shiftsim.data.nuplan.geopackage import REPAIR, GeoPackage, LayerTable
-from shiftsim.data.nuplan.sqlite import open_database
+from shiftsim.data.nuplan.sqlite import REPAIR, GeoPackage, LayerTable, open_database
 from shiftsim.data.polygons import shared_areas
 from shiftsim.errors import DataError, MapError
 from shiftsim.kernels import FloatArray
@@ -26,10 +25,7 @@ _DRIVABLE_LAYERS = ("road_segments", "intersections", "generic_drivable_areas", 
 
 
 def read_map(path: Path, name: str) -> VectorMap:
-    """Read a nuPlan map from `map.gpkg`; it is in metres.
-
-    Flaws that nuPlan tolerates are counted in its `flaws`; others are a DataError.
-    """
+    """A nuPlan map from `map.gpkg`, in metres; its `flaws` count what nuPlan tolerates, too."""
     with open_database(Path(path)) as database:
         try:
             return _assemble(GeoPackage(database), name)

@@ -8,8 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.data.nuplan.boxes import make_tracks, read_boxes
-from shiftsim.data.nuplan.log import Log, has_goals, read_ego, read_lights, read_route, read_types
+from shiftsim.data.nuplan.log import (
+    Log,
+    has_goals,
+    make_tracks,
+    read_boxes,
+    read_ego,
+    read_lights,
+    read_route,
+    read_types,
+)
 from shiftsim.data.nuplan.map import read_map
 from shiftsim.data.recording import EgoTrace, Recording, Window
 from shiftsim.errors import ConfigError, ConversionError, DataError
@@ -83,11 +91,7 @@ def mapping_of(scenario_type: str) -> Mapping:
 
 
 def parse_mapping(text: str) -> Mapping:
-    """A mapping from `DURATION,OFFSET,RATIO`, such as `15,0,0.5`.
-
-    Raises:
-        ConfigError: It does not consist of three sensible numbers.
-    """
+    """A mapping from `DURATION,OFFSET,RATIO`, such as `15,0,0.5`; else a ConfigError."""
     hint = "write DURATION,OFFSET,RATIO in seconds, such as 15,0,0.5; 0 < RATIO <= 1"
     try:
         duration, offset, ratio = (float(part) for part in text.split(","))

@@ -230,10 +230,7 @@ def _track_categories(
     warnings: Counter[str],
     remedy: str,
 ) -> tuple[str, ...]:
-    """N most frequent category of every track; `category` (A,) are indices of `names`.
-
-    Raises ConversionError: one is not among the `known`.
-    """
+    """N most frequent category of every track, by (A,) indices of `names`; or a ConversionError."""
     pairs, votes = np.unique(track * len(names) + category, return_counts=True)
     voted_track, voted = np.divmod(pairs, len(names))
     first, num_voted = np.unique(voted_track, return_index=True, return_counts=True)[1:]

@@ -129,11 +129,7 @@ class Py123dReader(SceneFolder):
 
 
 def read_starts(path: Path) -> dict[str, list[int]]:
-    """Times [us] by log of a CSV file with columns `log_name` and `time_us`.
-
-    Raises:
-        ConversionError: It cannot be read, or has no such columns.
-    """
+    """Times [us] by log of a CSV file with columns log_name and time_us; else a ConversionError."""
     starts: dict[str, list[int]] = {}
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:

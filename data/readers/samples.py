@@ -137,10 +137,7 @@ def sample_run(
 
 
 def resample(recording: TrackSamples, log_name: str, city: str, padding: int = 0) -> Recording:
-    """A whole recording at 20 Hz in the frame of the map, every run a track.
-
-    The first `padding` rows lie before the first frame, with constant velocity.
-    """
+    """A recording at 20 Hz in the frame of the map, and `padding` rows at constant velocity."""
     runs = recording.runs
     num_rows = int(np.floor(recording.duration / ROW_S + _EPS)) + 1 + padding
     first, last = rows_between(recording.time[runs.first], recording.time[runs.last])
@@ -212,10 +209,7 @@ def ego_states(centers: FloatArray, velocities: FloatArray) -> FloatArray:
 
 
 def slope(values: FloatArray, dt: float) -> FloatArray:
-    """Savitzky-Golay first derivative of values (R,), `dt` seconds apart.
-
-    Second order, 11 samples; the ends by the last fit.
-    """
+    """Savitzky-Golay first derivative of values (R,), `dt` [s] apart: second order, 11 samples."""
     half = min(_HALF_WINDOW, (len(values) - 1) // 2)
     if half == 0:
         return np.gradient(values, dt) if len(values) > 1 else np.zeros(len(values))

@@ -71,11 +71,7 @@ class Converted:
 
 
 def make_scenarios(samples: TrackSamples, road: VectorMap, **how: Any) -> Converted:
-    """All scenarios of a recording and a map in one frame; `how` as in `SourceRecording`.
-
-    Raises:
-        ConfigError: No object has the id of an ego.
-    """
+    """All scenarios of a recording and a map in one frame; `how` as in `SourceRecording`."""
     return convert_recording(SourceRecording(samples, BuiltMap(road, {}), **how))
 
 

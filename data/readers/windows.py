@@ -87,11 +87,7 @@ class ConversionConfig:
 
 
 def make_config(values: Mapping[str, Any]) -> ConversionConfig:
-    """Thresholds from plain values, such as those of a TOML file.
-
-    Raises:
-        ConfigError: A name is unknown, or a value is wrong.
-    """
+    """Thresholds from plain values, as of a TOML file; a ConfigError where one is wrong."""
     for name in values:
         one_of("setting", name, [item.name for item in fields(ConversionConfig)])
     return make_table(ConversionConfig, values, "settings")

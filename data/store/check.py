@@ -104,11 +104,7 @@ class CheckReport:
 
 
 def survey_store(path: str | Path) -> CheckReport:
-    """All problems of a store, and what was found in each recording.
-
-    Raises:
-        DataError: It is no store at all.
-    """
+    """All problems of a store, and what was found in each recording; a DataError if it is none."""
     path = Path(path)
     manifest = read_manifest(path)
     problems = list(_check_files(path, manifest["files"]))

@@ -85,10 +85,7 @@ SCHEMA = make_schema(
 
 
 def write_map(path: Path, road: VectorMap) -> None:
-    """Write a map; equal maps give equal bytes.
-
-    Raises DataError: a number is outside of its range, or an index of something that is not there.
-    """
+    """Write a map, equal ones with equal bytes; a DataError if it holds what cannot be."""
     require_sound(road, str(path))
     values: dict[str, Any] = {name: getattr(road, name) for name in ("name", *_NUMBERS)}
     values |= {_array(name): getattr(road, name) for name in _ARRAYS}

@@ -167,11 +167,7 @@ class ScenarioStore:
         return scene
 
     def map(self, city: str) -> VectorMap:
-        """A map; kept for the next scenario of that city.
-
-        Raises:
-            DataError: The store has no such map, or its file is damaged.
-        """
+        """A map, kept for the next scenario of that city; a DataError if missing or damaged."""
         if city not in self._maps:
             self._maps[city] = read_map_file(self.map_file(city))
         return self._maps[city]
@@ -230,11 +226,7 @@ def _limit(opened: dict[Any, Any]) -> None:
 
 
 def open_store(path: str | Path) -> ScenarioStore:
-    """Open the store in a folder, or behind the URL of one.
-
-    Raises:
-        DataError: There is no store, or it is damaged or of another version.
-    """
+    """Open the store in a folder, or behind the URL of one, or a DataError."""
     if "://" in str(path):
         from shiftsim.data.store.remote import RemoteFiles
 

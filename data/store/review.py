@@ -133,10 +133,7 @@ def require_blocks(road: VectorMap, review: Review, where: str) -> None:
 
 
 def route_problems(road: VectorMap, route: Sequence[str], start: int | None) -> list[str]:
-    """What is wrong with a route, in words; nothing for a good one.
-
-    `start` is the block the ego stands on at the first iteration, None where it is on none.
-    """
+    """What is wrong with a route, in words; the ego's first block is `start`, if any."""
     unknown = [name for name in route if name not in road.blocks.index]
     if unknown:
         return [f"roadblock {unknown[0]} is not on the map"]

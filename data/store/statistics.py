@@ -88,10 +88,7 @@ def store_stats(
     *,
     progress: Callable[[int, int, str], None] = lambda done, total, token: None,
 ) -> StoreStats:
-    """Statistics of some scenarios of a store, or of all where `tokens` is None.
-
-    `progress` is called with scenarios done, scenarios in all, and a token.
-    """
+    """Statistics of some scenarios of a store, or of all; `progress` gets done, all, token."""
     chosen = store.tokens if tokens is None else tuple(tokens)
     rows, cities, types = dict[str, ScenarioStats](), dict[str, str](), dict[str, str]()
     for done, token in enumerate(chosen, 1):

@@ -58,10 +58,7 @@ class Checkpoint(NamedTuple):
 
 
 def load_network(spec: str, planner: str, *, device: str = "cpu") -> Any:
-    """A planner's network with its weights, on its device and ready to be called.
-
-    The arguments and errors are those of `load_weights`.
-    """
+    """A planner's network with its weights, on its device, by arguments of `load_weights`."""
     weights = load_weights(spec, planner, device=device)
     network = network_module(planner).build_network(weights.args)
     network.load_state_dict(weights.state)
@@ -75,10 +72,8 @@ def load_weights(spec: str, planner: str, *, device: str = "cpu") -> Weights:
     `DETERMINISTIC`; `official`, `shiftsim`, or empty for the first of these two. The tensors go to
     the `device`, as in `resolve_device`, where torch is set up for inference.
 
-    Raises:
-        CheckpointError: There is no such file, it is damaged, or it is of another network.
-        ConfigError: There is no such device.
-        MissingExtraError: PyTorch is not installed.
+    Raises CheckpointError: there is no such file, it is damaged, or it is of another network.
+    ConfigError: there is no such device. MissingExtraError: PyTorch is not installed.
     """
     require_torch(f"planner {planner!r}")
     import torch
@@ -236,10 +231,7 @@ def needed_args(found: Checkpoint, planner: str) -> dict[str, Any] | None:
 def checked_state(
     found: Checkpoint, planner: str, args: Mapping[str, Any] | None
 ) -> dict[str, Any]:
-    """All tensors of a planner's network, and no other, in its own types.
-
-    A CheckpointError says which is missing, unexpected, of another shape, or not finite.
-    """
+    """All tensors of a network, and no other, of its types and shapes; or a CheckpointError."""
     try:
         wanted = empty_state(planner, args)
     except CheckpointError as error:

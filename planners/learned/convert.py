@@ -47,12 +47,7 @@ class Inspection:
 
 
 def inspect_checkpoint(spec: str) -> Inspection:
-    """Look into a checkpoint: a file, a folder that holds one, or a name in their folder.
-
-    Raises:
-        CheckpointError: It is no checkpoint, or it is damaged.
-        MissingExtraError: PyTorch is not installed.
-    """
+    """Look into a checkpoint: a file, a folder with one, or a name; or a CheckpointError."""
     require_torch("reading a checkpoint")
     found = checkpoint.open_checkpoint(checkpoint.find_checkpoint(spec))
     planner, problem = checkpoint.most_like(checkpoint.shapes_of(found.state)), ""
@@ -79,10 +74,8 @@ def convert_checkpoint(spec: str, out: Path, *, half: bool = False) -> Inspectio
     """Write the weights that a planner loads, and nothing else, to a safetensors file.
 
     Its metadata names planner, args and the hash of the source. With `half` its numbers are
-    float16, for half the size; planners compute with float32. Returns what is in the new file.
-
-    Raises:
-        CheckpointError: The source is not complete, or of no planner known here.
+    float16, for half the size; planners compute with float32. Returns what is in the new file. It
+    is a CheckpointError if the source is not complete, or of no planner known here.
     """
     require_torch("converting a checkpoint")
     from safetensors.torch import save_file

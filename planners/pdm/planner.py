@@ -33,19 +33,9 @@ from shiftsim.planners.routes.correction import known_blocks
 from shiftsim.planners.routes.graph import centerline
 from shiftsim.planners.routes.lead import LightWatch
 from shiftsim.sim.planner import Observation, SceneInfo
+from shiftsim.world import state
 from shiftsim.world.map import VectorMap
-from shiftsim.world.state import (
-    AX,
-    HEADING,
-    NUM_STATE,
-    VX,
-    VY,
-    YAW_RATE,
-    Trajectory,
-    VehicleParameters,
-    center_poses,
-    rear_poses,
-)
+from shiftsim.world.state import Trajectory, VehicleParameters, center_poses, rear_poses
 
 MAX_ACCEL, MIN_ACCEL = 2.40, -4.05  # m/s^2
 STOPPED = 0.2  # m/s
@@ -53,11 +43,11 @@ STOPPED = 0.2  # m/s
 
 def brake_speed(ego: FloatArray, vehicle: VehicleParameters) -> float:
     """Speed of the reference that makes the tracker brake, usually backwards [m/s]."""
-    speed = float(ego[VX])
+    speed = float(ego[state.VX])
     if speed > STOPPED:
         return 1.1 * (speed + float(np.clip(-10.0 * speed, MIN_ACCEL, MAX_ACCEL)))
     # nuPlan rule 194: the centre's acceleration without the angular term
-    accel = float(ego[AX]) + vehicle.rear_axle_to_center * float(ego[YAW_RATE]) ** 2
+    accel = float(ego[state.AX]) + vehicle.rear_axle_to_center * float(ego[state.YAW_RATE]) ** 2
     return float(np.clip(-4.0 * speed - accel, MIN_ACCEL, MAX_ACCEL))
 
 
@@ -66,8 +56,8 @@ def brake_poses(ego: FloatArray, vehicle: VehicleParameters) -> FloatArray:
     center = center_poses(ego[None, :3], vehicle)[0]
     travel = brake_speed(ego, vehicle) * DT * np.arange(STEPS + 1)
     centers = np.tile(center, (STEPS + 1, 1))
-    centers[:, 0] += travel * np.cos(ego[HEADING])
-    centers[:, 1] += travel * np.sin(ego[HEADING])
+    centers[:, 0] += travel * np.cos(ego[state.HEADING])
+    centers[:, 1] += travel * np.sin(ego[state.HEADING])
     return rear_poses(centers, vehicle)
 
 
@@ -104,7 +94,7 @@ def choose(scores: Scores, ego: FloatArray, params: PdmParameters) -> tuple[int,
     """Number of the best proposal, and whether the emergency brake replaces it."""
     best = int(np.argmax(scores.total))  # the first one on ties
     is_near = DT * scores.collision_index[best] <= params.brake_time
-    return best, bool(is_near and np.hypot(ego[VX], ego[VY]) <= params.brake_speed)
+    return best, bool(is_near and np.hypot(ego[state.VX], ego[state.VY]) <= params.brake_speed)
 
 
 _TIMES = STEP_US * np.arange(STEPS + 1)  # us
@@ -165,11 +155,7 @@ class PdmClosed:
         self.seen: Seen | None = None
 
     def reset(self, scene: SceneInfo) -> None:
-        """Look up the route; it is corrected at the first plan.
-
-        Raises:
-            PlannerError: The route is empty or unknown to the map.
-        """
+        """Look up the route, or a PlannerError; it is corrected at the first plan."""
         known_blocks(scene.map, scene.route, scene.token, self.name)
         self._scene = scene
         self.collided = []
@@ -177,7 +163,7 @@ class PdmClosed:
 
     def plan(self, observation: Observation) -> Trajectory:
         """81 poses, 0.1 s apart, without speeds."""
-        states = np.zeros((STEPS + 1, NUM_STATE))
+        states = np.zeros((STEPS + 1, state.NUM_STATE))
         states[:, :3] = self.step(observation).poses
         return Trajectory(observation.time_us + _TIMES, states)
 

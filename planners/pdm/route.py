@@ -11,13 +11,7 @@ from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.planners.proposals.areas import Areas, index_ranks, make_areas
 from shiftsim.planners.proposals.places import EgoBox
 from shiftsim.planners.routes.correction import Start, correct_route, find_start, known_blocks
-from shiftsim.planners.routes.graph import (
-    HINT,
-    Search,
-    deviation,
-    lane_at,
-    search_cheapest,
-)
+from shiftsim.planners.routes.graph import HINT, Search, deviation, lane_at, search_cheapest
 from shiftsim.world.layers import square_around
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import HEADING, X, Y
@@ -38,8 +32,7 @@ class Route(NamedTuple):
 def start_route(road: VectorMap, ids: Sequence[str], ego: FloatArray, token: str) -> Route:
     """Correct a route, given by roadblock ids, at the start of a scenario, from an ego state (11,).
 
-    Raises:
-        PlannerError: The route is empty, unknown to the map, or has no lanes.
+    Raises PlannerError: the route is empty, unknown to the map, or has no lanes.
     """
     blocks = known_blocks(road, ids, token, "pdm-closed")
     square = square_around(float(ego[0]), float(ego[1]), START_HALF_WIDTH)

@@ -239,10 +239,7 @@ def load_planner(name: str, **arguments: Any) -> Planner:
 
 
 def simulate(
-    scenario: Scenario,
-    planner: Planner | str | None,
-    setting: Setting = DEFAULT,
-    **changes: Any,
+    scenario: Scenario, planner: Planner | str | None, setting: Setting = DEFAULT, **changes: Any
 ) -> SimulationLog:
     """Drive one scenario in closed loop; as `shiftsim.sim.loop.simulate`, or by a planner's name.
 

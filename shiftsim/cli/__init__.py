@@ -278,11 +278,11 @@ _COMMANDS = {
     "planners": "planners:app",
     "doctor": "doctor:doctor",
     "verify": "doctor:verify",
-    "report": "report:report",
-    "explain": "report:explain",
+    "report": "view:report",
+    "explain": "view:explain",
     "view": "view:view",
     "plot": "view:plot",
-    "diff": "report:diff",
+    "diff": "view:diff",
     "data": "bench:data",
     "convert": "convert:app",
     "check": "store:check",
@@ -293,10 +293,10 @@ _COMMANDS = {
     "edits": "edits:app",
     "mine": "edits:mine",
     "export": "store:export",
-    "train": "training:app",
-    "features": "training:features",
+    "train": "planners:train",
+    "features": "planners:features",
     "checkpoint": "planners:checkpoint",
-    "realism": "training:realism",
+    "realism": "planners:realism",
 }
 _GROUPS = {"Run": "demo", "Look": "report", "Data": "data", "Train": "train"}  # by their first
 

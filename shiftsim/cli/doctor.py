@@ -151,11 +151,7 @@ def _torch() -> str:
 
 
 def compile_kernels(advance: Advance) -> dict[str, Any]:
-    """Make small runs that together use every kernel of a run; what is on disk then.
-
-    Raises:
-        ShiftsimError: A run failed.
-    """
+    """Make small runs that together use every kernel of a run; what is on disk then."""
     from shiftsim.data.synthetic.store import demo_store
     from shiftsim.kernels import CACHE_FOLDER, machine_code
 

@@ -15,7 +15,7 @@ from typer import Argument, Option
 import shiftsim
 from shiftsim import cli
 from shiftsim.cli import Json, Quiet, echo, plural, print_result, progress_bar, stdout_to_stderr
-from shiftsim.cli.report import print_worst
+from shiftsim.cli.view import print_worst
 from shiftsim.errors import ConfigError
 from shiftsim.files import DEFAULT_STORE, read_toml, store_path
 from shiftsim.planners.table import PLANNERS
@@ -127,10 +127,7 @@ def progress_of(
 
 @contextmanager
 def _compiling_shown(show: Callable[[str], None]) -> Iterator[None]:
-    """Say in one line that a first run compiles, how far it is, and that this happens once.
-
-    Nothing is said where the kernels of a run are there already.
-    """
+    """Say in one line that kernels are compiled, once per version, and how far it is."""
     from shiftsim.kernels import machine_code
 
     ended = threading.Event()

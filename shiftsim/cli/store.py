@@ -10,7 +10,7 @@ from typer import Argument, Option
 
 from shiftsim import cli
 from shiftsim.cli import Json, Quiet, echo, new_app, plural, print_json, print_result, progress_bar
-from shiftsim.cli.report import Plain, Serif, Width
+from shiftsim.cli.view import Plain, Serif, Width
 from shiftsim.errors import one_of
 from shiftsim.files import store_path
 

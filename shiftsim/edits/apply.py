@@ -21,14 +21,7 @@ from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.world.events import CAUTIOUS, FOLLOW, OFF, STOPPED, ScriptedPedestrian
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import (
-    HEADING,
-    NUM_STATE,
-    AgentKind,
-    LightStatus,
-    Tracks,
-    TrafficLights,
-)
+from shiftsim.world.state import HEADING, NUM_STATE, AgentKind, LightStatus, Tracks, TrafficLights
 
 SIZES = {  # length, width [m]
     "vehicle": (4.6, 1.9),
@@ -57,10 +50,8 @@ def apply_edit(
     """The scenario that an edit makes of a recorded one.
 
     Codes of interPlan need `driven_lanes`, such as `metrics.interplan.driven_lanes`, and what
-    begins in traffic that reacts needs a `replay` of it.
-
-    Raises:
-        ConfigError: It cannot be applied; the message names scenario, edit and reason.
+    begins in traffic that reacts needs a `replay` of it. It is a ConfigError if it cannot be
+    applied; the message names scenario, edit and reason.
     """
     try:
         if edit.start is not None:

@@ -174,10 +174,7 @@ class ScenarioBuilder:
     def add_vehicle(
         self, token: str, pose: FloatArray, size: FloatArray, speed: float, behavior: int
     ) -> None:
-        """Add a vehicle that drives from the first iteration on; until then it came along its lane.
-
-        Raises ConfigError: it is on no lane, or on something.
-        """
+        """Add a vehicle that drives from iteration 0 on, and came along its lane before."""
         road = self.scenario.map
         start = find_start(road, pose)
         if start is None:

@@ -38,10 +38,7 @@ class Slot(NamedTuple):
 
 
 def fill_lanes(builder: ScenarioBuilder, density: Density) -> None:
-    """Add vehicles that drive; those for which there is no space are left out.
-
-    Raises ConfigError: the ego is on no lane.
-    """
+    """Add vehicles that drive, as far as there is space; a ConfigError if the ego is on no lane."""
     road, center = builder.scenario.map, builder.center
     start = find_start(road, center)
     if start is None:

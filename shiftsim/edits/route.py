@@ -28,10 +28,7 @@ _MIN_LENGTH = 5.0  # m
 
 
 def reroute(builder: ScenarioBuilder, wanted: Reroute, *, ends: bool) -> None:
-    """Change route, goal and expert; the expert drives evenly along the lanes of the new route.
-
-    Raises ConfigError: there is no such route.
-    """
+    """Change route, goal and expert, who drives evenly along its lanes; or a ConfigError."""
     road, center = builder.scenario.map, builder.center
     start = find_start(road, center)
     if start is None:

@@ -271,11 +271,7 @@ def _plain(value: Any) -> str:
 
 
 def make_edit(table: Mapping[str, Any], where: str) -> Edit:
-    """An edit from its table; `where` is for messages.
-
-    Raises:
-        ConfigError: A key is unknown or missing, or a value is wrong.
-    """
+    """An edit from its table, or a ConfigError, whose message begins with `where`."""
     edit = make_table(Edit, _renamed(table), where, _check)
     where = f"{where} {edit.name!r}"
     good = edit.name and len(edit.name) <= _MAX_NAME and edit.name.replace("_", "").isalnum()

@@ -66,10 +66,8 @@ def make_tables(
 ) -> list[Table]:
     """The tables of a report, in the order of `TABLES`; without `options` everything is shown.
 
-    Beside published figures stands no planner with weights of our own that nobody asked for.
-
-    Raises:
-        ConfigError: Nothing is left beside them.
+    Beside published figures stands no planner with weights of our own that nobody asked for; it is
+    a ConfigError if nothing is left beside them.
     """
     chosen = options or Options()
     left_out = [group for group in groups if chosen.with_published and _has_default_weights(group)]
@@ -163,10 +161,8 @@ class Comparison:
 def in_format(tables: Sequence[Table], format: str) -> Any:
     """Tables as text in a format, or for `pandas` as one DataFrame with numbers in full.
 
-    In that, `attrs["notes"]` are the notes, and a column `table` tells several tables apart.
-
-    Raises:
-        MissingExtraError: pandas is not installed.
+    In that, `attrs["notes"]` are the notes, and a column `table` tells several tables apart. It is
+    a MissingExtraError if pandas is not installed.
     """
     one_of("format", format, (*FORMATS, "pandas"))
     if format != "pandas":

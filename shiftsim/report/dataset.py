@@ -90,8 +90,7 @@ def stats_figure(
 ) -> Any:
     """The store beside the published sets, and its cities; all bars lie, so that names have room.
 
-    Raises:
-        MissingExtraError: matplotlib is not installed.
+    Raises MissingExtraError: matplotlib is not installed, as for all pictures.
     """
     groups = stats.groups("city")
     means, cities = [*groups.values()], [name for name in groups if name != ALL]

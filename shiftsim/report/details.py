@@ -233,10 +233,7 @@ def edited_scores(groups: Sequence[Group]) -> list[Table]:
 
 
 def recorded_score(group: Group, others: Sequence[Group]) -> tuple[Number | None, Interval | None]:
-    """Score and interval of the recorded scenarios that those of a group were made of.
-
-    None where no other group has all of them under the same rules.
-    """
+    """Score and interval of the scenarios that a group's were made of, if a group has them."""
     edited = group.run.manifest["edits"]["made"]
     bases = [str(edited[token]["base"]) for token in group.data.tokens]
     for other in others:

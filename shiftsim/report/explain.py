@@ -28,10 +28,7 @@ def select_tasks(
 
     The token may be an unambiguous beginning of one. Rows are those of `tasks.parquet`, with `cls`,
     `why` and `metrics` added; every metric has its `role` (`multiplier`, `weighted` or empty) and
-    `weight`.
-
-    Raises:
-        ConfigError: There is no such task, or several scenarios begin like that.
+    `weight`. It is a ConfigError if there is no such task, or several scenarios begin like that.
     """
     tokens = set(run.tasks["token"].to_pylist())
     full = beginning(f"run {run.path.name!r}", "scenario", token, tokens)
@@ -83,10 +80,7 @@ def losses(rows: Iterable[Mapping[str, Any]]) -> list[tuple[dict[str, Any], floa
 
 
 def with_roles(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """The metrics of a task with role and weight, by role, then in the order of all tables.
-
-    Those of interPlan differ from nuPlan's.
-    """
+    """The metrics of a task, nuPlan's or interPlan's, with role and weight, by role."""
     listed = [dict(row) for row in rows]
     names = {row["metric"] for row in listed}
     sorts = next((name.removeprefix(SORTS) for name in names if name.startswith(SORTS)), "")
@@ -107,11 +101,7 @@ def with_roles(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def explain_tasks(
     runs: Sequence[Run], token: str, **wanted: Any
 ) -> dict[str, list[dict[str, Any]]]:
-    """The tasks of one scenario, as `select_tasks` gives them, by the name of their run.
-
-    Raises:
-        ConfigError: None of the runs has such a task.
-    """
+    """The tasks of one scenario by the name of their run, or a ConfigError: `select_tasks`."""
     found: dict[str, list[dict[str, Any]]] = {}
     for run in runs:
         try:

@@ -86,11 +86,7 @@ class _End(NamedTuple):
 
 @palette.in_format
 def figures(groups: Sequence[Group], *, form: FigureFormat = DEFAULT_FORM) -> list[Figure]:
-    """All pictures that the groups allow.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-    """
+    """All pictures that the groups allow; a MissingExtraError without matplotlib."""
     out: list[Figure] = []
     styles = palette.planner_styles(dict.fromkeys(group.planner for group in groups))
     names: list[str] = []
@@ -147,11 +143,8 @@ def figures(groups: Sequence[Group], *, form: FigureFormat = DEFAULT_FORM) -> li
 def open_against_closed(groups: Sequence[Group], *, form: FigureFormat = DEFAULT_FORM) -> Figure:
     """Open loop against closed loop: a mark per planner and scenario, clean where there is that.
 
-    The legends have Spearman's rank correlations over scenarios, and over the planners' means.
-
-    Raises:
-        ConfigError: No run has open-loop scores.
-        MissingExtraError: matplotlib is not installed.
+    The legends have Spearman's rank correlations over scenarios, and over the planners' means. It
+    is a ConfigError if no run has open-loop scores.
     """
     asked = [group for group in groups if has_open_loop(group)]
     if not asked:

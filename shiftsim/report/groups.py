@@ -229,10 +229,8 @@ def read_groups(
 
     Sets of scenarios are recognised by the published lists that are known. Planners of one name
     that are not the same, or were run otherwise and did otherwise, say what tells them apart.
-    `allow_partial` gives labelled means of groups that are not complete.
-
-    Raises:
-        DataError: Runs contradict each other, or hold no tasks.
+    `allow_partial` gives labelled means of groups that are not complete. It is a DataError if runs
+    contradict each other, or hold no tasks.
     """
     found = [group for run in runs for group in _groups(run, known)]
     by_name: dict[str, list[Group]] = {}

@@ -44,8 +44,7 @@ class FigureFormat(NamedTuple):
     ) -> "FigureFormat":
         """A format of a width [inches] that may have a unit, as in `3.5in`, `89mm` or `252pt`.
 
-        Raises:
-            ConfigError: The width is no length between 2 and 40 inches.
+        Raises ConfigError: the width is no length between 2 and 40 inches.
         """
         found = re.fullmatch(r"(\d+\.?\d*) ?(in|cm|mm|pt|)", str(width or 0))
         inches = float(found[1]) * _INCHES[found[2]] if found else 0.0
@@ -73,12 +72,9 @@ def in_format(draw: Callable[_Call, _Made]) -> Callable[_Call, _Made]:
 def new_figure(
     layout: Literal["constrained", "compressed"] | None = "constrained", **settings: Any
 ) -> Any:
-    """An empty figure of matplotlib that can be measured.
+    """An empty figure of matplotlib that can be measured; a MissingExtraError without matplotlib.
 
     Ids in SVG files are always the same; PDF files hold their fonts as TrueType, as papers ask for.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
     """
     _matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -101,11 +97,7 @@ def characters(width: float, size: float = SMALL) -> int:
 
 
 def save_picture(figure: Any, path: Path) -> None:
-    """Write a figure without time stamps: the same picture has the same bytes.
-
-    Raises:
-        ConfigError: The ending is none that can be drawn.
-    """
+    """Write a figure, with equal bytes for equal ones; a ConfigError if the ending is unknown."""
     kind = path.suffix.lower()
     if kind[1:] not in figure.canvas.get_supported_filetypes():
         raise ConfigError(f"{path}: no picture ends in {kind!r}", hint="use .png, .svg or .pdf")

@@ -39,13 +39,9 @@ def bootstrap_interval(
 ) -> Interval | None:
     """Percentile interval of the mean; clusters are drawn with replacement.
 
-    The mean of a draw is over its scenarios, so large recordings weigh as they do in the score.
-    None with fewer than two clusters: then nothing is known of the spread between them.
-
-    Args:
-        values: (S,) one value per scenario.
-        clusters: (S,) recording of each, as `cluster_codes` gives them.
-        draws: How many samples are drawn.
+    `values` (S,) are those of scenarios, `clusters` (S,) their recordings, by `cluster_codes`. The
+    mean of a draw is over its scenarios, so large recordings weigh as they do in the score. None
+    with fewer than two clusters: then nothing is known of the spread between them.
     """
     sums, sizes = np.bincount(clusters, values), np.bincount(clusters).astype(np.float64)
     count = len(sums)

@@ -24,11 +24,7 @@ MAX_SEEDS = 10_000  # of one range
 
 
 def parse_seeds(text: str) -> list[int]:
-    """Seeds as given on the command line, such as `0,1,2` or `0-2`.
-
-    Raises:
-        ConfigError: They are no integers.
-    """
+    """Seeds as on the command line, `0,1,2` or `0-2`; else a ConfigError."""
     seeds: list[int] = []
     try:
         for word in text.split(","):
@@ -49,11 +45,7 @@ def parse_seeds(text: str) -> list[int]:
 
 
 def parse_latency(text: str) -> list[int]:
-    """Latencies as given on the command line, such as `0,100,200` [ms].
-
-    Raises:
-        ConfigError: They are no integers.
-    """
+    """Latencies as on the command line, `0,100,200` [ms]; else a ConfigError."""
     try:
         return [int(word) for word in text.split(",")]
     except ValueError as error:
@@ -61,11 +53,7 @@ def parse_latency(text: str) -> list[int]:
 
 
 def parse_workers(text: str) -> int:
-    """Worker processes as given on the command line; 0, or `auto` there, chooses from the cores.
-
-    Raises:
-        ConfigError: It is neither a number from 1 on nor `auto`.
-    """
+    """Worker processes, from 1 on, or 0 for `auto`, by the cores; else a ConfigError."""
     if text == "auto":
         return 0
     if not text.isdecimal() or int(text) < 1:
@@ -109,8 +97,7 @@ class RunConfig:
         ("none",), "none, awgn-low … ou-high, all; repeatable. [none]", "--noise", "-n"
     )
     perception: tuple[str, ...] = setting(
-        ("none",),
-        "Boxes as seen: low, mid, high, miss-…, dropout-…, range-60; repeatable. [none]",
+        ("none",), "Boxes as seen: low, mid, high, miss-…, dropout-…, range-60; repeatable. [none]"
     )
     localization: tuple[str, ...] = setting(
         ("none",), "Errors of the ego's own pose: low, mid, high; repeatable. [none]"
@@ -131,9 +118,7 @@ class RunConfig:
         "nonreactive (nr), reactive (r), constant-velocity, or package.module:Model. [nonreactive]",
     )
     controller: str = setting(
-        "lqr",
-        "lqr, perfect or log-playback. [lqr]",
-        choices=("lqr", "perfect", "log-playback"),
+        "lqr", "lqr, perfect or log-playback. [lqr]", choices=("lqr", "perfect", "log-playback")
     )
     thresholds: str = setting("nuplan", "nuplan or deepplan. [nuplan]")
     planner_args: dict[str, dict[str, Value]] = field(
@@ -223,11 +208,7 @@ def _check(name: str, value: Any, where: str) -> None:
 
 
 def make_config(values: Mapping[str, Any], *, where: str = "run") -> RunConfig:
-    """Settings from plain values, such as those of a TOML file.
-
-    Raises:
-        ConfigError: A name is unknown, or a value is wrong.
-    """
+    """Settings from plain values, as of a TOML file; a ConfigError where one is wrong."""
     return make_table(RunConfig, values, where, _check)
 
 
@@ -235,9 +216,7 @@ def split_label(planner: str) -> tuple[str, str]:
     """Label and source of a planner in settings: `LABEL=SOURCE`, or a source, its own label.
 
     The label is what tasks, tables and pictures call the planner. It holds neither `:` nor a slash.
-
-    Raises:
-        ConfigError: The label or the source is empty.
+    It is a ConfigError if label or source is empty.
     """
     label, equals, source = planner.partition("=")
     if not equals or any(c in label for c in ":/\\"):
@@ -250,10 +229,8 @@ def split_label(planner: str) -> tuple[str, str]:
 def parse_argument(text: str, planners: tuple[str, ...]) -> tuple[str, str, Value]:
     """Label, name and value of one `key=value`, or `label.key=value` with several planners.
 
-    The value is read as a TOML value; anything that is none is taken as a string.
-
-    Raises:
-        ConfigError: It has another form, or it does not say which planner is meant.
+    The value is read as a TOML value; anything that is none is taken as a string. It is a
+    ConfigError if it has another form, or does not say which planner is meant.
     """
     planners = tuple(split_label(planner)[0] for planner in planners)
     key, equals, raw = text.partition("=")
@@ -280,11 +257,7 @@ def parse_argument(text: str, planners: tuple[str, ...]) -> tuple[str, str, Valu
 
 
 def parse_shard(text: str) -> tuple[int, int]:
-    """Number and count of a shard `i/n`, i from 1 to n.
-
-    Raises:
-        ConfigError: It has another form.
-    """
+    """Number and count of a shard `i/n`, i from 1 to n; else a ConfigError."""
     number, _, count = text.partition("/")
     if number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count):
         return int(number), int(count)

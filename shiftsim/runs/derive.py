@@ -2,7 +2,7 @@
 
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
 from functools import partial
@@ -17,7 +17,7 @@ from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.metrics.open_loop import NAMES as OPEN_LOOP
 from shiftsim.runs.config import RunConfig, default_workers, make_config, parse_shard
 from shiftsim.runs.edited import make_edits
-from shiftsim.runs.execute import OnProgress, Progress, record, results_of
+from shiftsim.runs.execute import ALONE, OnProgress, Progress
 from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.manifest import check_target, code_digest, difference, make_manifest, now
 from shiftsim.runs.prepare import RUNS, run_name
@@ -28,7 +28,7 @@ from shiftsim.runs.rollouts.files import encode_rows, rollout_rows
 from shiftsim.runs.rollouts.poses import NEED_BOXES, POINTS, REAR_AXLE, rollout_of
 from shiftsim.runs.scenarios import open_run_store, split_name, token_hash
 from shiftsim.runs.tables import FAILED, MISSING, OK, TaskResult, stored_results
-from shiftsim.runs.task import Batch, ScenarioReader, attempt, planner_times, score_rollout
+from shiftsim.runs.task import ScenarioReader, attempt, planner_times, score_rollout
 from shiftsim.runs.workers import map_unordered
 
 ELSEWHERE = "elsewhere"  # what moved ego and others, where nobody says more
@@ -124,15 +124,14 @@ class Rescorer:
         edit_set = make_edits(edits, self._run.path.name) if edits else None
         self._scenarios = ScenarioReader(store, edit_set)
         self._open_loop: dict[Task, list[dict[str, Any]]] = {}  # no threshold changes it
-        if config.open_loop:
-            for row in self._run.metrics.to_pylist():
-                if row["metric"] in OPEN_LOOP:
-                    task = Task(*(row.pop(name) for name in Task._fields))
-                    self._open_loop.setdefault(task, []).append(row)
+        for row in self._run.metrics.to_pylist() if config.open_loop else ():
+            if row["metric"] in OPEN_LOOP:
+                task = Task(*(row.pop(name) for name in Task._fields))
+                self._open_loop.setdefault(task, []).append(row)
 
-    def __call__(self, batch: Batch) -> list[TaskResult]:
-        """The results of tasks."""
-        return [attempt(task, partial(self._score, task)) for task in batch]
+    def __call__(self, entry: Entry) -> TaskResult:
+        """The result of a task."""
+        return attempt(entry.task, partial(self._score, entry.task))
 
     def _score(self, task: Task) -> TaskResult:
         scenario = self._scenarios.read(task.token)
@@ -145,11 +144,7 @@ class Rescorer:
 
 
 def tasks_with_rollouts(run: Run) -> list[Task]:
-    """The tasks of a run that have a score, as their rollouts lie in files.
-
-    Raises:
-        DataError: Rollouts of some of them were not stored.
-    """
+    """The tasks of a run that have a score; a DataError unless all of their rollouts are stored."""
     statuses = zip(run.rollout_places.items(), run.tasks["status"].to_pylist(), strict=True)
     done = {task: place for (task, place), status in statuses if status == OK}
     if without := sum(place is None for place in done.values()):
@@ -210,22 +205,34 @@ def rescore(
         for result in stored_results(run.path):
             if result.status != OK:  # it stays so
                 writer.add(replace(result, seconds={}))
-        batches: list[Batch] = [(task,) for task in done]
-        outcomes = map_unordered(
-            partial(Rescorer, run.path.resolve(), found.source, config),
-            batches,
-            workers=min(workers or default_workers(), len(done)),
-            alone=1,
-            group=lambda batch: batch[0].token,
-        )
-
-        def add(result: TaskResult) -> None:
+        make = partial(Rescorer, run.path.resolve(), found.source, config)
+        for result in _scored(make, [Entry(task) for task in done], workers, on_progress):
             writer.add(replace(result, location=run.rollout_places[result.task]))
-
-        with closing(outcomes):
-            record(map(results_of, outcomes), add, Progress(0, len(done), 0), on_progress)
         manifest |= {"state": "finished", "ended": now(), "rescored_from": run.path.name}
         return writer.finish(manifest, statuses, dict(_without_result(run)))
+
+
+def _scored(
+    make: Callable[[], Callable[[Entry], TaskResult]],
+    entries: Sequence[Entry],
+    workers: int,
+    on_progress: OnProgress,
+) -> Iterator[TaskResult]:
+    """The results of rollouts, which so many processes share, to be put on disk as they come."""
+    progress = Progress(0, len(entries), 0)
+    outcomes = map_unordered(
+        make,
+        entries,
+        workers=min(workers or default_workers(), len(entries)),
+        alone=1,
+        group=lambda entry: entry.task.token,
+    )
+    with closing(outcomes):
+        for outcome in outcomes:
+            lost = TaskResult(outcome.task.task, FAILED, error=outcome.death, hint=ALONE)
+            yield (result := outcome.result or lost)
+            progress += Progress(1, 0, int(result.status != OK), result.seconds)
+            on_progress(replace(progress, news=[result]))
 
 
 class ElsewhereScorer:
@@ -236,15 +243,13 @@ class ElsewhereScorer:
         self.config, self._undefined, self._given = config, undefined, given
         self._scenarios = ScenarioReader(store)
 
-    def __call__(self, entry: Entry) -> tuple[TaskResult, tuple[str, ...]]:
-        """The result of a rollout, and what a reader of it must know."""
-        remarks = list[str]()
-        return attempt(entry.task, partial(self._score, entry, remarks)), tuple(remarks)
+    def __call__(self, entry: Entry) -> TaskResult:
+        """The result of a rollout."""
+        return attempt(entry.task, partial(self._score, entry))
 
-    def _score(self, entry: Entry, remarks: list[str]) -> TaskResult:
+    def _score(self, entry: Entry) -> TaskResult:
         scenario, driven = self._scenarios.read(entry.task.token), entry.read()
-        log, found = rollout_of(driven, scenario, **self._given)
-        remarks += found
+        log, remarks = rollout_of(driven, scenario, **self._given)
         scores, metrics = score_rollout(scenario, log, self.config, self._undefined)
         is_recorded = driven.boxes is None and not self._undefined
         rows = rollout_rows(log, with_tracks=not is_recorded, with_kinds=not is_recorded)
@@ -256,6 +261,7 @@ class ElsewhereScorer:
             scores=scores,
             metrics=metrics,
             rollout=encode_rows(rows),
+            remarks=remarks,
         )
 
 
@@ -313,24 +319,11 @@ def score_elsewhere(
     undefined = () if recorded or source.has_boxes else NEED_BOXES
     remarks, failed = Counter[str](), list[TaskResult]()
     with closing(RunWriter(target, manifest)) as writer:
-        outcomes = map_unordered(
-            partial(ElsewhereScorer, found.source, config, undefined, **given),
-            source.entries,
-            workers=min(workers or default_workers(), len(tasks)),
-            alone=1,
-            group=lambda entry: entry.task.token,
-        )
-
-        def results() -> Iterator[list[TaskResult]]:
-            for outcome in outcomes:
-                lost = TaskResult(outcome.task.task, FAILED, error=outcome.death), ()
-                result, found = outcome.result or lost
-                remarks.update(found)
-                failed.extend([result] if result.status == FAILED else [])
-                yield [result]
-
-        with closing(outcomes):
-            record(results(), writer.add, Progress(0, len(tasks), 0), on_progress)
+        make = partial(ElsewhereScorer, found.source, config, undefined, **given)
+        for result in _scored(make, source.entries, workers, on_progress):
+            writer.add(result)
+            remarks.update(result.remarks)
+            failed += [result] if result.status == FAILED else []
         if len(failed) == len(tasks):
             if is_new:
                 shutil.rmtree(target)

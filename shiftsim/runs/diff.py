@@ -100,10 +100,8 @@ def diff_runs(
     """Compare two runs, and look into a number of changes, the largest of the score first.
 
     Rollouts part where a quantity differs by more than the tolerance [m, rad, …]. Planners are
-    paired by name; two runs of one planner each are compared whatever their names.
-
-    Raises:
-        ConfigError: They have no rollout in common.
+    paired by name; two runs of one planner each are compared whatever their names. It is a
+    ConfigError if they have no rollout in common.
     """
     planners = [run.manifest["config"]["planners"] for run in (first, second)]
     single = len(planners[0]) == len(planners[1]) == 1
@@ -234,11 +232,7 @@ def _largest_distance(first: pa.RecordBatch, second: pa.RecordBatch) -> tuple[fl
 def find_departure(
     first: pa.RecordBatch, second: pa.RecordBatch, *, tolerance: float = 0.0
 ) -> Departure | None:
-    """The first step at which two stored rollouts differ by more than a tolerance, if any.
-
-    Raises:
-        ValueError: One is damaged.
-    """
+    """The first step at which two rollouts differ by more than a tolerance, or a ValueError."""
     rows = min(len(first), len(second))
     tokens = sorted({*_track_tokens(first), *_track_tokens(second)})
     ours, theirs = (_quantities(table, rows, tokens) for table in (first, second))

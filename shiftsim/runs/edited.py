@@ -52,9 +52,8 @@ class EditSet:
     def expand(self, store: ScenarioStore, tokens: Iterable[str]) -> "dict[str, Edited]":
         """The edited scenarios, by id, of those of a store that are given.
 
-        Raises:
-            ConfigError: An edit names a scenario that the store does not have, or one id occurs
-                twice, or nothing is edited.
+        Raises ConfigError: an edit names a scenario that the store does not have, one id occurs
+        twice, or nothing is edited.
         """
         chosen, out = set(tokens), dict[str, Edited]()
         columns = (store.summary()[name].to_pylist() for name in ("token", "type"))
@@ -92,11 +91,10 @@ class EditSet:
         }
 
     def require_traffic(self, traffic: str) -> None:
-        """Refuse traffic that cannot drive what an edit asks for.
+        """Refuse traffic that cannot drive what an edit asks for, with a ConfigError.
 
-        Raises:
-            ConfigError: Replayed traffic has nothing that a spawned vehicle could do, reactive
-                traffic replays no vehicle, and interPlan's scenarios are for reactive traffic only.
+        Replayed traffic has nothing that a spawned vehicle could do, reactive traffic replays no
+        vehicle, and interPlan's scenarios are for reactive traffic only.
         """
         for edit in self.edits:
             where = f"edits {self.name!r}, edit {edit.name!r}"
@@ -178,12 +176,7 @@ class EditedStore(ScenarioStore):
         return self.edited[token].base
 
     def read(self, token: str, *, validate: bool = True) -> Scenario:
-        """One edited scenario.
-
-        Raises:
-            DataError: There is none of that id, or a file is missing or damaged.
-            ConfigError: The edit cannot be applied.
-        """
+        """One edited scenario; a ConfigError where it cannot be made, a DataError if missing."""
         recorded = super().read(self.base(token), validate=validate)
         return apply_edit(recorded, self.edited[token].edit, driven_lanes, _replay)
 
@@ -214,8 +207,7 @@ def edit_words(manifest: Mapping[str, Any], token: str) -> list[str]:
 def make_edits(table: Mapping[str, Any], name: str) -> EditSet:
     """Edits from the table of a file; `name` is for messages, and theirs where they have none.
 
-    Raises:
-        ConfigError: Something in it is unknown, missing or contradictory.
+    Raises ConfigError: something in it is unknown, missing or contradictory.
     """
     where = f"edits {name!r}"
     for key in table:
@@ -244,11 +236,7 @@ def make_edits(table: Mapping[str, Any], name: str) -> EditSet:
 
 
 def read_edits(name: str, store: Path | None = None) -> EditSet:
-    """Edits by the path of a file, or by the name of one in `edits/` of a store.
-
-    Raises:
-        ConfigError: There is no such file, or it is wrong.
-    """
+    """Edits by the path of a file, or the name of one in a store's `edits/`; else a ConfigError."""
     path = Path(name)
     if path.suffix != ".toml":
         folder = (store or Path()) / FOLDER

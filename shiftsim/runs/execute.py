@@ -20,6 +20,7 @@ from shiftsim.runs.task import Batch
 from shiftsim.runs.workers import Outcome, map_on_cluster, map_unordered
 
 _LOG = logging.getLogger(__name__)
+ALONE = "run this scenario alone with --workers 1 to see why"  # hint where a worker has died
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,14 +53,11 @@ OnProgress: TypeAlias = Callable[[Progress], None]
 def execute(
     plan: RunPlan, *, on_progress: OnProgress = lambda progress: None, argv: Sequence[str] = ()
 ) -> Run:
-    """Do all tasks and write the run folder.
+    """Do all tasks and write the run folder; a DataError where it cannot be written.
 
     Whatever happens, what is finished is on disk and can be resumed. An interrupt writes the tables
     with the other tasks `missing`, and `KeyboardInterrupt` is raised again; a complete run is never
     replaced by an incomplete one. `argv` is for the manifest.
-
-    Raises:
-        DataError: The folder cannot be written.
     """
     try:
         if plan.config.resumes and plan.before == "complete":
@@ -118,28 +116,17 @@ def _do_tasks(plan: RunPlan, writer: RunWriter, on_progress: OnProgress) -> None
     statuses = {task: record.status for task, record in writer.ended.items()}
     batches = remaining(plan.batches, statuses, retry=plan.config.retry_failed)
     todo = {task for batch in batches for task in batch}
-    earlier = (writer.result(task) for task in statuses if task not in todo)
-    progress = Progress(len(plan.tasks) - len(todo), len(plan.tasks), 0, news=earlier)
-    with closing(_results(plan, batches)) as results:
-        record(results, writer.add, progress, on_progress)
-
-
-def record(
-    batches: Iterable[list[TaskResult]],
-    add: Callable[[TaskResult], None],
-    progress: Progress,
-    on_progress: OnProgress,
-) -> None:
-    """Put results on disk as they come, and report how far the run is; it begins at `progress`."""
-    earlier, warned = iter(progress.news), set[str]()
-    for results in batches:
-        for result in results:
-            add(result)
-            progress += Progress(1, 0, int(result.status != OK), result.seconds)
-            if result.warning and result.task.planner not in warned:
-                warned.add(result.task.planner)
-                _LOG.warning("planner %s: %s", result.task.planner, result.warning)
-        on_progress(replace(progress, news=chain(earlier, results)))
+    earlier, warned = (writer.result(task) for task in statuses if task not in todo), set[str]()
+    progress = Progress(len(plan.tasks) - len(todo), len(plan.tasks), 0)
+    with closing(_results(plan, batches)) as found:
+        for results in found:
+            for result in results:
+                writer.add(result)
+                progress += Progress(1, 0, int(result.status != OK), result.seconds)
+                if result.warning and result.task.planner not in warned:
+                    warned.add(result.task.planner)
+                    _LOG.warning("planner %s: %s", result.task.planner, result.warning)
+            on_progress(replace(progress, news=chain(earlier, results)))
 
 
 def remaining(batches: Iterable[Batch], ended: Mapping[Task, str], *, retry: bool) -> list[Batch]:
@@ -197,5 +184,4 @@ def results_of(outcome: Outcome[Batch, list[TaskResult]]) -> list[TaskResult]:
     if outcome.result is not None:
         return outcome.result
     status = TIMEOUT if outcome.is_late else FAILED
-    hint = "run this scenario alone with --workers 1 to see why"
-    return [TaskResult(task, status, error=outcome.death, hint=hint) for task in outcome.task]
+    return [TaskResult(task, status, error=outcome.death, hint=ALONE) for task in outcome.task]

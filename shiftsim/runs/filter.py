@@ -116,11 +116,7 @@ class FilterResults:
 
 
 def _read(store: Path) -> FilterResults:
-    """The results that a store holds.
-
-    Raises:
-        DataError: The file is missing or damaged.
-    """
+    """The results that a store holds, or a DataError."""
     path = store / RESULTS
     table = Table(path, SCHEMA)
     if not isinstance(table.footer.get("config"), dict):
@@ -131,8 +127,7 @@ def _read(store: Path) -> FilterResults:
 def read_filter_results(store: str | Path, store_hash: str) -> FilterResults | None:
     """The results for a store, whose content has a hash; None where it was not filtered.
 
-    Raises:
-        DataError: The file is damaged, or of another content of the store.
+    Raises DataError: the file is damaged, or of another content of the store.
     """
     path = Path(store)
     if not (path / RESULTS).is_file():
@@ -211,10 +206,8 @@ def filter_store(
 
     A filter that was interrupted goes on where it stopped. Verdicts that were found with the same
     settings on the same scenarios are kept. The file has the same bytes for any number of workers,
-    of which 0 chooses from the cores. `on_progress` is told scenarios done and in all.
-
-    Raises:
-        DataError: There is no store, or it is damaged.
+    of which 0 chooses from the cores. `on_progress` is told scenarios done and in all. It is a
+    DataError if the store is missing or damaged.
     """
     path, config = Path(store), config or FilterConfig()
     opened = open_store(path)

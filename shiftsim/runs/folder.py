@@ -48,22 +48,14 @@ class TaskRecord(NamedTuple):
 
 
 class RunWriter:
-    """The folder of a run under way.
-
-    Attributes:
-        path: The folder.
-        rollouts: The folder of its rollouts.
-        ended: What has ended so far, in an earlier attempt included.
-    """
+    """The folder of a run under way; what has `ended` so far includes an earlier attempt."""
 
     def __init__(self, path: Path, manifest: dict[str, Any], *, resume: bool = False) -> None:
         """Begin a run, or `resume` one: keep what is finished.
 
         The manifest is written as `running`, unless a complete run is there, which stays as it is
-        until this one has finished as well.
-
-        Raises:
-            ConfigError: Another process works on this folder.
+        until this one has finished as well. It is a ConfigError if another process works on the
+        folder.
         """
         self.path = path
         path.mkdir(parents=True, exist_ok=True)
@@ -103,11 +95,7 @@ class RunWriter:
         return TaskResult.from_rows(rows, self.rollouts)
 
     def add(self, result: TaskResult) -> None:
-        """Put one result on disk; a file of another run that holds its rollout is linked to.
-
-        Raises:
-            OSError: The disk is full; what is there already stays.
-        """
+        """Put a result on disk; a file of another run that holds its rollout is linked to."""
         if result.location is not None:
             file = self._link(result.location.file)
             result = replace(result, location=result.location._replace(file=file))
@@ -180,10 +168,7 @@ class RunWriter:
         """Put the rollouts of a run that ends into files, those of a scenario together.
 
         A file from an earlier attempt stays as it is, unless some of its rollouts have been made
-        again: then the others move.
-
-        Returns:
-            Where they are.
+        again: then the others move. Returns where they are.
         """
         order = sorted(self.ended, key=lambda task: (task.token, task))
         records = [(task, self.ended[task]) for task in order]

@@ -33,11 +33,7 @@ class Journal:
     """Numbered entries: a key, JSON values, and bytes beside them."""
 
     def __init__(self, path: Path, *, keep: bool) -> None:
-        """Begin a journal, or keep one; nothing is in the file before the first entry.
-
-        Raises:
-            ConfigError: Another process works with it.
-        """
+        """Begin a journal, or keep one; a ConfigError where another process works with it."""
         self.path = safe_join(path.parent, path.name)
         self._appended = safe_join(path.parent, f"{path.name}-wal")
         try:
@@ -66,11 +62,7 @@ class Journal:
         return database
 
     def put(self, key: str, values: Mapping[str, Any], data: bytes = b"") -> int:
-        """Put an entry on disk, and return its number; of the same key, the last one counts.
-
-        Raises:
-            OSError: The disk is full; what is there already stays.
-        """
+        """Put an entry on disk, and return its number; of the same key, the last one counts."""
         # NumPy scalars as Python's
         row = (key, json.dumps(values, default=lambda value: value.item()), data)
         with self._errors():

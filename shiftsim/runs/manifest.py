@@ -107,14 +107,10 @@ def _git_state() -> str:
 
 
 def state_of(folder: Path) -> State:
-    """How far the run in a folder is.
+    """How far the run in a folder is, or a DataError if the folder holds something else.
 
-    Returns:
-        `new` when there is nothing to lose, `unfinished` when it was interrupted or killed,
-        `failed` when it ended with failed or missing tasks, else `complete`.
-
-    Raises:
-        DataError: The folder holds something else.
+    That is `new` when there is nothing to lose, `unfinished` when it was interrupted or killed,
+    `failed` when it ended with failed or missing tasks, else `complete`.
     """
     if not folder.exists() or (folder.is_dir() and not _has_content(folder)):
         return "new"
@@ -140,8 +136,7 @@ def _has_content(folder: Path) -> bool:
 def check_target(folder: Path, fingerprint: dict[str, Any], *, shard: str = "") -> State:
     """How far the run in a folder is, to which another one is to be written: the same, or none yet.
 
-    Raises:
-        ConfigError: The folder holds something else; the message says what differs.
+    Raises ConfigError: the folder holds something else; the message says what differs.
     """
     try:
         state = state_of(folder)
@@ -169,11 +164,7 @@ def difference(manifest: dict[str, Any], fingerprint: dict[str, Any], shard: str
 
 
 def check_resumable(folder: Path, fingerprint: dict[str, Any], *, shard: str = "") -> None:
-    """Refuse to begin anew where an unfinished run with other settings seems to be meant.
-
-    Raises:
-        ConfigError: There is one; the message says what differs.
-    """
+    """Refuse to begin anew where an unfinished run with other settings seems to be meant."""
     prefix = folder.name.rpartition("_")[0]
     for other in sorted(folder.parent.glob(f"{prefix}_*")) if prefix else ():
         try:

@@ -16,14 +16,8 @@ from shiftsim._version import __version__
 from shiftsim.data import open_store
 from shiftsim.errors import ConfigError, one_of
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
-from shiftsim.planners.registry import (
-    PLANNERS,
-    RunPlanner,
-    own_name,
-    planner_name,
-    run_planner,
-    takes_argument,
-)
+from shiftsim.planners import registry
+from shiftsim.planners.registry import PLANNERS, RunPlanner, planner_name, takes_argument
 from shiftsim.runs.config import DRIFT, RunConfig, Value, default_workers, parse_shard, split_label
 from shiftsim.runs.manifest import State, check_resumable, check_target, code_digest
 from shiftsim.runs.rollouts import Task
@@ -66,12 +60,6 @@ class RunPlan:
         """All tasks whose scenario exists."""
         return tuple(task for batch in self.batches for task in batch)
 
-    @property
-    def is_serial(self) -> bool:
-        """Whether this process does all tasks itself."""
-        config = self.config
-        return config.executor == "processes" and self.workers <= 1 and not config.timeout
-
     def runner(self) -> "partial[TaskRunner]":
         """What makes the function that does batches, in this process or in another one."""
         given = (self.config, self.store, self.planners, self.noises, self.selection.edits)
@@ -93,9 +81,7 @@ def prepare(
     """Resolve every name and check everything that a run needs.
 
     Classes or instances of planners, drifts, and edits take the place of the names in the settings.
-
-    Raises:
-        ShiftsimError: Something is unknown, missing or contradictory.
+    It is a ShiftsimError if something is unknown, missing or contradictory.
     """
     models = list(noises) or make_drifts(*(getattr(config, name) for name in DRIFT))
     values: dict[str, Any] = {one.name: one.default for one in fields(config) if one.name in DRIFT}
@@ -157,22 +143,19 @@ def prepare(
         workers=workers,
         shared=shared if workers > 1 else (),
     )
-    if not plan.is_serial:
+    if config.executor != "processes" or workers > 1 or config.timeout:  # others do the tasks
         plan.close_planners()
     return plan
 
 
 def _traffic(config: RunConfig) -> tuple[RunPlanner | None, dict[str, Any], bool]:
-    """The planner that drives other vehicles, if one does, and what identifies the traffic.
-
-    Last, whether a network of it moves several rollouts at once.
-    """
+    """The planner that drives others, if any, what identifies traffic, and if a network does."""
     name = config.traffic.removeprefix(PLANNER)
     if name != config.traffic:
         arguments: dict[str, Value] = dict(config.planner_args.get(name, {}))
         if takes_argument(name, "device"):
             arguments.setdefault("device", config.device)
-        planner = run_planner(name, arguments)
+        planner = registry.run_planner(name, arguments)
         return planner, {"traffic_made_of": dict(planner.fingerprint)}, False
     try:
         model = make_traffic(config.traffic, config.device)
@@ -208,7 +191,7 @@ def _planners(config: RunConfig, given: Sequence[Any]) -> list[RunPlanner]:
             arguments.setdefault("device", config.device)
         size = 0 if isolates or takes_argument(source, "batch_size") else _batch_size(arguments)
         isolated = _isolated(config, source, arguments) if isolates else source
-        entry = run_planner(isolated, arguments, name)
+        entry = registry.run_planner(isolated, arguments, name)
         if size and not entry.in_batches:
             raise ConfigError(
                 f"planner {name!r} takes no batch_size: it answers for one scenario at a time",
@@ -218,7 +201,7 @@ def _planners(config: RunConfig, given: Sequence[Any]) -> list[RunPlanner]:
             entry.batch_size, entry.fingerprint = size, {**entry.fingerprint, "batch_size": size}
         entries.append(entry)
         is_custom = isinstance(source, str) and source == name and source not in PLANNERS
-        names.append(own_name(entry) if is_custom else name)
+        names.append(registry.own_name(entry) if is_custom else name)
     for entry, name in zip(entries, names, strict=True):
         entry.name = name if names.count(name) == 1 else entry.name
     return entries

@@ -32,26 +32,17 @@ _MANIFEST = {  # what is read of it, and its type
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run on disk.
+    """A finished run on disk."""
 
-    Attributes:
-        path: Its folder.
-        manifest: Everything the run depended on, and its counts.
-        labels: What planners are called, by their names on disk, where that is something else.
-    """
-
-    path: Path
-    manifest: dict[str, Any]
+    path: Path  # its folder
+    manifest: dict[str, Any]  # everything the run depended on, and its counts
+    # what planners are called, by their names on disk, where that is something else
     labels: Mapping[str, str] = field(default_factory=dict, repr=False)
 
     def labelled(self, labels: Mapping[str, str]) -> Self:
-        """The same run with planners called otherwise in tables and pictures; the disk stays.
+        """The same run with planners called otherwise, new names by own ones; the disk stays.
 
-        Args:
-            labels: New names by those that the run has.
-
-        Raises:
-            ConfigError: The run has no such planner, or two would have one name.
+        Raises ConfigError: the run has no such planner, or two would have one name.
         """
         config, determining = self.manifest["config"], self.manifest["determining"]
         for name in labels:
@@ -116,18 +107,13 @@ class Run:
     def rollout(self, task: Task, scenario: Scenario) -> SimulationLog:
         """One stored rollout; its scenario is that of the store the run was made with.
 
-        Raises:
-            DataError: It was not stored, cannot be read, or the scenario is another one.
+        Raises DataError: it was not stored, cannot be read, or the scenario is another one.
         """
         rows, is_partial = self.rollout_rows(task), "elsewhere" in self.manifest
         return complete_rollout(rows, scenario, task, is_partial=is_partial)
 
     def rollout_rows(self, task: Task) -> pa.RecordBatch:
-        """One stored rollout as it lies on disk, a row per sample.
-
-        Raises:
-            DataError: It was not stored, or cannot be read.
-        """
+        """One stored rollout as it lies on disk, a row per sample; or a DataError."""
         location = self.rollout_places.get(task)
         if location is None:
             raise DataError(
@@ -147,12 +133,7 @@ class Run:
 
 
 def open_run(path: str | Path) -> Run:
-    """A run folder.
-
-    Raises:
-        ConfigError: There is no such folder.
-        DataError: It is not a run folder, one of another format, or the run is not finished.
-    """
+    """A run folder; a ConfigError where there is none, a DataError if it cannot be read."""
     folder = Path(path)
     if not folder.is_dir():
         near = (
@@ -175,8 +156,7 @@ def open_run(path: str | Path) -> Run:
 def label_runs(runs: Sequence[Run], labels: Iterable[str]) -> list[Run]:
     """Runs with planners called otherwise: `NAME=LABEL`, or `RUN/NAME=LABEL` in one of them.
 
-    Raises:
-        ConfigError: No run has such a planner, or two of one would have one name.
+    Raises ConfigError: no run has such a planner, or two of one would have one name.
     """
     wanted: list[dict[str, str]] = [{} for _ in runs]
     named = [
@@ -203,11 +183,7 @@ def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """The manifest of a run folder, finished or not.
-
-    Raises:
-        DataError: It is not a run folder, or one of another format.
-    """
+    """The manifest of a run folder, finished or not; a DataError if none is of this format."""
     path = folder / "manifest.json"
     try:
         manifest: dict[str, Any] = json.loads(path.read_text("utf-8"))

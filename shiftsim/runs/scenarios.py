@@ -32,10 +32,8 @@ _DEMO_SPLIT = "demo-mini"  # of the generated store, where no split is named
 def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
     """The store that a run was made with, or its bundle, which then has the hash of that store.
 
-    `store` says where the store has moved. Edits of the run are in its manifest.
-
-    Raises:
-        DataError: It is not there, or is another one.
+    `store` says where the store has moved. Edits of the run are in its manifest. It is a DataError
+    if the store is not there, or another one.
     """
     found = _recorded(run, store)
     if edits := run.manifest.get("edits"):
@@ -82,10 +80,8 @@ def is_bundled(run: Run) -> bool:
 def bundle_run(run: Run, store: str | None = None) -> ScenarioStore:
     """Copy the scenarios of a run, with recordings and maps, into its folder; the copy's store.
 
-    `store` says where the store has moved. Of a run that holds them already they are checked.
-
-    Raises:
-        DataError: The store is not there, or is another one.
+    `store` says where the store has moved; it is a DataError if it is not there, or another one. Of
+    a run that holds them already they are checked.
     """
     from shiftsim.data.store.writing import StoreWriter, window_row
 
@@ -123,11 +119,7 @@ def bundle_run(run: Run, store: str | None = None) -> ScenarioStore:
 
 
 def open_edits(name: str, store: ScenarioStore) -> "EditSet":
-    """Edits by the path of a file, or by the name of one in `edits/` of a store; splits resolved.
-
-    Raises:
-        ConfigError: There is no such file, or it is wrong.
-    """
+    """Edits by a file, or a name in `edits/` of a store, splits resolved; or a ConfigError."""
     from shiftsim.runs.edited import read_edits
 
     path = Path(store.path)
@@ -164,8 +156,7 @@ def select_scenarios(
 ) -> Selection:
     """The scenarios of a run; edits that are `given` take the place of those in the settings.
 
-    Raises:
-        ShiftsimError: A split or edits are unknown or wrong, or scenarios are missing.
+    Raises ShiftsimError: a split or edits are unknown or wrong, or scenarios are missing.
     """
     edits = given or (open_edits(config.edits, store) if config.edits else None)
     whole, fingerprint = len(store.tokens), {"store": store.hash}
@@ -223,9 +214,7 @@ def open_split(store: ScenarioStore, name: str, *, whole: bool = False) -> "tupl
     """The split of a name, and the hash of the filter's results, empty where they did not choose.
 
     Of a store without a name of a split it is what filter and review accept, or the `whole` store.
-
-    Raises:
-        ShiftsimError: There is no such split, or the filter accepts nothing.
+    It is a ShiftsimError if there is no such split, or the filter accepts nothing.
     """
     from shiftsim.runs.filter import read_filter_results
 
@@ -245,11 +234,7 @@ def open_split(store: ScenarioStore, name: str, *, whole: bool = False) -> "tupl
 
 
 def require_scenarios(split: str, tokens: Sequence[str], store: str, held: Iterable[str]) -> None:
-    """Refuse a split of which a store does not hold everything.
-
-    Raises:
-        DataError: Scenarios are missing.
-    """
+    """Refuse a split of which a store does not hold everything, with a DataError."""
     if missing := sorted(set(tokens).difference(held)):
         raise DataError(
             f"split {split!r} needs {len(tokens)} scenarios, store {store!r} "
@@ -281,10 +266,8 @@ def find_split(name: str, store: Path, tokens: tuple[str, ...]) -> Split:
     """The split of a name; `tokens` are all scenarios of the store in a folder.
 
     The name is that of a file (`.toml`, or `.txt` with one token per line), one below `splits/` of
-    the store, or the store's own (or nothing) for all its scenarios.
-
-    Raises:
-        ConfigError: There is no such split, or it contradicts itself.
+    the store, or the store's own (or nothing) for all its scenarios; anything else is a
+    ConfigError.
     """
     if name in ("", store.name):
         return Split(store.name, tokens)
@@ -306,9 +289,8 @@ def find_split(name: str, store: Path, tokens: tuple[str, ...]) -> Split:
 def read_split(path: Path) -> Split:
     """A split from a file: TOML with `tokens`, or text with one token per line.
 
-    Raises:
-        ConfigError: The file cannot be read, names no tokens or a token twice, or its `count` or
-            `hash` says otherwise.
+    Raises ConfigError: the file cannot be read, names no tokens or a token twice, or its `count` or
+    `hash` says otherwise.
     """
     table: dict[str, object] = {}
     if path.suffix == ".toml":
@@ -357,10 +339,7 @@ def choose_scenarios(
     """Tokens of some scenarios of a store, sorted: the first ones up to the limits.
 
     The rows hold `token`, `type` and `city` of every scenario, `usable` the tokens to choose from,
-    and `wanted` values by column, none for any.
-
-    Raises:
-        ConfigError: No scenario has one of the values wanted.
+    and `wanted` values by column, none for any; one that no scenario has is a ConfigError.
     """
     table = sorted(rows, key=itemgetter("token"))
     for column, values in wanted.items():
@@ -382,10 +361,8 @@ def choose_scenarios(
 def write_split(path: Path, tokens: tuple[str, ...]) -> Split:
     """Write a split that `read_split` reads: TOML with count and hash, or text for `.txt`.
 
-    It is named after the file.
-
-    Raises:
-        ConfigError: There are no tokens, the file ends otherwise, or it cannot be written.
+    It is named after the file. Raises ConfigError: there are no tokens, the file ends otherwise, or
+    it cannot be written.
     """
     split = Split(path.stem, tokens)
     if not tokens:

@@ -96,6 +96,7 @@ class TaskResult:
         None  # where the rollout is stored, where it is in a file already
     )
     warning: str = ""  # why the first plan is most likely not what was meant
+    remarks: tuple[str, ...] = ()  # what a reader must know of a rollout that was driven elsewhere
 
     def rows(self) -> dict[str, list[dict[str, Any]]]:
         """Its rows by table."""
@@ -141,7 +142,10 @@ def stored_location(
 
 def stored_results(run: Path) -> Iterator[TaskResult]:
     """The results that the tables of a run hold, in their order, without those that are missing."""
-    found = {name: _rows_by_task(run / f"{name}.parquet") for name in TABLES}
+    found = {}
+    for name in TABLES:
+        rows_of = (row for batch in _batches(run / f"{name}.parquet") for row in batch.to_pylist())
+        found[name] = ((task, list(group)) for task, group in groupby(rows_of, task_of))
     for task, tasks in found["tasks"]:
         status, rows = tasks[0]["status"], {"tasks": tasks}
         for name in ("scores", "metrics"):
@@ -158,17 +162,8 @@ def _next_rows(task: Task, rows: Iterator[Any], table: Path) -> list[dict[str, A
     return list(values)
 
 
-def _rows_by_task(path: Path) -> Iterator[tuple[Task, list[dict[str, Any]]]]:
-    rows = (row for batch in _batches(path) for row in batch.to_pylist())
-    return ((task, list(group)) for task, group in groupby(rows, task_of))
-
-
 def read_table(path: Path) -> pa.Table:
-    """A table of a run.
-
-    Raises:
-        DataError: It is missing or damaged.
-    """
+    """A table of a run, or a DataError."""
     schema = TABLES[path.stem]
     return pa.Table.from_batches((batch.select(schema.names) for batch in _batches(path)), schema)
 

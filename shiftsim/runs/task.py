@@ -262,10 +262,7 @@ def planner_times(log: SimulationLog) -> dict[str, float]:
 def score_rollout(
     scenario: Scenario, log: SimulationLog, config: RunConfig, undefined: Collection[str] = ()
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The row of `scores.parquet` and the rows of `metrics.parquet`, beyond the key.
-
-    Where metrics are undefined they have no row, and there is no total.
-    """
+    """A row of `scores.parquet` and rows of `metrics.parquet`, without what is `undefined`."""
     result = compute_metrics(log, scenario, thresholds=config.thresholds, own=config.metrics)
     if scenario.script is not None and scenario.script.profile == "interplan":
         from shiftsim.metrics.interplan import add_interplan

@@ -244,9 +244,7 @@ def map_on_cluster(
 ) -> Generator[Outcome[T, R], None, None]:
     """As `map_unordered`, on the cluster whose scheduler is at an address.
 
-    Raises:
-        MissingExtraError: dask.distributed is not installed.
-        ConfigError: There is no scheduler at that address.
+    Raises MissingExtraError: dask.distributed is not installed. ConfigError: no scheduler is there.
     """
     distributed: Any = import_extra("distributed", "cluster")
     try:

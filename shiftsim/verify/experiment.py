@@ -87,13 +87,9 @@ class Run:
 def verify_experiment(folder: Path, find: FindScenario, mode: str | None = None) -> Report:
     """Compare every result folder of nuPlan in a folder with what shiftsim computes.
 
-    Args:
-        folder: What `run_simulation.py` made, or a folder of such folders.
-        find: The scenario of a token, None where there is none.
-        mode: Only results of this challenge (`NR`, `R` or `PT`); None for all.
-
-    Raises:
-        DataError: There is no result folder, or nothing says what was simulated.
+    The folder is what `run_simulation.py` made, or one of such folders; `find` gives the scenario
+    of a token, None where there is none; `mode` chooses a challenge (`NR`, `R` or `PT`), None all.
+    It is a DataError if there is no result folder, or nothing says what was simulated.
     """
     folders = {path.parent for name in _PARTS for path in folder.rglob(name) if path.is_dir()}
     if not folders:

@@ -44,21 +44,14 @@ class Quantity:
 
 @dataclass
 class Report:
-    """All comparisons so far.
+    """All comparisons so far."""
 
-    Attributes:
-        quantities: Tally by quantity, in the order of first appearance.
-        mismatches: One line per case that differs.
-        not_covered: Count by description of what should be compared and was not.
-        informative: Descriptions of what need not be compared.
-        remarks: What else the reader should know of the content.
-    """
-
-    quantities: dict[str, Quantity] = field(default_factory=dict)
-    mismatches: list[str] = field(default_factory=list)
+    quantities: dict[str, Quantity] = field(default_factory=dict)  # by first appearance
+    mismatches: list[str] = field(default_factory=list)  # a line per case that differs
+    # count by description of what should be compared and was not
     not_covered: dict[str, int] = field(default_factory=dict)
-    informative: list[str] = field(default_factory=list)
-    remarks: list[str] = field(default_factory=list)
+    informative: list[str] = field(default_factory=list)  # what need not be compared
+    remarks: list[str] = field(default_factory=list)  # what else the reader should know
 
     def compare(
         self,
@@ -160,23 +153,14 @@ class Report:
 
 @dataclass
 class Source:
-    """Named values of one file, or some rows of them.
+    """Named values of one file, or some rows of them."""
 
-    Attributes:
-        name: Begins the names of compared quantities.
-        what: What one of its values is called.
-        values: All of them.
-        report: Receives the comparisons.
-        used: Names of the values that were read; shared by all parts of a file.
-        rows: Which rows of the values this part has; None for all.
-    """
-
-    name: str
-    what: str
+    name: str  # begins the names of compared quantities
+    what: str  # what one of its values is called
     values: Named
-    report: Report
-    used: set[str] = field(default_factory=set)
-    rows: Any = None
+    report: Report  # receives the comparisons
+    used: set[str] = field(default_factory=set)  # values that were read, of all parts of a file
+    rows: Any = None  # which rows of the values this part has; None for all
 
     def __contains__(self, name: str) -> bool:
         return name in self.values

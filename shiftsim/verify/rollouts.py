@@ -170,10 +170,7 @@ def plan_at(plans: Source, iteration: int) -> Trajectory:
 
 
 class RecordedRun:
-    """What a planner saw in a recorded run, from its ego states and its own objects.
-
-    A run that is not reactive shows the objects of the log.
-    """
+    """What a planner saw: the run's ego states, and its own objects where traffic is reactive."""
 
     def __init__(self, scenario: Scenario, ego: Source, objects: Source, challenge: str) -> None:
         self.scenario, self.ego = scenario, read_ego(ego)
@@ -256,11 +253,7 @@ CHECKS = {
 
 
 def check_reference(name: str, report: Report) -> None:
-    """Compare with one file, a name in `CHECKS`.
-
-    Raises:
-        DataError: The file is missing or damaged.
-    """
+    """Compare with one file, a name in `CHECKS`; a DataError if it is missing or damaged."""
     path = REFERENCE / name
     try:
         with np.load(path, allow_pickle=False) as archive:

@@ -143,11 +143,7 @@ class Recorded:
 
 
 def find_simulation_logs(folder: Path) -> dict[tuple[str, str], Path]:
-    """The logs in a result folder by token and planner.
-
-    Raises:
-        MissingExtraError: There are some that cannot be read without the extra `nuplan`.
-    """
+    """The logs in a result folder by token and planner, or a MissingExtraError."""
     root = folder / "simulation_log"
     found = {
         (path.name.partition(".")[0], path.relative_to(root).parts[0]): path
@@ -165,11 +161,7 @@ def _require_msgpack(files: Iterable[Path]) -> None:
 
 
 def log_source(path: Path) -> Rollouts | None:
-    """The rollouts of a log, or of all logs in a folder; None where there is none.
-
-    Raises:
-        MissingExtraError: They cannot be read without the extra `nuplan`.
-    """
+    """The rollouts of a log, or of all logs in a folder; None where there is none."""
     files = sorted(path.rglob("*.xz")) if path.is_dir() else [path] * (path.suffix == ".xz")
     if not files:
         return None
@@ -206,11 +198,7 @@ def _driven(path: Path) -> Driven:
 
 
 def read_simulation_log(path: Path, report: Report) -> Recorded:
-    """Read one log.
-
-    Raises:
-        DataError: It is damaged, or not as the known version of the devkit writes it.
-    """
+    """Read one log; a DataError if it is damaged, or not as the known devkit writes it."""
     try:
         reader = _LogReader(_unpacked(path))
         return _recorded(reader.load(), report, frozenset(reader.left_out))

@@ -258,8 +258,7 @@ def _sites(folder: Path) -> None:
 
 
 def _read_site(folder: Path) -> Any:
-    from shiftsim.data.readers.annotations import read_recording
-    from shiftsim.data.readers.dsc3d import convert_dsc3d, open_site
+    from shiftsim.data.readers.dsc3d import convert_dsc3d, open_site, read_recording
     from shiftsim.data.readers.windows import ConversionConfig
 
     site = open_site(folder)

@@ -26,14 +26,15 @@ from shiftsim.data.maps.opendrive.graph import LaneSegment
 from shiftsim.data.maps.opendrive.lanes import LaneKey
 from shiftsim.data.maps.opendrive.map import build_road_map
 from shiftsim.data.maps.opendrive.reading import read_opendrive
-from shiftsim.data.readers.annotations import (
+from shiftsim.data.readers.dsc3d import (
     POSITION,
     ROTATION,
     Site,
+    find_map,
+    open_site,
     read_recording,
     rotation_angles,
 )
-from shiftsim.data.readers.dsc3d import find_map, open_site
 from shiftsim.data.readers.reader import SourceRecording
 from shiftsim.data.readers.samples import (
     ROW_S,

@@ -30,8 +30,7 @@ from parity_cases import (
 )
 
 from shiftsim.compat import nuplan as compat
-from shiftsim.data.nuplan.boxes import read_boxes
-from shiftsim.data.nuplan.log import Log, open_log, read_ego
+from shiftsim.data.nuplan.log import Log, open_log, read_boxes, read_ego
 from shiftsim.data.nuplan.scenarios import find_maps, load_map
 from shiftsim.data.readers.routes import follow_blocks
 from shiftsim.verify.rollouts import LOGGED, ego_columns, light_columns, object_columns

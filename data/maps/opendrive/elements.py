@@ -122,10 +122,7 @@ class Reader:
     def coefficients(
         self, element: Any, names: Sequence[str], is_crumb: bool
     ) -> tuple[list[float], list[bool]]:
-        """Coefficients of a curve, and whether each is in its range, or not finite.
-
-        Those of a record shorter than 1 mm may be any numbers.
-        """
+        """Coefficients of a curve, and which of them fit their ranges; a crumb's may be any."""
         values = [self.number(element, name, may_be_any=is_crumb) for name in names]
         allowed = [OPENDRIVE[f"{element.tag} {name}"] for name in names]
         fits = [

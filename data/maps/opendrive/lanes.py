@@ -100,10 +100,7 @@ def border_is_mirrored(lane: Lane) -> bool:
 
 
 def runs_forward(road: Road, section: int, lane: int) -> bool:
-    """Whether traffic on a lane moves in the direction of s.
-
-    Lanes for both directions count as lanes of their own side.
-    """
+    """Whether traffic on a lane moves along s; two-way lanes count as of their own side."""
     is_reversed = road.sections[section].lanes[lane].direction == "reversed"
     return ((lane < 0) != road.left_hand) != is_reversed
 

@@ -32,24 +32,14 @@ def build_road_map(
     od: OpenDrive,
     *,
     name: str,
-    offset: tuple[float, float] = (0.0, 0.0),
-    epsg: int = 0,
-    country: str = "DE",
+    offset: tuple[float, float] = (0.0, 0.0),  # UTM position of the local origin [m]
+    epsg: int = 0,  # code of the coordinate system that results; 0 for a local frame
+    country: str = "DE",  # whose default speed limits hold where the file has none
 ) -> tuple[VectorMap, BuiltMap]:
-    """The semantic map of an OpenDRIVE file.
+    """The semantic map of an OpenDRIVE file, and the report.
 
-    Args:
-        od: The file.
-        name: Name of the map.
-        offset: Added to all coordinates: UTM position of the local origin [m].
-        epsg: Code of the coordinate system that results; 0 for a local frame.
-        country: Whose default speed limits hold where the file has none.
-
-    Returns:
-        The map, without lanes where the file has none that cars may use, and the report.
-
-    Raises:
-        MapError: The file has more road than one map can hold.
+    It has no lanes where the file has none that cars may use. Raises MapError: the file has more
+    road than one map can hold.
     """
     warnings = Counter(od.warnings)
     placed = _prepare(od, warnings)
@@ -87,10 +77,7 @@ def require_lanes(od: OpenDrive, built: BuiltMap) -> None:
 
 
 def _prepare(od: records.OpenDrive, warnings: Counter[str]) -> records.OpenDrive:
-    """The file in the frame of its header, without roads that cannot be drawn; counts them.
-
-    Raises MapError: the file has more road than one map can hold.
-    """
+    """The file in the frame of its header, without roads that cannot be drawn; or a MapError."""
     roads = {}
     fast: list[str] = []  # roads of towns with limits that cannot be meant
     for name, road in od.roads.items():

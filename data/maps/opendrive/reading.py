@@ -34,9 +34,7 @@ def read_opendrive(path: Path) -> OpenDrive:
     """Read an OpenDRIVE file (1.0 to 1.8).
 
     Entities, document types and external references are refused: the file is data, not a program.
-
-    Raises:
-        ConversionError: The file is missing, too large, not OpenDRIVE, or broken beyond repair.
+    It is a ConversionError if it is missing, too large, not OpenDRIVE, or broken beyond repair.
     """
     try:
         size = path.stat().st_size

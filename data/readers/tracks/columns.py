@@ -119,9 +119,8 @@ class Columns:
 def recognise(names: Sequence[str], overrides: Mapping[str, Any], where: str) -> Columns:
     """What each column is; the `overrides` of the TOML file go before what names tell.
 
-    Raises:
-        ConfigError: The TOML file names something that does not exist.
-        ConversionError: A column that is needed is missing, or there twice.
+    Raises ConfigError: the TOML file names something that does not exist. ConversionError: a column
+    that is needed is missing, or there twice.
     """
     for key in overrides:
         one_of("setting", key, _SETTINGS)

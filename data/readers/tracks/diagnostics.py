@@ -10,7 +10,7 @@ from shiftsim.data.readers.build import find_pause, find_twice
 from shiftsim.data.readers.codes import KINDS
 from shiftsim.data.readers.motion import contradiction
 from shiftsim.data.readers.tracks import axes
-from shiftsim.data.readers.tracks.map_fit import MIN_ALONG, Fit, fit_map
+from shiftsim.data.readers.tracks.axes import MIN_ALONG, Fit, fit_map
 from shiftsim.data.readers.tracks.table import TrackTable
 from shiftsim.errors import listed
 from shiftsim.world.map import VectorMap

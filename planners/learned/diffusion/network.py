@@ -158,8 +158,7 @@ class DiffusionNetwork(nn.Module):
 def build_network(args: Mapping[str, Any] | None = None) -> DiffusionNetwork:
     """The network without its weights, by an args.json or of the official dimensions.
 
-    Raises:
-        CheckpointError: The settings lack something, or are of a network that reads other features.
+    Raises CheckpointError: settings lack something, or are of a network that reads other features.
     """
     if args is not None:
         _check(args)

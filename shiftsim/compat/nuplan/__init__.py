@@ -50,9 +50,8 @@ def wrap(planner: Any, **arguments: Any) -> "NuplanPlanner":
 def from_spec(spec: str) -> Callable[..., "NuplanPlanner"]:
     """What makes the planner `nuplan:package.module:Class`.
 
-    Raises:
-        ConfigError: There is no such class, or it is none of nuPlan planners.
-        MissingExtraError: It needs more of nuPlan's devkit than the shims have.
+    Raises ConfigError: there is no such class, or it is none of nuPlan planners. MissingExtraError:
+    it needs more of nuPlan's devkit than the shims have.
     """
     if spec.count(":") != 2:
         raise ConfigError(
@@ -70,8 +69,7 @@ def from_spec(spec: str) -> Callable[..., "NuplanPlanner"]:
 def factory(kind: Any) -> Callable[..., "NuplanPlanner"]:
     """What makes wrapped planners of a class; it takes the arguments of the class's constructor.
 
-    Raises:
-        ConfigError: It is no class of nuPlan planners, or asks for what shiftsim does not have.
+    Raises ConfigError: it is no class of nuPlan planners, or asks for what shiftsim does not have.
     """
     if not inspect.isclass(kind):
         raise ConfigError(

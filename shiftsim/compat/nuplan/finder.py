@@ -69,11 +69,7 @@ class ShimFinder(MetaPathFinder, Loader):
     def find_spec(
         self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """A spec for a shim, or None for modules of others.
-
-        Raises:
-            MissingExtraError: There is no shim for this part of the devkit.
-        """
+        """A spec for a shim, None for modules of others; an error for parts without a shim."""
         if name.partition(".")[0] != "nuplan":
             return None
         if name in MODULES or name in _PACKAGES or self._note(name):

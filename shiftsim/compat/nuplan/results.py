@@ -70,19 +70,8 @@ def export_results(
 ) -> ResultsExport:
     """Write the results of a run as nuPlan's own simulation would have written them.
 
-    Args:
-        run: A run with stored rollouts.
-        out: Folder to write to; must be new or empty.
-        store: Where the store of the run has moved.
-        logs: Folder of the recordings (.db), which nuBoard opens.
-        maps: Folder of the maps, likewise.
-        simulation_logs: Whether to write simulation logs; without them nuBoard shows tables only.
-        workers: Worker processes; 0 chooses from the cores.
-        progress: Called with tasks done and tasks in all.
-
-    Raises:
-        ConfigError: The folder is not empty, or two planners would have the same name.
-        DataError: Rollouts are missing, or the store is another one.
+    Settings and errors are those of `shiftsim.Run.export_results`; without simulation logs nuBoard
+    shows tables only.
     """
     out, tasks, rows = Path(out), tasks_with_rollouts(run), run.tasks.to_pylist()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):

@@ -148,18 +148,9 @@ def write_simulation_log(
     """Write a rollout as a simulation log, packed with msgpack and xz.
 
     Velocities of plans are derived from their poses. The planner is a stand-in: it has the name and
-    the run times, and `shiftsim` says what was run.
-
-    Args:
-        path: File to write.
-        task: What was run.
-        scenario: The scenario.
-        log: The rollout.
-        database: The recording (.db), where nuPlan's tools look for the rest of the scenario.
-        maps: Folder where they look for the map.
-
-    Raises:
-        ConversionError: A light belongs to a connector without an integer id.
+    the run times, and `shiftsim` says what was run. In `database`, the recording (.db), and in the
+    folder `maps` nuPlan's tools look for the rest of the scenario. It is a ConversionError if a
+    light belongs to a connector without an integer id.
     """
     with _without_collector():
         planner = _DEVKIT.SimplePlanner(

@@ -89,10 +89,7 @@ def scenario_type(changes: Mapping[str, Any], details: Mapping[str, Any]) -> str
 
 
 def group_names(names: Iterable[str]) -> dict[str, list[str]]:
-    """Codes by token, of names such as `2d62c3139aa95007-s0`, in their order.
-
-    Raises ConfigError: some names have codes and others have none.
-    """
+    """Codes by token, of names such as `2d62c3139aa95007-s0`, all or none of them with codes."""
     listed = list(names)
     if len({"-" in name for name in listed}) > 1:
         raise ConfigError("some names have codes and others have none", "all or none need one")
@@ -125,10 +122,8 @@ def import_names(
     """The table of an `edits.toml` for a list of interPlan's names and its modifications.
 
     Both are what the files of interPlan's repository hold, which are not part of this package. The
-    `window` is the duration of the scenarios [s], 0 for the recorded one.
-
-    Raises:
-        ConfigError: They do not hold it, or a code is wrong.
+    `window` is the duration of the scenarios [s], 0 for the recorded one. It is a ConfigError if
+    the files do not hold it, or a code is wrong.
     """
     listed, details = names.get("scenario_tokens"), modifications.get(DETAILS)
     if not isinstance(listed, list) or not isinstance(details, dict):

@@ -43,10 +43,7 @@ def make_plan(
     initial: FloatArray,
     driven_lanes: DrivenLanes,
 ) -> Plan:
-    """Route, lanes, goal and expert; the ego starts in the state `initial` (11,).
-
-    Raises ConfigError: interPlan finds none.
-    """
+    """Route, lanes, goal and expert from a state `initial` (11,), or a ConfigError without any."""
     road, center = scenario.map, center_poses(initial[None, :3])[0]
     expert = center_poses(scenario.expert[:, :3])
     letter = changes.get("goal")

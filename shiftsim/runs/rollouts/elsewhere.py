@@ -52,7 +52,7 @@ class Entry(NamedTuple):
     """A rollout that waits to be scored."""
 
     task: Task
-    read: Callable[[], Driven]
+    read: Any = None  # makes the `Driven` of one that was driven elsewhere
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,7 @@ class Source:
     def in_store(self, store: ScenarioStore) -> "Source":
         """The rollouts whose scenarios a store has.
 
-        Raises:
-            DataError: It lacks all of them, or one where the source is to be scored as a whole.
+        Raises DataError: it lacks all of them, or one where the source is to be scored as a whole.
         """
         known = [entry for entry in self.entries if entry.task.token in store]
         lost = [entry.task.token for entry in self.entries if entry.task.token not in store]
@@ -171,10 +170,8 @@ def _as_table(given: Any, scenario: Scenario) -> pa.Table:
 def read_source(path: Path, tracks: str = "") -> Source:
     """The rollouts of a table of poses, or of the tables in a folder.
 
-    `tracks` is the path of a table of boxes; empty or `RECORDED` without one.
-
-    Raises:
-        DataError: A file cannot be read, or a column is missing or holds something else.
+    `tracks` is the path of a table of boxes; empty or `RECORDED` without one. It is a DataError if
+    a file cannot be read, or a column is missing or holds something else.
     """
     files = tuple(sorted([*path.glob("*.parquet"), *path.glob("*.csv")])) or (path,)
     table = pa.concat_tables(map(_read_table, files), promote_options="default")
@@ -205,11 +202,7 @@ def _read_table(path: Path) -> pa.Table:
 def table_source(
     table: pa.Table, where: str, boxes: pa.Table | None = None, where_boxes: str = "tracks"
 ) -> Source:
-    """The rollouts in a table of poses, among the boxes of another one.
-
-    Raises:
-        DataError: A column is missing, or holds something else.
-    """
+    """The rollouts in a table of poses, among the boxes of another one, or a DataError."""
     point = (table.schema.metadata or {}).get(b"point", b"").decode()
     if point:
         one_of(f"{where}: point", point, POINTS)

@@ -135,10 +135,8 @@ def complete_rollout(
     """The stored rollout of a task, completed by its noise and what its scenario holds already.
 
     The rows have columns of `STATES`, and of `TRACKS` where they are not those of the log. Where
-    they may end before the scenario, the expert ends with them.
-
-    Raises:
-        DataError: The scenario is not the one that was driven, or the rows are damaged.
+    they may end before the scenario, the expert ends with them. Raises DataError: the scenario is
+    not the one that was driven, or the rows are damaged.
     """
     time_us = rows["time_us"].to_numpy()
     if is_partial:
@@ -194,11 +192,7 @@ def complete_rollout(
 
 
 def _stored_seen(rows: pa.RecordBatch, true: Tracks) -> Seen | None:
-    """What was seen in a stored rollout; None where it was the truth.
-
-    Raises:
-        ValueError: It is damaged.
-    """
+    """What was seen in a stored rollout, None where it was the truth; a ValueError if damaged."""
     if SEEN.names[0] not in rows.schema.names:
         return None
     ego = stack(rows, SEEN.names[:3])
@@ -213,22 +207,14 @@ def _stored_seen(rows: pa.RecordBatch, true: Tracks) -> Seen | None:
 
 
 def _cells(column: pa.Array, lengths: np.ndarray, name: str) -> pa.Array:
-    """The items of lists that have these lengths (K,).
-
-    Raises:
-        ValueError: They have others.
-    """
+    """The items of lists that have these lengths (K,), else a ValueError."""
     if not np.array_equal(np.diff(column.offsets.to_numpy()), lengths):
         raise ValueError(f"the lists of {name!r} are too short or too long")
     return column.flatten()
 
 
 def stored_plans(rows: pa.RecordBatch) -> np.ndarray:
-    """(K, P, 3) poses of the plans of a stored rollout, to about 10 micrometres.
-
-    Raises:
-        ValueError: They are damaged.
-    """
+    """(K, P, 3) poses of the plans of a rollout, to about 10 micrometres, or a ValueError."""
     lengths = np.diff(rows[_PLAN_COLUMNS[0]].offsets.to_numpy())
     if (lengths > NUM_KEPT).any():
         raise ValueError(f"a plan of {lengths.max()} poses")
@@ -242,15 +228,10 @@ def stored_plans(rows: pa.RecordBatch) -> np.ndarray:
 def stored_tracks(
     rows: pa.RecordBatch, tokens: Sequence[str], prefix: str = "track_"
 ) -> dict[str, np.ndarray]:
-    """Fields `valid`, `poses`, `velocities` and `sizes` of the tracks of a stored rollout.
+    """Fields `valid`, `poses`, `velocities`, `sizes` of N stored tracks, by their `tokens`.
 
-    Args:
-        rows: Columns of `TRACKS`.
-        tokens: N tokens of the tracks, in the order of the arrays.
-        prefix: Of the columns; those that were seen have `seen_track_`.
-
-    Raises:
-        ValueError: They are damaged, or of other tracks.
+    Columns are those of `TRACKS`, or of what was seen with its prefix. Raises ValueError: they are
+    damaged, or of other tracks.
     """
     names = rows[f"{prefix}tokens"]
     lengths = np.diff(names.offsets.to_numpy())
@@ -323,11 +304,7 @@ class RolloutReader:
         self._first = 0  # its first row
 
     def read(self, location: RolloutLocation) -> pa.RecordBatch:
-        """The rows of a rollout, all columns.
-
-        Raises:
-            DataError: The file cannot be read, or does not hold them.
-        """
+        """The rows of a rollout, all columns, or a DataError."""
         try:
             if self._file is None or self._path != location.file:
                 self._open(location.file)
@@ -420,11 +397,7 @@ def _keys(rollouts: list[tuple[Task, pa.RecordBatch]]) -> list[pa.Array]:
 
 
 def part_file(folder: Path, name: str) -> Path:
-    """The file of rollouts in a folder that a table or a journal names.
-
-    Raises:
-        DataError: It cannot be the name of one.
-    """
+    """The file of rollouts in a folder that a table or a journal names, or a DataError."""
     if not _PART.fullmatch(name):
         raise DataError(
             f"{str(folder)!r}: {name!r} is no file of rollouts", hint="make the run again"

@@ -16,26 +16,13 @@ from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.metrics.comfort import MIN_SAMPLES, derived_states
 from shiftsim.sim.log import SimulationLog, as_recorded
+from shiftsim.world import state
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import (
-    AX,
-    AY,
-    HEADING,
-    LAST_AGENT_KIND,
-    PACIFICA,
-    STATE_COLUMNS,
-    VX,
-    VY,
-    YAW_ACCEL,
-    YAW_RATE,
-    Tracks,
-    center_poses,
-    rear_poses,
-)
+from shiftsim.world.state import HEADING, STATE_COLUMNS, VX, VY, Tracks, center_poses, rear_poses
 
 REAR_AXLE, CENTER = POINTS = ("rear_axle", "center")
 NEED_BOXES = ("no_ego_at_fault_collisions", "time_to_collision_within_bound")
-_READ = (VX, VY, AX, AY, YAW_RATE, YAW_ACCEL)  # by metrics, beside poses
+_READ = (VX, VY, state.AX, state.AY, state.YAW_RATE, state.YAW_ACCEL)  # by metrics, beside poses
 _STEP = 100_000  # us between iterations
 _EXACT, _NEAR = 1_000, 25_000  # us from an iteration: taken as it is, or interpolated
 _LONGEST_STEP = 150_000  # us
@@ -97,15 +84,9 @@ def rollout_of(
 ) -> tuple[SimulationLog, tuple[str, ...]]:
     """The rollout that poses in a scenario are, and what a reader of its score must know.
 
-    Args:
-        driven: The poses, with states and boxes as far as they are given.
-        scenario: Where they were driven.
-        point: Which of `POINTS` the poses are of.
-        recorded: Whether the others did what was recorded, if no boxes are given.
-        partial: Whether it may end before the scenario: the expert then ends as well.
-
-    Raises:
-        DataError: Something cannot be right; the message names the row.
+    The poses are of one of `POINTS`; `recorded`: the others did what was recorded, if no boxes are
+    given; `partial`: it may end before the scenario, and the expert then ends as well. Raises
+    DataError: something cannot be right; the message names the row.
     """
     _check_rows(driven)
     states, remarks = np.array(driven.states), [*driven.remarks]
@@ -243,7 +224,7 @@ def _check_start(
             side = "ahead of" if other == CENTER else "behind"
             driven.refuse_one(
                 row,
-                f"at iteration 0 the pose is {PACIFICA.rear_axle_to_center:.3f} m {side} the "
+                f"at iteration 0 the pose is {state.PACIFICA.rear_axle_to_center:.3f} m {side} the "
                 f"recorded rear axle: it is of the {other.replace('_', ' ')}",
                 f"say so: --point {other}",
             )
@@ -357,7 +338,7 @@ def _others(
             words = f"{driven.where}: track {token!r} has no type, and is not in the recording"
             raise DataError(words, "add a column type: VEHICLE, PEDESTRIAN, BICYCLE, …")
         kinds[index] = recorded[token]
-    velocities, moves = np.array(tracks.velocities), kinds <= LAST_AGENT_KIND
+    velocities, moves = np.array(tracks.velocities), kinds <= state.LAST_AGENT_KIND
     unknown = tracks.valid & moves & np.isnan(velocities).any(axis=2)
     if unknown.any():
         velocities[unknown] = _differences(tracks, times)[unknown]

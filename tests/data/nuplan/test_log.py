@@ -13,9 +13,8 @@ import pytest
 from nuplan_logs import list_scenarios, read_scenario
 from recordings import require_plausible
 
-from shiftsim.data.nuplan.boxes import read_boxes
 from shiftsim.data.nuplan.convert import convert_nuplan
-from shiftsim.data.nuplan.log import open_log, read_ego
+from shiftsim.data.nuplan.log import open_log, read_boxes, read_ego
 from shiftsim.data.nuplan.map import read_map
 from shiftsim.data.nuplan.scenarios import (
     NAMED_TYPES,

@@ -13,10 +13,9 @@ from commands import call
 from nuplan_logs import list_scenarios
 
 from shiftsim.data.nuplan.convert import convert_nuplan
-from shiftsim.data.nuplan.filter import ScenarioFilter
+from shiftsim.data.nuplan.filter import ScenarioFilter, is_taken, thin_out
 from shiftsim.data.nuplan.log import Log, open_log
 from shiftsim.data.nuplan.map import read_map
-from shiftsim.data.nuplan.sampling import is_taken, thin_out
 from shiftsim.data.nuplan.scenarios import ScenarioEntry, cut_window
 from shiftsim.errors import ConfigError
 from shiftsim.world.map import VectorMap

@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shiftsim.data.readers.annotations import read_recording, rotation_angles
-from shiftsim.data.readers.dsc3d import find_map, open_site
+from shiftsim.data.readers.dsc3d import find_map, open_site, read_recording, rotation_angles
 from shiftsim.data.readers.motion import held_headings
 from shiftsim.errors import ConversionError
 

@@ -11,9 +11,8 @@ import pytest
 from track_files import write_tracks
 
 from shiftsim.data.readers.motion import contradiction, fitted_velocities, track_ends
-from shiftsim.data.readers.tracks.axes import Diagnostics, check_velocities
+from shiftsim.data.readers.tracks.axes import Diagnostics, Fit, check_velocities
 from shiftsim.data.readers.tracks.diagnostics import _check_jumps, _check_sizes
-from shiftsim.data.readers.tracks.map_fit import Fit
 from shiftsim.data.readers.tracks.table import read_tracks
 from shiftsim.data.store.check import _check_boxes
 from shiftsim.verify.report import Report

@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shiftsim.data.readers.annotations import read_recording
-from shiftsim.data.readers.dsc3d import convert_dsc3d, open_site
+from shiftsim.data.readers.dsc3d import convert_dsc3d, open_site, read_recording
 from shiftsim.data.readers.windows import ConversionConfig, make_config
 from shiftsim.data.store.check import survey_store
 from shiftsim.errors import ConfigError, ConversionError

@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import savgol_filter
 
-from shiftsim.data.readers.annotations import read_recording
 from shiftsim.data.readers.build import make_samples
-from shiftsim.data.readers.dsc3d import convert_dsc3d, open_site
+from shiftsim.data.readers.dsc3d import convert_dsc3d, open_site, read_recording
 from shiftsim.data.readers.samples import ego_states, resample, slope
 from shiftsim.data.readers.scenarios import _spans
 from shiftsim.data.readers.windows import (

@@ -6,8 +6,7 @@ from track_files import write_demo
 
 from shiftsim.benchmarks import known_sets
 from shiftsim.benchmarks.speed.city import bench_scene
-from shiftsim.data.readers.annotations import read_recording
-from shiftsim.data.readers.dsc3d import open_site
+from shiftsim.data.readers.dsc3d import open_site, read_recording
 from shiftsim.data.readers.windows import overlap_partners
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.data.synthetic.layouts import random_town

@@ -47,7 +47,6 @@ class BridgeMap(AbstractMap):
 
     @property
     def map_name(self) -> str:
-        """Name of the map."""
         return self.source.name
 
     @cached_property

@@ -48,7 +48,6 @@ class NuPlanPolylineMapObject(PolylineMapObject):
 
     @cached_property
     def linestring(self) -> shapely.LineString:
-        """The line."""
         return shapely.LineString(self._xy)
 
     @property
@@ -115,7 +114,6 @@ class _Mapped:
 
     @cached_property
     def polygon(self) -> shapely.Polygon:
-        """Its area."""
         return self._layer.shape(self._index)
 
 
@@ -156,7 +154,6 @@ class _Edge(_Mapped):
 
     @cached_property
     def baseline_path(self) -> NuPlanPolylineMapObject:
-        """Its centre line."""
         return NuPlanPolylineMapObject(self.id, self._source.baselines.at(self._index))
 
     @property
@@ -172,11 +169,9 @@ class _Edge(_Mapped):
         return None if block == NONE else self._map.object("blocks", block)
 
     def get_roadblock_id(self) -> str:
-        """Id of its roadblock or roadblock connector."""
         return "" if self.parent is None else str(self.parent.id)
 
     def has_traffic_lights(self) -> bool:
-        """Whether lights govern it."""
         return bool(self._source.has_traffic_lights[self._index])
 
 
@@ -214,7 +209,6 @@ class NuPlanLaneConnector(_Edge, LaneConnector):
 
     @property
     def turn_type(self) -> Any:
-        """Where it turns."""
         return LaneConnectorType(int(self._source.turn_type[self._index]))
 
     def is_left_of(self, other: Any) -> bool:
@@ -258,7 +252,6 @@ class NuPlanStopLine(_Mapped, StopLine):
 
     @property
     def layer_type(self) -> Any:
-        """Why one stops here."""
         return StopLineType(int(self._source.stop_kinds[self._index]))
 
     stop_line_type = layer_type

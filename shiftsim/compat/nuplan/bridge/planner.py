@@ -69,7 +69,6 @@ class ObservedTracks(DetectionsTracks):
 
     @cached_property
     def tracked_objects(self) -> Any:
-        """The objects."""
         present = np.flatnonzero(self._tracks.valid[0]).tolist()
         return TrackedObjects([self._object(track) for track in present])
 
@@ -137,10 +136,8 @@ def to_trajectory(plan: Any, now_us: int, next_us: int, planner: str) -> Traject
     """What a planner returned, as ours; the times are those of this iteration and the next [us].
 
     The states of an `InterpolatedTrajectory` are taken as they are. Another kind of trajectory is
-    asked for its states wherever the simulation looks at it.
-
-    Raises:
-        PlannerError: It is no trajectory of ego states.
+    asked for its states wherever the simulation looks at it. It is a PlannerError if the states are
+    not those of an ego.
     """
     if not isinstance(plan, AbstractTrajectory):
         raise PlannerError(
@@ -192,11 +189,7 @@ class NuplanPlanner:
         return self._source(**self._arguments) if fresh else self._source
 
     def reset(self, scene: SceneInfo) -> None:
-        """Initialize the planner; of a class a new one, unless the present one is still unused.
-
-        Raises:
-            ConfigError: It asks for sensor data.
-        """
+        """Initialize the planner, of a class a new one; a ConfigError if it wants sensor data."""
         if self._scene is not None:
             self.close()
             self._planner = self._make()
@@ -212,11 +205,7 @@ class NuplanPlanner:
         self._planner.initialize(PlannerInitialization(list(scene.route), goal, _maps(scene.map)))
 
     def plan(self, observation: Observation) -> Trajectory:
-        """The planner's trajectory.
-
-        Raises:
-            PlannerError: It returned something else.
-        """
+        """The planner's trajectory; a PlannerError where it returned something else."""
         if self._scene is None or self._history is None:
             raise PlannerError(f"planner {self.name!r}: plan() was called before reset()")
         found = self._planner.compute_trajectory(self._history.planner_input(observation))

@@ -123,7 +123,6 @@ class OrientedBox(_Halves):
 
     @classmethod
     def from_new_pose(cls, box: "OrientedBox", pose: StateSE2) -> "OrientedBox":
-        """A box of the same size elsewhere."""
         return OrientedBox(pose, *astuple(box.dimensions))
 
     center = part("_center", "Pose of the centre.")
@@ -134,7 +133,6 @@ class OrientedBox(_Halves):
     half_height = derived(lambda self: float(self.height / 2.0), "Half the height [m].")
 
     def corner(self, point: OrientedBoxPointType) -> Point2D:
-        """One point of the box."""
         if point == OrientedBoxPointType.CENTER:
             return self.center.point
         along, across = _WHERE[point]
@@ -148,7 +146,6 @@ class OrientedBox(_Halves):
 
     @cached_property
     def geometry(self) -> shapely.Polygon:
-        """The polygon of the corners."""
         return shapely.Polygon([(point.x, point.y) for point in self.all_corners()])
 
     def __eq__(self, other: object) -> bool:
@@ -183,7 +180,6 @@ class CarFootprint(OrientedBox):
     def build_from_center(
         cls, center: StateSE2, vehicle_parameters: VehicleParameters
     ) -> "CarFootprint":
-        """From the pose of the centre."""
         return cls(center, vehicle_parameters)
 
     oriented_box = derived(lambda self: self, "The box itself.")
@@ -194,7 +190,6 @@ class CarFootprint(OrientedBox):
 
     @cached_property
     def rear_axle(self) -> StateSE2:
-        """Pose of the rear axle."""
         return translate_longitudinally(self.center, -self.rear_axle_to_center_dist)
 
 

@@ -10,11 +10,7 @@ import numpy as np
 
 from shiftsim.compat.nuplan.shims.boxes import CarFootprint, OrientedBox, VehicleParameters
 from shiftsim.compat.nuplan.shims.geometry import StateSE2, StateVector2D, TimePoint, part
-from shiftsim.compat.nuplan.shims.objects import (
-    AgentState,
-    SceneObjectMetadata,
-    TrackedObjectType,
-)
+from shiftsim.compat.nuplan.shims.objects import AgentState, SceneObjectMetadata, TrackedObjectType
 from shiftsim.compat.nuplan.shims.transforms import (
     approximate_derivatives,
     lateral_projection,
@@ -81,7 +77,6 @@ class Waypoint(InterpolatableState):
 
     @staticmethod
     def deserialize(vector: Sequence[Any]) -> "Waypoint":
-        """From what `serialize` gives."""
         time, x, y, heading, length, width, height, *velocity = vector
         return Waypoint(
             TimePoint(int(time)),
@@ -97,7 +92,6 @@ class Waypoint(InterpolatableState):
 
     @staticmethod
     def from_split_state(split_state: SplitState) -> "Waypoint":
-        """A waypoint from parts."""
         time, x, y, *velocity = split_state.linear_states
         width, length, height = split_state.fixed_states
         known = all(v is not None and not np.isnan(v) for v in velocity)
@@ -144,7 +138,6 @@ class DynamicCarState:
 
     @classmethod
     def build_from_rear_axle(cls, *values: Any, **named: Any) -> "DynamicCarState":
-        """The same as the constructor."""
         return cls(*values, **named)
 
     @cached_property
@@ -197,7 +190,6 @@ class EgoState(InterpolatableState):
         angular_accel: float = 0.0,
         tire_steering_rate: float = 0.0,
     ) -> "EgoState":
-        """From what is known at the rear axle."""
         footprint = CarFootprint.build_from_rear_axle(rear_axle_pose, vehicle_parameters)
         distance, velocity = footprint.rear_axle_to_center_dist, rear_axle_velocity_2d
         turning = (angular_vel, angular_accel, tire_steering_rate)
@@ -217,7 +209,6 @@ class EgoState(InterpolatableState):
         angular_vel: float = 0.0,
         angular_accel: float = 0.0,
     ) -> "EgoState":
-        """From what is known at the centre of the box."""
         footprint = CarFootprint(center, vehicle_parameters)
         distance, turning = footprint.rear_axle_to_center_dist, (angular_vel, angular_accel)
         back = StateVector2D(-distance, 0.0)
@@ -228,7 +219,6 @@ class EgoState(InterpolatableState):
 
     @property
     def scene_object_metadata(self) -> SceneObjectMetadata:
-        """Says that it is the ego."""
         return SceneObjectMetadata(self.time_us, "ego", -1, "ego")
 
     @cached_property
@@ -239,7 +229,6 @@ class EgoState(InterpolatableState):
 
     @cached_property
     def agent(self) -> AgentState:
-        """The ego as one of the objects."""
         velocity = self.dynamic_car_state.center_velocity_2d
         metadata = self.scene_object_metadata
         return AgentState(TrackedObjectType.EGO, self.car_footprint, velocity, metadata)

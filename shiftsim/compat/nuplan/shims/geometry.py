@@ -55,7 +55,6 @@ class TimeDuration:
 
     @classmethod
     def from_us(cls, t_us: int) -> "TimeDuration":
-        """A span in microseconds."""
         return cls(time_us=int(t_us), _direct=False)
 
     @classmethod
@@ -115,7 +114,6 @@ class TimePoint:
         return NotImplemented
 
     def diff(self, time_point: "TimePoint") -> TimeDuration:
-        """How long after another moment this one is."""
         return TimeDuration.from_us(self.time_us - time_point.time_us)
 
 
@@ -151,19 +149,16 @@ class StateSE2(Point2D):
 
     @staticmethod
     def from_matrix(matrix: FloatArray) -> "StateSE2":
-        """The pose of a (3, 3) transform."""
         assert matrix.shape == (3, 3), f"a 3x3 transform is needed, not {matrix.shape}"
         return StateSE2(matrix[0, 2], matrix[1, 2], np.arctan2(matrix[1, 0], matrix[0, 0]))
 
     @staticmethod
     def deserialize(vector: Sequence[float]) -> "StateSE2":
-        """A pose from x, y, heading."""
         if len(vector) != 3:
             raise RuntimeError(f"a pose has 3 numbers, not {len(vector)}")
         return StateSE2(*vector)
 
     def serialize(self) -> list[float]:
-        """X, y, heading."""
         return [self.x, self.y, self.heading]
 
     def __iter__(self) -> Iterator[float]:
@@ -193,7 +188,6 @@ class ProgressStateSE2(StateSE2):
 
     @staticmethod
     def deserialize(vector: Sequence[float]) -> "ProgressStateSE2":
-        """From progress, x, y, heading."""
         if len(vector) != 4:
             raise RuntimeError(f"a pose with progress has 4 numbers, not {len(vector)}")
         return ProgressStateSE2(*vector)
@@ -224,7 +218,6 @@ class StateVector2D:
     y = _component(1, "Second component.")
 
     def magnitude(self) -> float:
-        """Length of the vector."""
         return float(np.hypot(self.x, self.y))
 
     def __eq__(self, other: object) -> bool:

@@ -19,7 +19,6 @@ class SemanticMapLayer(IntEnum):
 
     @classmethod
     def deserialize(cls, layer: str) -> "SemanticMapLayer":
-        """A layer by its name."""
         return cls[layer]
 
 
@@ -45,12 +44,10 @@ class TrafficLightStatusType(IntEnum):
     GREEN, YELLOW, RED, UNKNOWN = range(4)
 
     def serialize(self) -> str:
-        """Its name."""
         return self.name
 
     @classmethod
     def deserialize(cls, key: str) -> "TrafficLightStatusType":
-        """A status by its name."""
         return cls[key]
 
 
@@ -63,12 +60,10 @@ class TrafficLightStatusData:
     timestamp: int
 
     def serialize(self) -> dict[str, Any]:
-        """As plain values."""
         return {**vars(self), "status": self.status.serialize()}
 
     @classmethod
     def deserialize(cls, data: dict[str, Any]) -> "TrafficLightStatusData":
-        """From plain values."""
         return cls(**{**data, "status": TrafficLightStatusType.deserialize(data["status"])})
 
 
@@ -123,7 +118,6 @@ class LaneGraphEdgeMapObject(GraphEdgeMapObject):
         raise NotImplementedError
 
     def is_same_roadblock(self, other: "LaneGraphEdgeMapObject") -> bool:
-        """Whether another one is of the same roadblock."""
         return self.get_roadblock_id() == other.get_roadblock_id()
 
 
@@ -179,15 +173,12 @@ class OccupancyMap:
         return len(self._geom_map)
 
     def is_empty(self) -> bool:
-        """Whether there is none."""
         return not self._geom_map
 
     def contains(self, geometry_id: str) -> bool:
-        """Whether there is one of that id."""
         return geometry_id in self._geom_map
 
     def get(self, geometry_id: str) -> Geometry:
-        """The geometry of an id."""
         return self._geom_map[geometry_id]
 
     def insert(self, geometry_id: str, geometry: Geometry) -> None:
@@ -203,11 +194,9 @@ class OccupancyMap:
             del self._geom_map[name]
 
     def get_all_ids(self) -> list[str]:
-        """All ids."""
         return list(self._geom_map)
 
     def get_all_geometries(self) -> list[Geometry]:
-        """All geometries."""
         return list(self._geom_map.values())
 
     def get_nearest_entry_to(self, geometry_id: str) -> tuple[str, Geometry, float]:

@@ -32,7 +32,6 @@ class TrackedObjectType(Enum):
     EGO = 7, "ego"
 
     def __new__(cls, number: int, fullname: str) -> "TrackedObjectType":
-        """A member with its number for a value."""
         member = object.__new__(cls)
         member._value_ = number
         member.fullname = fullname
@@ -102,7 +101,6 @@ class AgentState(SceneObject):
 
     @classmethod
     def from_new_pose(cls, agent: "AgentState", pose: StateSE2) -> "AgentState":
-        """The same agent elsewhere."""
         kind, box = agent.tracked_object_type, OrientedBox.from_new_pose(agent.box, pose)
         return AgentState(
             kind, box, agent.velocity, replace(agent.metadata), agent.angular_velocity
@@ -184,7 +182,6 @@ class TrackedObjects:
         )
 
     def get_tracked_objects_of_type(self, wanted: TrackedObjectType) -> list[TrackedObject]:
-        """The objects of one type."""
         return [item for item in self.tracked_objects if item.tracked_object_type == wanted]
 
     def get_tracked_objects_of_types(
@@ -232,7 +229,6 @@ class Observation(ABC):  # noqa: B024  # a mere common base, as in nuPlan
 
     @classmethod
     def detection_type(cls) -> str:
-        """Name of the kind of observation."""
         return cls.__name__
 
 

@@ -53,7 +53,6 @@ class AbstractTrajectory(ABC):
         """The states it is made of."""
 
     def is_in_range(self, time_point: TimePoint | int) -> bool:
-        """Whether a moment is in its span."""
         now = TimePoint(time_point) if isinstance(time_point, int) else time_point
         return bool(self.start_time <= now <= self.end_time)
 
@@ -88,11 +87,9 @@ class InterpolatedTrajectory(AbstractTrajectory):
     end_time = derived(lambda self: self._trajectory[-1].time_point, "Moment of the last state.")
 
     def get_state_at_time(self, time_point: TimePoint) -> Any:
-        """The state at a moment of its span."""
         return self.get_state_at_times([time_point])[0]
 
     def get_state_at_times(self, time_points: list[TimePoint]) -> list[Any]:
-        """The states at moments of its span."""
         first, last = min(time_points), max(time_points)
         assert self.start_time <= first <= last <= self.end_time, (
             f"times {first.time_us} … {last.time_us} us are not in the trajectory, "
@@ -107,7 +104,6 @@ class InterpolatedTrajectory(AbstractTrajectory):
         ]
 
     def get_sampled_trajectory(self) -> list[Any]:
-        """The states it is made of."""
         return self._trajectory
 
 
@@ -177,7 +173,6 @@ class PredictedTrajectory:
 
     @cached_property
     def trajectory(self) -> AbstractTrajectory:
-        """The known waypoints as a trajectory."""
         return InterpolatedTrajectory(self.valid_waypoints)
 
     def __len__(self) -> int:
@@ -248,11 +243,9 @@ class SimulationHistoryBuffer:
     )
 
     def append(self, ego_state: EgoState, observation: Observation) -> None:
-        """Add a sample; the oldest one may go."""
         self.extend([ego_state], [observation])
 
     def extend(self, ego_states: Sequence[EgoState], observations: Sequence[Observation]) -> None:
-        """Add samples; the oldest ones may go."""
         if len(ego_states) != len(observations):
             raise ValueError(f"{len(ego_states)} ego states, {len(observations)} observations")
         self.ego_state_buffer.extend(ego_states)
@@ -375,5 +368,4 @@ class EgoTrajectoryTargetBuilder(AbstractTargetBuilder):
 
     @classmethod
     def get_feature_unique_name(cls) -> str:
-        """Name of the target."""
         return "trajectory"

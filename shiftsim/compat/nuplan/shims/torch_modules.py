@@ -27,11 +27,9 @@ class TorchModuleWrapper(torch.nn.Module):
         self.feature_builders, self.target_builders = feature_builders, target_builders
 
     def get_list_of_required_feature(self) -> list[AbstractFeatureBuilder]:
-        """What makes its inputs."""
         return self.feature_builders
 
     def get_list_of_computed_target(self) -> list[AbstractTargetBuilder]:
-        """What makes its targets."""
         return self.target_builders
 
     @abstractmethod

@@ -138,7 +138,6 @@ class AngularInterpolator:
         self._angles = interp1d(states, angles, axis=0)
 
     def interpolate(self, sampled_state: Any) -> FloatArray:
-        """Angles at one place or many."""
         return np.asarray(principal_value(self._angles(sampled_state)))
 
 
@@ -157,19 +156,15 @@ class InterpolatedPath(AbstractPath):
         self._headings = AngularInterpolator(self._progress, [pose.heading for pose in path])
 
     def get_start_progress(self) -> float:
-        """Where it starts [m]."""
         return self._path[0].progress
 
     def get_end_progress(self) -> float:
-        """Where it ends [m]."""
         return self._path[-1].progress
 
     def get_state_at_progress(self, progress: float) -> ProgressStateSE2:
-        """The pose at a distance within the path."""
         return self.get_state_at_progresses([progress])[0]
 
     def get_state_at_progresses(self, progresses: list[float]) -> list[ProgressStateSE2]:
-        """The poses at distances within the path."""
         first, last = self.get_start_progress(), self.get_end_progress()
         inside = first <= min(progresses) and max(progresses) <= last
         assert inside, f"{progresses} m are not on the path, {first} … {last} m"
@@ -181,7 +176,6 @@ class InterpolatedPath(AbstractPath):
         return [ProgressStateSE2(*row) for row in rows.tolist()]
 
     def get_sampled_path(self) -> list[ProgressStateSE2]:
-        """The poses it is made of."""
         return self._path
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from worlds import straight_road
 
-from shiftsim.data.readers.tracks.map_fit import _AXES, Guess, fit_map
+from shiftsim.data.readers.tracks.axes import _AXES, Guess, fit_map
 
 ROAD = straight_road()  # 420 m x 7 m from (0, -1.75) on, 15 m/s
 PLACES = np.column_stack([np.linspace(1.0, 419.0, 60), np.tile([-1.5, 5.0], 30)])
