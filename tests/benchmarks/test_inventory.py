@@ -26,15 +26,15 @@ def test_where_nothing_is_there_every_row_names_what_to_get(place):
     found = inventory.list_available_data()
     assert found["stores"] == []
     assert len(found["rows"]) == 25
-    [row] = rows(track="state-drift", planner="plantf")
+    [row] = rows(track="state-drift", planner="diffusion-planner")
     assert [lack["what"] for lack in row["missing"]] == [
         "Val14 (1118 scenarios)",
         "own scenarios",
-        "planner plantf",
+        "planner diffusion-planner",
     ]
     assert row["missing"][0]["get"].startswith("shiftsim convert nuplan ")
     assert row["missing"][1]["get"].startswith("shiftsim convert dsc3d ")
-    assert "jchengai/planTF" in row["missing"][2]["get"]
+    assert "ZhengYinan-AIR/Diffusion-Planner" in row["missing"][2]["get"]
 
 
 def test_a_store_of_ones_own_and_a_checkpoint_are_found(place):
