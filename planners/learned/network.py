@@ -107,10 +107,13 @@ class Scenes:
             self.present = torch.cat(before, dim=1)
         self.counts: list[int] = self.present.sum(dim=1).tolist()  # rows of each scene
         self.valid = self.pack(valid)  # (T,) rows that take part in attention
-        self.masks = [  # by scene (1, 1, 1, count) logits added to its keys; None where all do
-            None if bool(keys.all()) else key_mask(keys)[None].to(valid.device)
-            for keys in self.split(self.valid.cpu())
-        ]
+        self.padded = pads(valid)
+        self.masks: list[Tensor | None] = []  # by scene (1, 1, 1, count); None where all take part
+        if not self.padded:
+            self.masks = [
+                None if bool(keys.all()) else key_mask(keys)[None]
+                for keys in self.split(self.valid)
+            ]
 
     def pack(self, x: Tensor) -> Tensor:
         """(T, ...) the rows of x (B, N, ...) that do not fill up, scene by scene."""
@@ -128,7 +131,13 @@ class Scenes:
 
     def firsts(self, rows: Tensor) -> Tensor:
         """(B, ...) the first row of each scene."""
-        return torch.stack([scene[0] for scene in self.split(rows)])
+        counts = self.present.sum(dim=1)
+        return rows[counts.cumsum(dim=0) - counts]
+
+
+def pads(x: Tensor) -> bool:
+    """Whether scenes are filled up for attention: a GPU would wait for one after another."""
+    return x.is_cuda
 
 
 def key_mask(valid: Tensor) -> Tensor:
@@ -155,17 +164,28 @@ class Attention(nn.Module):
         return self.out_proj(self.attend(*self.project(query, key, value), mask))
 
     def segment_attention(
-        self, query: Tensor, context: Tensor, counts: Sequence[int], scenes: Scenes
+        self, query: Tensor, context: Tensor, asking: Scenes, scenes: Scenes
     ) -> Tensor:
-        """Attend in each scene from its rows of `query` (Q, D) to its rows of `context` (T, D).
+        """Attend in each scene from its rows of `query` (Q, ..., D) to those of `context` (T, D).
 
-        `counts` says how many rows of `query` each scene has, `scenes` how those of `context` lie.
+        `asking` says how the rows of `query` lie, `scenes` how those of `context` do.
         """
         q, k, v = self.project(query, context, context)
-        parts = (torch.split(q, list(counts)), scenes.split(k), scenes.split(v), scenes.masks)
-        by_scene = zip(*parts, strict=True)
-        mixed = [self.attend(q[None], k[None], v[None], mask)[0] for q, k, v, mask in by_scene]
-        return self.out_proj(torch.cat(mixed))
+        if scenes.padded:
+            dense, mask = asking.unpack(q), key_mask(scenes.unpack(scenes.valid, False))
+            keys, values = scenes.unpack(k), scenes.unpack(v)
+            mixed = asking.pack(
+                self.attend(dense.flatten(1, -2), keys, values, mask).view_as(dense)
+            )
+        else:
+            parts = (asking.split(q), scenes.split(k), scenes.split(v), scenes.masks)
+            mixed = torch.cat(
+                [
+                    self.attend(q.flatten(0, -2)[None], k[None], v[None], mask)[0].view_as(q)
+                    for q, k, v, mask in zip(*parts, strict=True)
+                ]
+            )
+        return self.out_proj(mixed)
 
     def project(self, query: Tensor, key: Tensor, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Projections of the three, each (..., D)."""
@@ -241,7 +261,7 @@ class EncoderBlock(nn.Module):
     def forward(self, x: Tensor, scenes: Scenes) -> Tensor:
         """Tokens (T, D) of scenes to the same."""
         normed = self.norm1(x)
-        x = x + self.attn.segment_attention(normed, normed, scenes.counts, scenes)
+        x = x + self.attn.segment_attention(normed, normed, scenes, scenes)
         return x + self.mlp(self.norm2(x))
 
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -67,13 +68,25 @@ class GradientPool:
     """
 
     def __init__(self, device: str, threads: int) -> None:
-        self._device = device
+        self._device, self._threads = device, threads
         torch.set_num_threads(1)  # sums must not depend on the number of cores
         self._pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
 
     def sum(self, compute: Callable[..., BatchGradient], *lanes: Iterable[Any]) -> BatchGradient:
         """Sum of what `compute` gives for the parts of a batch, whose arguments are `lanes`."""
         return _sum(self._pool.map(compute, *lanes))
+
+    def load(self, rows: IntArray, read: Callable[[IntArray], NDArray[np.uint8]]) -> Tensor:
+        """The rasters that `read` gives for some rows; those of a GPU are read on all threads."""
+        if self._device == "cpu":
+            return torch.from_numpy(read(rows))
+
+        def load_part(part: IntArray) -> Tensor:
+            return torch.from_numpy(read(part)).to(self._device)
+
+        return torch.cat(
+            [*self._pool.map(load_part, np.array_split(rows, min(self._threads, len(rows))))]
+        )
 
     def compute(
         self,
@@ -279,10 +292,12 @@ class Learner(TrainedNetwork):
         count = len(batch.indices)
 
         def loss_of_rows(rows: IntArray) -> tuple[Tensor, Tensor]:
-            rasters = states.rasters(batch.indices[rows], batch.mirrored[rows].tolist())
-            arrays = (rasters, batch.measurements[rows] / UNITS, batch.actions[rows])
-            pictures, measured, label = (torch.from_numpy(a).to(self._device) for a in arrays)
-            return loss_of(self.network(pictures, measured), label)
+            arrays = batch.measurements[rows] / UNITS, batch.actions[rows]
+            measured, label = (torch.from_numpy(a).to(self._device) for a in arrays)
+            return loss_of(self.network(self._pool.load(rows, read), measured), label)
+
+        def read(rows: IntArray) -> NDArray[np.uint8]:
+            return states.rasters(batch.indices[rows], batch.mirrored[rows].tolist())
 
         found = self._pool.compute(self._trained, count, loss_of_rows)
         rate = self._rate * schedule(self.step / self.total)

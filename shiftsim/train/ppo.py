@@ -212,11 +212,14 @@ class Trainer:
         chosen["advantages"] = (gain - gain.mean()) / (gain.std() + 1e-8)
 
         def loss_of_rows(rows: IntArray) -> tuple[Tensor, Tensor]:
-            rasters = np.stack([read_raster(pictures[index]) for index in order[rows]])
+            rasters = self._pool.load(rows, read)
             part = {name: value[rows].to(self._device) for name, value in chosen.items()}
             inputs = (rasters, part["measurements"], part["critic"])
             policy, values = self._evaluate(*inputs, critic_only=critic_only)
             return ppo_loss(policy, values, part, critic_only=critic_only)
+
+        def read(rows: IntArray) -> NDArray[np.uint8]:
+            return np.stack([read_raster(pictures[index]) for index in order[rows]])
 
         parameters: list[Tensor] = list(self.network.parameters())
         count = len(order)

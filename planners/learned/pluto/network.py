@@ -1,7 +1,7 @@
 """The network of PLUTO, with the names and shapes of its checkpoint."""
 
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -140,25 +140,36 @@ class DecoderBlock(nn.Module):
         x: Tensor,  # (L, modes, 128) queries of the reference lines
         place: Tensor,  # (1, modes, 128) embedding of the modes
         lines: Scenes,  # how the lines lie
-        masks: Sequence[Tensor],  # by scene, added to the logits of its lines as keys
+        masks: Tensor,  # (B, 1 or modes, 1, 1, R) added to the logits of lines as keys
         tokens: Tensor,  # (T, 128) of the scenes
         scenes: Scenes,  # how these lie
     ) -> Tensor:
         """(L, modes, 128); zero before the attention to the scene for lines without points."""
         normed = self.norm1(x)
         parts = self.r2r_attn.project(normed, normed, normed)
-        mixed = []
-        for q, k, v, mask in zip(*map(lines.split, parts), masks, strict=True):
-            # every mode of a line attends to the same mode of the scene's others
-            q, k, v = q.transpose(0, 1), k.transpose(0, 1), v.transpose(0, 1)
-            mixed.append(self.r2r_attn.attend(q, k, v, mask).transpose(0, 1))
-        x = x + self.r2r_attn.out_proj(torch.cat(mixed))
+        # every mode of a line attends to the same mode of the scene's others
+        if lines.padded:
+            mixed = lines.pack(self._among_lines(map(lines.unpack, parts), masks))
+        else:
+            by_scene = zip(zip(*map(lines.split, parts), strict=True), masks, strict=True)
+            each = [
+                self._among_lines((part[None] for part in scene), mask[None, ..., : len(scene[0])])
+                for scene, mask in by_scene
+            ]
+            mixed = torch.cat(each, dim=1)[0]
+        x = x + self.r2r_attn.out_proj(mixed)
         normed = self.norm2(x)
         x = x + self.m2m_attn(normed + place, normed + place, normed)
         x = x * lines.valid[:, None, None]
-        rows, counts = x.flatten(0, 1), [count * MODES for count in lines.counts]
-        rows = rows + self.cross_attn.segment_attention(self.norm3(rows), tokens, counts, scenes)
-        return (rows + self.ffn(self.norm4(rows))).view(x.shape)
+        x = x + self.cross_attn.segment_attention(self.norm3(x), tokens, lines, scenes)
+        return x + self.ffn(self.norm4(x))
+
+    def _among_lines(self, parts: Iterable[Tensor], mask: Tensor) -> Tensor:
+        """(B, R, modes, D) attention from line to line; `mask` (B, 1 or modes, 1, 1, R)."""
+        mask = mask.expand(-1, MODES, -1, -1, -1).flatten(0, 1)
+        q, k, v = (x.transpose(1, 2).flatten(0, 1) for x in parts)
+        mixed = self.r2r_attn.attend(q, k, v, mask)
+        return mixed.view(-1, MODES, *mixed.shape[1:]).transpose(1, 2)
 
 
 class PlanningDecoder(nn.Module):
@@ -189,7 +200,7 @@ class PlanningDecoder(nn.Module):
         embedded = lines.pack(self._embed_lines(inputs))
         shape = len(embedded), MODES, DIM
         x = torch.cat([embedded[:, None].expand(shape), self.m_emb[0].expand(shape)], dim=-1)
-        x, masks = self.q_proj(x), self._line_masks(valid, lines.counts)
+        x, masks = self.q_proj(x), self._line_masks(valid)
         for block in self.decoder_blocks:
             x = block(x, self.m_pos, lines, masks, tokens, scenes)
         counts = torch.tensor(lines.counts, device=egos.device)
@@ -199,13 +210,13 @@ class PlanningDecoder(nn.Module):
         logits = self.pi_head(x)[..., 0].masked_fill(~lines.valid[:, None], NEVER)
         return lines.unpack(plans), lines.unpack(logits, NEVER)
 
-    def _line_masks(self, valid: Tensor, counts: Sequence[int]) -> list[Tensor]:
-        """By scene (1 or modes, 1, 1, count) logits added to its lines as keys, from (B, R)."""
+    def _line_masks(self, valid: Tensor) -> Tensor:
+        """(B, 1 or modes, 1, 1, R) logits added to the lines as keys, from (B, R)."""
         # a scene without any line that has points attends to all of them, and nothing reads it
         logits = key_mask(valid | ~valid.any(dim=1, keepdim=True))[:, None]
         if self.misordered_masks:  # nuPlan rule 307: by mode, where queries are ordered by scene
             logits = logits.repeat(MODES, 1, 1, 1, 1).view(len(valid), MODES, *logits.shape[2:])
-        return [row[..., :count] for row, count in zip(logits, counts, strict=True)]
+        return logits
 
     def _embed_lines(self, inputs: Inputs) -> Tensor:
         """(B, R, 128)."""

@@ -16,6 +16,7 @@ from shiftsim.world.state import HEADING, VX, AgentKind, LightStatus, TrafficLig
 
 torch = pytest.importorskip("torch")
 
+from shiftsim.planners.learned import network as layers  # noqa: E402  # needs torch
 from shiftsim.planners.learned.pluto.network import build_network  # noqa: E402  # needs torch
 from shiftsim.planners.learned.pluto.planner import NO_LINE, Pluto, make_batch  # noqa: E402
 
@@ -126,6 +127,24 @@ def test_official_masks_of_a_batch_matter_only_where_numbers_of_lines_differ(rou
     )
     assert torch.equal(*alike)
     assert not torch.equal(*unlike)
+
+
+def test_filled_up_as_on_a_gpu_the_outputs_and_gradients_are_the_same(monkeypatch, rough):
+    two = rough.features(first_sight(scene(0), rough))
+    of_lines = [name for name in two._fields if name.startswith("line_")]
+    one = two._replace(**{name: getattr(two, name)[:1] for name in of_lines})
+    few = rough.features(first_sight(scene(3, 2), rough))
+    ours = build_network()
+    ours.load_state_dict(rough.network.state_dict())
+    found = []
+    for padded in (False, True):
+        monkeypatch.setattr(layers, "pads", lambda x, padded=padded: padded)
+        out = ours.eval()(make_batch([two, one, few], "cpu"))
+        loss = out.trajectory.square().mean() + out.prediction.square().mean()
+        gradients = torch.autograd.grad(loss, list(ours.parameters()), allow_unused=True)
+        found.append([out.trajectory, out.probability, *(g for g in gradients if g is not None)])
+    for packed, filled in zip(*found, strict=True):
+        torch.testing.assert_close(packed, filled, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("count", [0, 1, 500])

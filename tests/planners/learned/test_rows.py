@@ -4,6 +4,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from shiftsim.planners.learned import network  # noqa: E402
 from shiftsim.planners.learned.network import Attention, Linear, Scenes, linear  # noqa: E402
 
 pytestmark = pytest.mark.learned
@@ -58,15 +59,17 @@ def test_rows_that_fill_up_are_left_out_and_come_back():
     assert torch.equal(scenes.unpack(rows, 7.0)[1, 2:], torch.full((2, 5), 7.0))
 
 
-def test_attention_stays_within_its_scene():
+@pytest.mark.parametrize("padded", [False, True])
+def test_attention_stays_within_its_scene(monkeypatch, padded):
+    monkeypatch.setattr(network, "pads", lambda x: padded)
     layer = Attention(8, 2)
     for parameter in layer.parameters():
         torch.nn.init.normal_(parameter)
     asking, counts = [2, 0, 1, 3], [4, 2, 1, 5]
     query, context = torch.randn(sum(asking), 8), torch.randn(sum(counts), 8)
     keep = torch.tensor([1, 0, 1, 1, 1, 0, 1, 0, 1, 1, 0, 1], dtype=torch.bool)
-    scenes = scenes_of(counts, keep)
-    out = layer.segment_attention(query, context, asking, scenes)
+    queries = scenes_of(asking, torch.ones(sum(asking), dtype=torch.bool))
+    out = layer.segment_attention(query, context, queries, scenes_of(counts, keep))
     parts = zip(query.split(asking), context.split(counts), keep.split(counts), strict=True)
     expected = torch.cat([official(layer, *part) for part in parts])
     torch.testing.assert_close(out, expected, rtol=0.0, atol=ROUNDING)
