@@ -44,7 +44,7 @@ NOISES = {  # how often states are collected under each
 }
 TESTED = ("none", "ou-high")
 LEFT_OUT = 0.1  # share of the towns that are tested on
-TOGETHER = 10  # scenarios of a job
+TOGETHER, TOGETHER_ON_GPU = 10, 32  # scenarios of a job
 _MIN_GROUPS = 5  # fewer towns are not left out, but recordings, or else scenarios
 _EXPECTED = 60  # states of a scenario, before any was driven
 # share of scenarios that PDM-Closed begins, and up to which step

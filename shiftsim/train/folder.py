@@ -109,6 +109,7 @@ class ImitationSettings:
     workers: int = setting(2, "Processes that make samples, and that drive.")
     rounds: int = setting(0, "Of training and testing. [of the preset]")
     samples: int = setting(0, "To train on, each time counted. [of the preset]")
+    batch: int = setting(0, "Samples of a step. [of the preset]")
     tests: int = setting(40, "Scenarios that each round is tested on.")
 
     def __post_init__(self) -> None:
@@ -116,7 +117,7 @@ class ImitationSettings:
         _require_positive(self, "tests", "workers")
         if self.preset not in PRESETS:
             raise ConfigError(f"preset {self.preset!r} unknown", hint=" or ".join(PRESETS))
-        for name in ("rounds", "samples", "seed"):
+        for name in ("rounds", "samples", "batch", "seed"):
             if getattr(self, name) < 0:
                 raise ConfigError(f"{name} is negative", hint="give 0 or more")
 
@@ -126,7 +127,8 @@ class ImitationSettings:
         preset = PRESETS[self.preset]
         cost = 1.0 if preset.published else COSTS[self.planner]
         samples = self.samples or round(preset.samples / cost)
-        return preset._replace(rounds=self.rounds or preset.rounds, samples=samples)
+        rounds, batch = self.rounds or preset.rounds, self.batch or preset.batch
+        return preset._replace(rounds=rounds, samples=samples, batch=batch)
 
     @property
     def determining(self) -> dict[str, object]:

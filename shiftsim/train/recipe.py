@@ -35,6 +35,7 @@ from shiftsim.train.checks import check
 from shiftsim.train.driving import (
     TESTED,
     TOGETHER,
+    TOGETHER_ON_GPU,
     RunJobs,
     Towns,
     collect,
@@ -362,7 +363,8 @@ class ImitationTraining(Recipe):
             "out": str(out),
             "noise": list(TESTED),
             "workers": settings.workers,
-            "batch_size": TOGETHER,
+            "device": settings.device,
+            "batch_size": TOGETHER if self.device == "cpu" else TOGETHER_ON_GPU,
             **more,
         }
         return execute(prepare(make_config(values)))
