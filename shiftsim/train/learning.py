@@ -147,7 +147,7 @@ def apply_gradient(
 ) -> None:
     """One step of an optimiser down the mean gradient of so many states, clipped to a norm."""
     for parameter, gradient in zip(parameters, found.gradients, strict=True):
-        parameter.grad = gradient / count
+        parameter.grad = (gradient / count).contiguous()  # as a GPU needs it
     torch.nn.utils.clip_grad_norm_(parameters, clip)
     for group in optimiser.param_groups:
         group["lr"] = rate
