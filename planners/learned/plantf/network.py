@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from shiftsim.planners.learned import encoders
 from shiftsim.planners.learned import network as layers
 from shiftsim.planners.learned.deterministic import DriveHead
 from shiftsim.planners.learned.network import DIM, Linear, head, perceptron
@@ -57,8 +58,8 @@ class PlanTfNetwork(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.pos_emb = perceptron(4, DIM, DIM)
-        self.agent_encoder = layers.AgentEncoder()
-        self.map_encoder = layers.MapEncoder(POLYGON_CHANNELS, perceptron(1, DIM, DIM))
+        self.agent_encoder = encoders.AgentEncoder()
+        self.map_encoder = encoders.MapEncoder(POLYGON_CHANNELS, perceptron(1, DIM, DIM))
         self.encoder_blocks = nn.ModuleList(layers.EncoderBlock(HEADS) for _ in range(DEPTH))
         self.norm = nn.LayerNorm(DIM)
         self.trajectory_decoder = TrajectoryDecoder()

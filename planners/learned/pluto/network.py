@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from shiftsim.planners.learned import encoders
 from shiftsim.planners.learned import network as layers
 from shiftsim.planners.learned.deterministic import DriveHead
 from shiftsim.planners.learned.network import DIM, Attention, Linear, Scenes, head, key_mask
@@ -178,7 +179,7 @@ class PlanningDecoder(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.misordered_masks = False  # for comparisons with the official network
-        self.r_encoder = layers.PointsEncoder(LINE_CHANNELS)
+        self.r_encoder = encoders.PointsEncoder(LINE_CHANNELS)
         self.r_pos_emb = FourierEmbedding(3)
         self.q_proj = Linear(2 * DIM, DIM)
         self.m_emb = nn.Parameter(0.01 * torch.randn(1, 1, MODES, DIM))
@@ -234,8 +235,8 @@ class PlutoNetwork(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.pos_emb = FourierEmbedding(3)
-        self.agent_encoder = layers.AgentEncoder()
-        self.map_encoder = layers.MapEncoder(POLYGON_CHANNELS, FourierEmbedding(1))
+        self.agent_encoder = encoders.AgentEncoder()
+        self.map_encoder = encoders.MapEncoder(POLYGON_CHANNELS, FourierEmbedding(1))
         self.static_objects_encoder = StaticObjectsEncoder()
         self.encoder_blocks = nn.ModuleList(layers.EncoderBlock(HEADS) for _ in range(DEPTH))
         self.norm = nn.LayerNorm(DIM)
