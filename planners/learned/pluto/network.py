@@ -170,7 +170,7 @@ class DecoderBlock(nn.Module):
         mask = mask.expand(-1, MODES, -1, -1, -1).flatten(0, 1)
         q, k, v = (x.transpose(1, 2).flatten(0, 1) for x in parts)
         mixed = self.r2r_attn.attend(q, k, v, mask)
-        return mixed.view(-1, MODES, *mixed.shape[1:]).transpose(1, 2)
+        return mixed.view(len(mixed) // MODES, MODES, *mixed.shape[1:]).transpose(1, 2)
 
 
 class PlanningDecoder(nn.Module):
