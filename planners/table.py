@@ -115,6 +115,7 @@ _ENTRIES = (
         "imitation with contrastive learning, and a choice among its plans by rules",
         _NETWORK,
         Published("pluto_1M_aux_cil.ckpt", "jchengai/pluto", "pluto_1M_aux_cil.ckpt", megabytes=17),
+        "planners/learned/pluto/shiftsim.safetensors",
     ),
     PlannerEntry(
         "scripted",
