@@ -8,7 +8,7 @@ planner to planner is in `KINDS`.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -229,7 +229,6 @@ class Future(NamedTuple):
 
     present: FloatArray  # (A, 3) poses now
     poses: FloatArray  # (A, 80, 3)
-    velocities: FloatArray  # (A, 80, 2) in the frame of the map [m/s]
     valid: BoolArray  # (A, 80) whether there was a row
 
 
@@ -244,28 +243,36 @@ class Moment(NamedTuple):
     # there already, or at once
     beside: int | None
 
+    @property
+    def rows(self) -> slice:
+        """Those of the 8 s after it."""
+        step = self.scenario.row_step
+        return slice(self.row + step, self.row + step * STEPS + 1, step)
+
     def future(self, near: IntArray) -> Future:
         """Of the ego from where it is now, and of some tracks."""
-        scenario, tracks, step = self.scenario, self.scenario.tracks, self.scenario.row_step
-        rows = slice(self.row + step, self.row + step * STEPS + 1, step)
-        ego = scenario.ego[rows]
-        poses, velocities, valid = (  # (80, A - 1, ...); indexing with two arrays is slow
-            values[rows].take(near, axis=1)
-            for values in (tracks.poses, tracks.velocities, tracks.valid)
-        )
-        cos, sin, vx, vy = np.cos(ego[:, 2]), np.sin(ego[:, 2]), ego[:, VX], ego[:, VY]
-        own, drive = np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy]), ego[:, :3]
-        now = self.observation.history.ego[-1:, :3]
+        scenario, tracks, rows = self.scenario, self.scenario.tracks, self.rows
+        poses = np.empty((1 + len(near), STEPS, 3))
+        valid = np.ones(poses.shape[:2], np.bool_)
+        # take: indexing with two arrays is slow
+        poses[1:] = tracks.poses[rows].take(near, axis=1).swapaxes(0, 1)
+        valid[1:] = tracks.valid[rows].take(near, axis=1).T
+        now, poses[0] = self.observation.history.ego[-1:, :3], scenario.ego[rows, :3]
         if self.beside is not None:
-            path = scenario.ego[self.beside : rows.stop : step, :3]
-            drive = from_frame(way_back(self.state[3], to_frame(path, now[0])), now[0])
-            own = np.diff(np.vstack([now, drive])[:, :2], axis=0) / STEP
-        return Future(
-            np.vstack([now, tracks.poses[self.row, near]]),
-            np.concatenate([drive[None], poses.swapaxes(0, 1)]),
-            np.concatenate([own[None], velocities.swapaxes(0, 1)]),
-            np.vstack([np.ones((1, STEPS), np.bool_), valid.T]),
-        )
+            path = scenario.ego[self.beside : rows.stop : rows.step, :3]
+            poses[0] = from_frame(way_back(self.state[3], to_frame(path, now[0])), now[0])
+        return Future(np.vstack([now, tracks.poses[self.row, near]]), poses, valid)
+
+    def velocities(self, near: IntArray, future: Future) -> FloatArray:
+        """(A, 80, 2) in the frame of the map [m/s], of the same."""
+        ego, velocities = self.scenario.ego[self.rows], self.scenario.tracks.velocities
+        cos, sin, vx, vy = np.cos(ego[:, 2]), np.sin(ego[:, 2]), ego[:, VX], ego[:, VY]
+        own = np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy])
+        if self.beside is not None:
+            drive = np.vstack([future.present[:1], future.poses[0]])
+            own = np.diff(drive[:, :2], axis=0) / STEP
+        others = velocities[self.rows].take(near, axis=1).swapaxes(0, 1)
+        return np.concatenate([own[None], others])
 
 
 def _plantf_sample(planner: plantf.PlanTF, read: plantf.Features, now: Moment) -> Sample | str:
@@ -281,9 +288,11 @@ def _pluto_sample(planner: pluto.Pluto, read: pluto.SceneInputs, now: Moment) ->
         return _NO_LINE
     read.current_state[3:] = now.state[3:]
     seen = planner.surroundings
-    future = now.future(seen.agents.tracks)
+    near = seen.agents.tracks
+    future = now.future(near)
     future.valid[0, steps_before_red(planner, now, future.poses[0]) :] = False
-    target = motion_targets(*future[:3], future.present[0])
+    motion = now.velocities(near, future)
+    target = motion_targets(future.present, future.poses, motion, future.present[0])
     return Sample(read, target, future.valid, projections(seen.lines, future.poses[0]))
 
 
@@ -370,7 +379,7 @@ def make_sample(
         if moved is not None:
             ego, state = observation.history.ego.copy(), moved
             ego[-1, :3] = features.map_poses(state[:3], ego[-1])
-            observation = observe_log(scenario, iteration, ego=ego)
+            observation = replace(observation, history=replace(observation.history, ego=ego))
     goes_back = moved is not None and not (as_published and kind.noise[3])
     now = Moment(scenario, row, observation, state, row if goes_back else None)
     return kind.label(planner, planner.features(observation), now)
