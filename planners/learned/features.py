@@ -57,7 +57,7 @@ def agent_features(history: History, center: FloatArray, max_agents: int) -> Age
     )
     others = (tracks.poses, tracks.velocities, tracks.sizes, tracks.valid)
     poses, velocities, sizes, seen = (
-        np.concatenate([one[:, None], rows[-SAMPLES:, nearest]], axis=1)
+        np.concatenate([one[:, None], rows[-SAMPLES:].take(nearest, axis=1)], axis=1)
         for one, rows in zip(own, others, strict=True)
     )
 

@@ -17,7 +17,8 @@ import shapely
 import torch
 from torch import Tensor
 
-from shiftsim.geometry.boxes import boxes_to_corners, boxes_touch, from_frame, to_frame, turned
+from shiftsim.geometry.boxes import boxes_to_corners, from_frame, to_frame, turned
+from shiftsim.geometry.polylines import arc_lengths, project_on_polyline
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.learned import features
 from shiftsim.planners.learned.base import LearnedPlanner
@@ -26,6 +27,7 @@ from shiftsim.planners.learned.diffusion.features import Features as DiffusionFe
 from shiftsim.planners.learned.plantf import planner as plantf
 from shiftsim.planners.learned.pluto import planner as pluto
 from shiftsim.planners.learned.pluto.world import red_lights
+from shiftsim.planners.proposals.contacts import touches_boxes
 from shiftsim.sim.planner import History, Observation, observe_log, past_rows
 from shiftsim.world.layers import contains
 from shiftsim.world.scenario import Scenario
@@ -119,7 +121,7 @@ def perturbed_state(state: FloatArray, noise: FloatArray) -> FloatArray:
 def is_free(pose: FloatArray, others: FloatArray, sizes: FloatArray) -> bool:
     """Whether the ego with its rear axle at a pose (3,) touches none of boxes (N, 3), (N, 2)."""
     own = boxes_to_corners(center_poses(pose)[None], np.array([[PACIFICA.length, PACIFICA.width]]))
-    return not any(boxes_touch(own[0], box) for box in boxes_to_corners(others, sizes))
+    return not touches_boxes(own[0], boxes_to_corners(others, sizes)).any()
 
 
 def targets(present: FloatArray, future: FloatArray, frame: FloatArray) -> np.ndarray:
@@ -161,10 +163,13 @@ def projections(lines: Sequence[FloatArray], ego: FloatArray) -> np.ndarray:
         lines: R reference lines (K, 3).
         ego: (80, 3) poses of the rear axle in the 8 s.
     """
-    points = shapely.points(ego[9::10, :2])
-    curves = np.array([shapely.linestrings(line[:, :2]) for line in lines])[:, None]
-    both = [shapely.line_locate_point(curves, points), shapely.distance(curves, points)]
-    return np.stack(both, axis=-1).astype(np.float32)
+    points, out = ego[9::10, :2], np.empty((len(lines), 8, 2), np.float32)
+    for line, both in zip(lines, out, strict=True):
+        xy = np.ascontiguousarray(line[:, :2])
+        arc = arc_lengths(xy, np.array([0, len(xy)]))
+        both[:, 0] = [project_on_polyline(xy, arc, 0, len(xy), x, y) for x, y in points.tolist()]
+        both[:, 1] = shapely.distance(shapely.linestrings(xy), shapely.points(points))
+    return out
 
 
 def way_back(speed: float, path: FloatArray) -> FloatArray:
