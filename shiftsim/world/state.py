@@ -143,7 +143,8 @@ class Tracks:
     def readonly(self) -> "Tracks":
         """The same tracks in arrays that cannot be written."""
         arrays = (self.valid, self.poses, self.velocities, self.sizes, self.kinds)
-        return Tracks(*map(readonly, arrays), self.tokens)
+        valid, poses, velocities, sizes, kinds = map(readonly, arrays)
+        return Tracks(valid, poses, velocities, sizes, kinds, self.tokens)
 
     @staticmethod
     def empty(num_rows: int) -> "Tracks":
