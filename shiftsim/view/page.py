@@ -103,10 +103,12 @@ def replay_page(
     drawn = shown[:MAX_ROLLOUTS]
     words = f"{len(drawn)} of {len(shown)} rollouts shown" if len(drawn) < len(shown) else ""
     replay = Replay(scenario, drawn, seeds)
+    first, *others = (rollout_fields(replay, index) for index in range(len(drawn)))
     data = {
         "meta": describe_scene(replay) | {"back": back, "shown": words} | dict(more or {}),
         "scene": pack(scene_fields(replay)),
-        **{f"rollout{n}": pack(rollout_fields(replay, n)) for n in range(len(drawn))},
+        "rollout0": pack(first),
+        **{f"rollout{n}": pack(fields, first) for n, fields in enumerate(others, 1)},
     }
     return framed("replay", title=f"{scenario.token} · shiftsim", images="data:", data=data)
 

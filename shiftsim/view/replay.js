@@ -170,8 +170,13 @@ function tracksOf(index) {
     : { fields: scene, names: meta.tracks };
 }
 
+async function load(index) {
+  if (index) await load(0); // which the others are stored from
+  rollouts[index] ??= await readSection(`rollout${index}`, rollouts[0]);
+}
+
 async function show(index, on) {
-  if (on && !rollouts[index]) rollouts[index] = await readSection(`rollout${index}`);
+  if (on) await load(index);
   state.shown[index] = on;
   if (!state.shown.some(Boolean)) state.shown[index] = true; // something must remain
   if (!state.shown[state.focus]) state.focus = state.shown.indexOf(true);
@@ -1033,7 +1038,7 @@ async function loadState() {
   state.follow = !(at.length === 2 && at.every(Number.isFinite));
   if (!state.follow) [state.centre, state.up] = [at, false];
   for (const [index, shown] of state.shown.entries()) {
-    if (shown && !rollouts[index]) rollouts[index] = await readSection(`rollout${index}`);
+    if (shown) await load(index);
   }
   state.t = Math.min(Math.max(number("t", 0), 0), duration());
 }
