@@ -22,10 +22,10 @@ from shiftsim.world.scenario import Scenario, require_scenario
 
 MAX_ROLLOUTS = 6  # of a replay
 _HERE = Path(__file__).parent
-_SCENE = ("marks.js", "world.js")
+_THEME, _SCENE = "../report/theme.css", ("marks.js", "world.js")
 _FILES = {  # style and script of each page; its body is the file of its name
-    "list": (["list.css"], ["marks.js", "list.js"]),
-    "live": (["list.css", "live.css"], ["marks.js", "live.js"]),
+    "list": ([_THEME, "list.css"], ["marks.js", "list.js"]),
+    "live": ([_THEME, "list.css", "live.css"], ["marks.js", "live.js"]),
     "replay": (["replay.css"], ["codec.js", *_SCENE, "strips.js", "waterfall.js", "replay.js"]),
     "review": (["replay.css", "review.css"], ["codec.js", *_SCENE, "review.js"]),
 }
@@ -145,7 +145,7 @@ def framed(
 
 @cache
 def _asset(name: str) -> str:
-    """A file of this folder."""
+    """A file by its place from this folder."""
     return (_HERE / name).read_text(encoding="utf-8")
 
 

@@ -734,44 +734,17 @@ function setOption(name, on) {
   saveState();
 }
 
-// ---- light and dark ----
-
-const prefersDark = window.matchMedia("(prefers-color-scheme: dark)");
-const isDark = () => document.documentElement.dataset.theme === "dark";
-
-function setTheme(dark) {
-  document.documentElement.dataset.theme = dark ? "dark" : "light";
-  readColours();
+function repaint() {
   const branches = meta.rollouts.flatMap(({ fork }) => fork?.branches || []);
   for (const item of [...meta.rollouts, ...tubes, ...branches].filter(({ colour }) => colour)) {
     item.given ??= item.colour;
-    item.colour = dark ? lightened(item.given) : item.given;
+    item.colour = isDark() ? lightened(item.given) : item.given;
   }
   if (!map) return;
   map.version++;
   listRollouts();
   listLegend();
   changed();
-}
-
-function toggleTheme() {
-  setTheme(!isDark());
-  try {
-    localStorage.setItem("shiftsim-theme", isDark() ? "dark" : "light");
-  } catch {
-    // a page inside a notebook keeps nothing
-  }
-}
-
-function startTheme() {
-  let wanted = null;
-  try {
-    wanted = localStorage.getItem("shiftsim-theme");
-  } catch {
-    // nothing is kept here
-  }
-  setTheme(wanted ? wanted === "dark" : prefersDark.matches);
-  prefersDark.addEventListener("change", () => setTheme(prefersDark.matches));
 }
 
 // a scale within its bounds, as the link has it

@@ -3,9 +3,7 @@
 
 const byId = (id) => document.getElementById(id);
 const secret = new URLSearchParams(location.search).get("token") || "";
-const ROUTE = "rgba(40, 140, 90, 0.38)";
 const CHANGED = "rgba(224, 138, 0, 0.45)";
-const EGO = "#0b62c4";
 const NUMBERS = { // results of the filter, in words
   max_outside_m: (value) => `${value.toFixed(2)} m off the road`,
   path_m: (value) => `${value.toFixed(1)} m path`,
@@ -293,11 +291,16 @@ function draw() {
   drawRoute(ratio);
   drawLights(context, scene, panel, at);
   drawAgents(context, scene, panel, at, highlighted);
-  drawPath(context, scene.get("expert.xy").data, at, panel, EGO, [], 2);
+  drawPath(context, scene.get("expert.xy").data, at, panel, COLOURS.link, [], 2);
   drawTicks();
-  drawEgo(context, poseAt(fields, "ego", 1, 0, at), open.found.meta.vehicle, panel, EGO, true);
+  drawEgo(context, poseAt(fields, "ego", 1, 0, at), open.found.meta.vehicle, panel, COLOURS.link, true);
   byId("clock").textContent = `${now.toFixed(1)} s of ${duration().toFixed(1)} s`;
   byId("time").value = now;
+}
+
+function repaint() {
+  if (map) map.version++;
+  draw();
 }
 
 function drawRoute(ratio) {
@@ -307,7 +310,7 @@ function drawRoute(ratio) {
   context.setTransform(zoom, 0, 0, -zoom, left * ratio, top * ratio);
   for (const { id, path } of blocks) {
     if (!open.found.current.includes(id)) continue;
-    context.fillStyle = open.found.recordedRoute.includes(id) ? ROUTE : CHANGED;
+    context.fillStyle = open.found.recordedRoute.includes(id) ? COLOURS.route : CHANGED;
     context.fill(path, "evenodd");
   }
   context.restore();
@@ -315,7 +318,7 @@ function drawRoute(ratio) {
 
 function drawTicks() {
   const xy = scene.get("expert.xy").data;
-  context.fillStyle = EGO;
+  context.fillStyle = COLOURS.link;
   context.font = "10px system-ui, sans-serif";
   times().forEach((t, i) => {
     if (Math.abs(t - Math.round(t)) > 0.02 || Math.round(t) % 5) return;
@@ -413,6 +416,7 @@ const KEYS = {
   c: () => byId("comment").focus(),
   o: () => keep({ route: null }),
   f: wholeScene,
+  d: toggleTheme,
   " ": play,
   ArrowLeft: () => step(-1),
   ArrowRight: () => step(1),
@@ -437,7 +441,7 @@ async function start() {
   const first = listing.scenarios.find((row) => row.token === wanted) ||
     listing.scenarios.find(isOpen) || listing.scenarios[0];
   byId("which").value = isOpen(first) ? "open" : "all";
-  for (const [id, key] of [["accept", "a"], ["reject", "r"], ["undo", "u"], ["recorded", "o"], ["play", " "]]) {
+  for (const [id, key] of [["accept", "a"], ["reject", "r"], ["undo", "u"], ["recorded", "o"], ["play", " "], ["theme", "d"]]) {
     byId(id).addEventListener("click", KEYS[key]);
   }
   byId("which").addEventListener("change", showList);
@@ -456,6 +460,7 @@ async function start() {
   }, { passive: false });
   window.addEventListener("keydown", onKey);
   window.addEventListener("resize", layOut);
+  startTheme();
   await open(first.token);
 }
 

@@ -173,6 +173,8 @@ def test_a_report_can_be_read(page, folder, name, mode):
     page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
     page.open((folder / name).as_uri(), ready=LOADED)
     assert page.run(FAINT) == []
+    ground = page.run("getComputedStyle(document.body).backgroundColor.match(/\\d+/)[0]")
+    assert (int(ground) < 60) == (mode == "dark")
     page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
 
 
