@@ -11,6 +11,7 @@ const WORST = 10;
 const chosen = { planner: "", noise: "" }; // by the matrix
 let sorting = { key: "cls", up: true };
 let room = PAGE;
+const FILTERS = ["city", "type", "violated", "low", "high", "find"];
 
 for (const row of rows) row.first = row.at ?? Infinity;
 
@@ -146,7 +147,7 @@ function card([row, alike]) {
 function choose(wanted) {
   const same = chosen.planner === wanted.planner && chosen.noise === wanted.noise;
   Object.assign(chosen, same ? { planner: "", noise: "" } : wanted);
-  refresh();
+  refilter();
 }
 
 function button(content, wanted, label) {
@@ -236,11 +237,23 @@ function refresh() {
   showWorst(show());
 }
 
+// of another filter, which the address keeps
+function refilter() {
+  refresh();
+  const filters = [...Object.entries(chosen), ...FILTERS.map((id) => [id, byId(id).value])];
+  const set = filters.filter(([id, value]) => value !== (byId(id)?.defaultValue ?? ""));
+  history.replaceState(null, "", `#${new URLSearchParams(set)}`);
+}
+
 for (const name of ["city", "type"]) options(name, sorted(rows.map((row) => row[name])).filter(Boolean));
 const violated = new Set(rows.flatMap((row) => Object.keys(row.violated)));
 const named = Object.fromEntries(Object.entries(metrics).map(([short, words]) => [short, `${words} (${short})`]));
 options("violated", Object.keys(metrics).filter((name) => violated.has(name)), named);
-for (const id of ["city", "type", "violated", "low", "high", "find"]) byId(id).addEventListener("input", refresh);
+for (const id of FILTERS) byId(id).addEventListener("input", refilter);
+for (const [id, value] of new URLSearchParams(location.hash.slice(1))) {
+  if (id in chosen) chosen[id] = value;
+  else if (FILTERS.includes(id)) byId(id).value = value;
+}
 for (const th of byId("list").tHead.querySelectorAll("[data-key]")) {
   th.tabIndex = 0;
   const sort = () => {
