@@ -1,7 +1,6 @@
 "use strict";
 // The list of rollouts: filtered by a matrix of scores, sorted, each row a link to what went wrong.
 
-const byId = (id) => document.getElementById(id);
 const read = (name) => JSON.parse(byId(`data-${name}`).textContent);
 const rows = read("rows");
 const metrics = read("metrics"); // words by abbreviation, in their order
@@ -66,12 +65,9 @@ function worstOf(found) {
 }
 
 function linked(row, content) {
-  const link = document.createElement(row.page ? "a" : "span");
+  if (!row.page) return make("span", { title: "no replay" }, content);
   const at = Number.isFinite(row.first) ? `t=${row.first.toFixed(2)}&` : "";
-  if (row.page) link.href = `${row.page}#${at}focus=${row.index + 1}`;
-  else link.title = "no replay";
-  link.append(content);
-  return link;
+  return make("a", { href: `${row.page}#${at}focus=${row.index + 1}` }, content);
 }
 
 function picture(row) {
@@ -112,7 +108,6 @@ function causesOf(row) {
 }
 
 function line(row) {
-  const tr = document.createElement("tr");
   const about = span("soft", [row.type, row.city].filter(Boolean).join(" · "));
   const cells = {
     scene: [sceneOf(row)],
@@ -122,18 +117,15 @@ function line(row) {
     cls: [scoreOf(row)],
     causes: causesOf(row),
   };
-  for (const [kind, content] of Object.entries(cells)) {
-    const td = tr.insertCell();
-    td.className = kind;
-    td.append(...content);
-  }
-  return tr;
+  const cellOf = ([className, content]) => make("td", { className }, ...content);
+  return make("tr", {}, ...Object.entries(cells).map(cellOf));
 }
 
 function card([row, alike]) {
-  const item = document.createElement("li");
   const more = alike ? span("soft", `${alike} alike`) : "";
-  item.append(
+  return make(
+    "li",
+    {},
     sceneOf(row),
     span("top", scoreOf(row), more),
     linked(row, row.token),
@@ -141,7 +133,6 @@ function card([row, alike]) {
     span("who", planner(row.planner, styles[row.planner], row.noise), noiseOf(row)),
     span("causes", ...causesOf(row)),
   );
-  return item;
 }
 
 function choose(wanted) {
@@ -151,10 +142,7 @@ function choose(wanted) {
 }
 
 function button(content, wanted, label) {
-  const made = document.createElement("button");
-  made.type = "button";
-  made.append(content);
-  made.title = made.ariaLabel = label;
+  const made = make("button", { type: "button", title: label, ariaLabel: label }, content);
   Object.assign(made.dataset, wanted);
   made.addEventListener("click", () => choose(wanted));
   return made;
@@ -181,12 +169,7 @@ function cellOf(name, noise, best) {
   return made;
 }
 
-function headingOf(scope, ...parts) {
-  const th = document.createElement("th");
-  th.scope = scope;
-  th.append(button(...parts));
-  return th;
-}
+const headingOf = (scope, ...parts) => make("th", { scope }, button(...parts));
 
 function makeMatrix() {
   const [head, body] = [byId("matrix").tHead.insertRow(), byId("matrix").tBodies[0]];

@@ -22,7 +22,7 @@ from shiftsim.world.scenario import Scenario, require_scenario
 
 MAX_ROLLOUTS = 6  # of a replay
 _HERE = Path(__file__).parent
-_THEME, _SCENE = "../report/theme.css", ("marks.js", "world.js")
+_THEME, _SCENE = "../report/theme.css", ("marks.js", "world.js", "player.js")
 _FILES = {  # style and script of each page; its body is the file of its name
     "list": ([_THEME, "list.css"], ["marks.js", "list.js"]),
     "live": ([_THEME, "list.css", "live.css"], ["marks.js", "live.js"]),

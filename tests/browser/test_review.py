@@ -202,6 +202,6 @@ def test_play_moves_the_recording(desk):
     before = desk.pixels()
 
     desk.press(" ")
-    desk.wait("now > 0.2")
+    desk.wait("state.t > 0.2")
 
     assert desk.pixels() != before
