@@ -55,6 +55,14 @@ function sizeCanvas() {
   return { width, height, ratio };
 }
 
+// lowest and highest x, and y, of places x, y, x, y, … and some metres around them
+function boundsOf(xy, around) {
+  return [0, 1].map((axis) => {
+    const values = xy.filter((value, i) => i % 2 === axis && Number.isFinite(value));
+    return [Math.min(...values) - around, Math.max(...values) + around];
+  });
+}
+
 // place of the pointer on the canvas
 function pointer(event) {
   const box = canvas.getBoundingClientRect();

@@ -671,14 +671,11 @@ function rounded(scale) {
   return Number(Math.min(Math.max(scale, MIN_SCALE), MAX_SCALE).toFixed(2));
 }
 
-const fit = () => showAround([...rollouts[state.focus].get("ego.xy").data], AROUND);
+const fit = () => showAround(rollouts[state.focus].get("ego.xy").data, AROUND);
 
 // the view of places x, y, x, y, … and some metres around them
 function showAround(xy, around) {
-  const ends = [0, 1].map((axis) => {
-    const values = xy.filter((value, i) => i % 2 === axis && Number.isFinite(value));
-    return [Math.min(...values) - around, Math.max(...values) + around];
-  });
+  const ends = boundsOf(xy, around);
   const { width, height } = panels[0].panel;
   const scale = Math.min(width / (ends[0][1] - ends[0][0]), height / (ends[1][1] - ends[1][0]));
   state.scale = rounded(scale);

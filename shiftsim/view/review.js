@@ -235,13 +235,10 @@ function seek(t) {
 }
 
 function wholeScene() {
-  const xy = fields.get("ego.xy").data;
-  const [xs, ys] = [0, 1].map((k) => [...xy].filter((_, i) => i % 2 === k));
-  const range = (values) => [Math.min(...values), Math.max(...values)];
-  const [[x0, x1], [y0, y1]] = [range(xs), range(ys)];
+  const [[x0, x1], [y0, y1]] = boundsOf(fields.get("ego.xy").data, 30);
   const { clientWidth: width, clientHeight: height } = byId("stage");
   state.centre = [(x0 + x1) / 2, (y0 + y1) / 2];
-  state.scale = Math.min(width / (x1 - x0 + 60), height / (y1 - y0 + 60), 12);
+  state.scale = Math.min(width / (x1 - x0), height / (y1 - y0), 12);
   layOut();
 }
 
@@ -260,7 +257,7 @@ function draw() {
   panel.centre = state.centre;
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   panel.drawMap(context);
-  drawRoute(ratio);
+  panel.inWorld(context, fillRoute);
   drawLights(context, scene, panel, at);
   drawAgents(context, scene, panel, at, -1);
   drawPath(context, scene.get("expert.xy").data, at, panel, COLOURS.link, [], 2);
@@ -275,17 +272,11 @@ function repaint() {
   draw();
 }
 
-function drawRoute(ratio) {
-  const zoom = state.scale * ratio;
-  context.save();
-  const [left, top] = panel.toScreen(0, 0);
-  context.setTransform(zoom, 0, 0, -zoom, left * ratio, top * ratio);
-  for (const { id, path } of blocks) {
-    if (!open.found.current.includes(id)) continue;
+function fillRoute() {
+  for (const { id, path } of blocks.filter((block) => open.found.current.includes(block.id))) {
     context.fillStyle = open.found.recordedRoute.includes(id) ? COLOURS.route : CHANGED;
     context.fill(path, "evenodd");
   }
-  context.restore();
 }
 
 function drawTicks() {

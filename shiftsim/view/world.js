@@ -305,10 +305,11 @@ function traceLine(context, xy, first, stop, panel) {
 }
 
 // the line that was traced; on a light page a bright colour, which the road would swallow, is edged
+// unless it is drawn faint
 function strokeEdged(context, colour) {
   const width = context.lineWidth;
-  if (!isDark() && luminance(colour) > SHADE) {
-    context.lineWidth = width + 3;
+  if (!isDark() && context.globalAlpha === 1 && luminance(colour) > SHADE) {
+    context.lineWidth = width + 2.4;
     context.strokeStyle = COLOURS.edge;
     context.stroke();
   }

@@ -231,15 +231,13 @@ class TestRows:
 @pytest.mark.parametrize("mode", ["light", "dark"])
 @pytest.mark.parametrize("size", [DESK, TABLET, PHONE])
 def test_the_page_fits_every_window_and_can_be_read(page, folder, size, mode, tmp_path):
-    scheme = [{"name": "prefers-color-scheme", "value": mode}]
-    page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
+    page.prefer(mode)
 
     page.open((folder / "index.html").as_uri(), size)
 
     assert page.run("document.documentElement.scrollWidth") <= size[0]
     assert page.run(FAINT) == []
     page.shoot(tmp_path / "list.png")
-    page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
 
 
 def test_rows_are_cards_on_a_phone(page, folder):

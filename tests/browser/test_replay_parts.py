@@ -272,8 +272,7 @@ class TestColours:
 
     def test_the_page_follows_the_system_and_the_key_turns_it(self, replay):
         assert replay.run("document.documentElement.dataset.theme") == "light"
-        media = [{"name": "prefers-color-scheme", "value": "dark"}]
-        replay.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": media})
+        replay.prefer("dark")
         replay.wait("isDark()")
         dark = replay.pixels()
 
@@ -282,7 +281,6 @@ class TestColours:
         assert not replay.run("isDark()")
         assert replay.pixels() != dark
         replay.browser.execute_script("localStorage.clear()")
-        replay.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
 
 
 def test_each_noise_is_one_curve_with_steering_beside(replay):

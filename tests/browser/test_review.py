@@ -78,8 +78,7 @@ def test_the_list_has_thumbnail_city_and_why_the_filter_dropped_a_scenario(page,
 
 @pytest.mark.parametrize("mode", ["light", "dark"])
 def test_it_can_be_read_as_the_system_has_it_and_by_its_key(page, store, mode):
-    scheme = [{"name": "prefers-color-scheme", "value": mode}]
-    page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
+    page.prefer(mode)
     faint = f"{FAINT}.filter((text) => !/ (recorded route|undo|[uo])$/.test(text))"
     with reviewing(store) as server:
         page.open(server.address)
@@ -95,7 +94,6 @@ def test_it_can_be_read_as_the_system_has_it_and_by_its_key(page, store, mode):
             drawn.append(page.pixels())
             page.press("u", "d")
             page.wait("!document.getElementById('reject').classList.contains('on')")
-    page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
     assert grounds == [mode == "light", mode != "light"]
     assert drawn[0] != drawn[1]
 

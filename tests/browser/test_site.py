@@ -38,12 +38,6 @@ def site():
     shutil.rmtree(folder)
 
 
-def prefer(page, mode):
-    """Let the browser ask for light or dark pages."""
-    features = [{"name": "prefers-color-scheme", "value": mode}]
-    page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
-
-
 def test_every_page_fits_a_phone_breaks_no_code_in_tables_and_asks_no_other_server(page, site):
     for path in sorted(site.rglob("*.html")):
         if path.name == "404.html":
@@ -58,7 +52,7 @@ def test_every_page_fits_a_phone_breaks_no_code_in_tables_and_asks_no_other_serv
 
 @pytest.mark.parametrize("mode", ["light", "dark"])
 def test_text_stands_out_from_its_ground(page, site, mode):
-    prefer(page, mode)
+    page.prefer(mode)
     schemes = {"light": "default", "dark": "slate"}
     for name in ("index", "quickstart", "metrics", "nuplan_rules", "api", "api/run", "api/command"):
         page.open((site / f"{name}.html").as_uri(), DESK, LOADED)
