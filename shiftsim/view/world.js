@@ -309,7 +309,7 @@ function traceLine(context, xy, first, stop, panel) {
 function strokeEdged(context, colour) {
   const width = context.lineWidth;
   if (!isDark() && context.globalAlpha === 1 && luminance(colour) > SHADE) {
-    context.lineWidth = width + 2.4;
+    context.lineWidth = width + 3;
     context.strokeStyle = COLOURS.edge;
     context.stroke();
   }
