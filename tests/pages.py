@@ -10,23 +10,33 @@ import numpy as np
 from shiftsim.view.scene import MISSING
 
 
-def unpack(text):
-    """The fields of a packed section, as codec.js reads them."""
+def unpack(text, base=None):
+    """The fields of a packed section, as codec.js reads them; `base` is the first rollout."""
+    return {name: values for name, (values, _) in _unpack(text, base and _unpack(base)).items()}
+
+
+def _unpack(text, base=None):
+    """Values and whole steps of the fields, by name."""
     body = zlib.decompress(base64.b64decode(text))
     end = 4 + int.from_bytes(body[:4], "little")
     out = {}
     for field in json.loads(body[4:end]):
-        count = int(np.prod(field["shape"]))
+        shape = field["shape"]
+        count = int(np.prod(shape))
         size = 4 * count if field["step"] else count
-        raw = np.frombuffer(body[end : end + size], np.uint8)
+        raw = steps = np.frombuffer(body[end : end + size], np.uint8)
         end += size
         if field["step"]:
-            whole = np.ascontiguousarray(raw.reshape(4, count).T).view("<u4")
-            steps = whole.reshape(field["shape"]).astype(np.int64)
-            summed = np.cumsum(steps, axis=0) & 0xFFFFFFFF
-            signed = summed.astype(np.uint32).view(np.int32)
-            raw = np.where(signed == MISSING, np.nan, signed * field["step"])
-        out[field["name"]] = raw.reshape(field["shape"])
+            bits = np.ascontiguousarray(raw.reshape(4, count).T).view("<u4")
+            signed = (bits >> 1).astype(np.int64) ^ -(bits & 1).astype(np.int64)
+            steps = np.moveaxis(signed.reshape(*shape[1:], shape[0]), -1, 0).copy()
+            steps[1:] = np.cumsum(steps[1:], axis=0)
+            steps = np.cumsum(steps, axis=0)
+            if field.get("base"):
+                steps += base[field["name"]][1]
+            steps = steps.astype(np.int32)
+            raw = np.where(steps == MISSING, np.nan, steps * field["step"])
+        out[field["name"]] = raw.reshape(shape), steps
     assert end == len(body)
     return out
 

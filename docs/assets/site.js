@@ -19,6 +19,8 @@ function ruleRow(heading, list) {
   title.firstChild.data = title.firstChild.data.replace(/^\d+\. /, "");
   const summary = make("summary", {}, ...title.childNodes);
   const link = make("a", { href: `#${heading.id}`, textContent: number });
+  for (const code of list.querySelectorAll("code")) // paths break at their slashes
+    code.replaceChildren(...code.textContent.split(/(?<=\/)/).flatMap((part) => [part, make("wbr", {})]));
   const rule = make("td", {}, make("details", {}, summary, list));
   const where = [...list.children].find((item) => item.textContent.startsWith("Where"));
   const code = make("td", {}, where.querySelector("code")?.cloneNode(true) ?? "");

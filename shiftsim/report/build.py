@@ -208,7 +208,8 @@ def write_report(
             coded = {path: base64.b64encode(path.read_bytes()).decode() for path in pictures}
             images = {f"data:image/png;base64,{coded[p]}": t for p, t in pictures.items()}
             body = report_html(runs, tables, images)
-            parts = [_filled("page.html", title=html.escape(title), body=body)]
+            look = {"title": html.escape(title), "theme": _filled("theme.css")}
+            parts = [_filled("page.html", body=body, **look)]
         elif style == "md":
             shown = [f"![{markdown_escape(t)}]({path.name})" for path, t in pictures.items()]
             head = [f"# {markdown_escape(title)}", markdown_escape(subtitle)]

@@ -335,11 +335,7 @@ def _draw_panel(axes: Any, inspection: "TracksReader", egos: Egos, extent: Float
     _draw_directions(axes, inspection.road, box)
     _draw_tracks(axes, inspection.table)
     _draw_egos(axes, egos)
-    axes.set_xlim(box[0], box[2])
-    axes.set_ylim(box[1], box[3])
-    axes.set_aspect("equal")
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("y [m]")
+    axes.set(xlim=box[::2], ylim=box[1::2], aspect="equal", xlabel="x [m]", ylabel="y [m]")
     axes.ticklabel_format(useOffset=False, style="plain")
     axes.tick_params(labelsize=7)
 

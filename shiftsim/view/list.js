@@ -1,7 +1,6 @@
 "use strict";
 // The list of rollouts: filtered by a matrix of scores, sorted, each row a link to what went wrong.
 
-const byId = (id) => document.getElementById(id);
 const read = (name) => JSON.parse(byId(`data-${name}`).textContent);
 const rows = read("rows");
 const metrics = read("metrics"); // words by abbreviation, in their order
@@ -11,6 +10,7 @@ const WORST = 10;
 const chosen = { planner: "", noise: "" }; // by the matrix
 let sorting = { key: "cls", up: true };
 let room = PAGE;
+const FILTERS = ["city", "type", "violated", "low", "high", "find"];
 
 for (const row of rows) row.first = row.at ?? Infinity;
 
@@ -65,12 +65,9 @@ function worstOf(found) {
 }
 
 function linked(row, content) {
-  const link = document.createElement(row.page ? "a" : "span");
+  if (!row.page) return make("span", { title: "no replay" }, content);
   const at = Number.isFinite(row.first) ? `t=${row.first.toFixed(2)}&` : "";
-  if (row.page) link.href = `${row.page}#${at}focus=${row.index + 1}`;
-  else link.title = "no replay";
-  link.append(content);
-  return link;
+  return make("a", { href: `${row.page}#${at}focus=${row.index + 1}` }, content);
 }
 
 function picture(row) {
@@ -111,7 +108,6 @@ function causesOf(row) {
 }
 
 function line(row) {
-  const tr = document.createElement("tr");
   const about = span("soft", [row.type, row.city].filter(Boolean).join(" · "));
   const cells = {
     scene: [sceneOf(row)],
@@ -121,18 +117,15 @@ function line(row) {
     cls: [scoreOf(row)],
     causes: causesOf(row),
   };
-  for (const [kind, content] of Object.entries(cells)) {
-    const td = tr.insertCell();
-    td.className = kind;
-    td.append(...content);
-  }
-  return tr;
+  const cellOf = ([className, content]) => make("td", { className }, ...content);
+  return make("tr", {}, ...Object.entries(cells).map(cellOf));
 }
 
 function card([row, alike]) {
-  const item = document.createElement("li");
   const more = alike ? span("soft", `${alike} alike`) : "";
-  item.append(
+  return make(
+    "li",
+    {},
     sceneOf(row),
     span("top", scoreOf(row), more),
     linked(row, row.token),
@@ -140,20 +133,16 @@ function card([row, alike]) {
     span("who", planner(row.planner, styles[row.planner], row.noise), noiseOf(row)),
     span("causes", ...causesOf(row)),
   );
-  return item;
 }
 
 function choose(wanted) {
   const same = chosen.planner === wanted.planner && chosen.noise === wanted.noise;
   Object.assign(chosen, same ? { planner: "", noise: "" } : wanted);
-  refresh();
+  refilter();
 }
 
 function button(content, wanted, label) {
-  const made = document.createElement("button");
-  made.type = "button";
-  made.append(content);
-  made.title = made.ariaLabel = label;
+  const made = make("button", { type: "button", title: label, ariaLabel: label }, content);
   Object.assign(made.dataset, wanted);
   made.addEventListener("click", () => choose(wanted));
   return made;
@@ -180,12 +169,7 @@ function cellOf(name, noise, best) {
   return made;
 }
 
-function headingOf(scope, ...parts) {
-  const th = document.createElement("th");
-  th.scope = scope;
-  th.append(button(...parts));
-  return th;
-}
+const headingOf = (scope, ...parts) => make("th", { scope }, button(...parts));
 
 function makeMatrix() {
   const [head, body] = [byId("matrix").tHead.insertRow(), byId("matrix").tBodies[0]];
@@ -236,11 +220,23 @@ function refresh() {
   showWorst(show());
 }
 
+// of another filter, which the address keeps
+function refilter() {
+  refresh();
+  const filters = [...Object.entries(chosen), ...FILTERS.map((id) => [id, byId(id).value])];
+  const set = filters.filter(([id, value]) => value !== (byId(id)?.defaultValue ?? ""));
+  history.replaceState(null, "", `#${new URLSearchParams(set)}`);
+}
+
 for (const name of ["city", "type"]) options(name, sorted(rows.map((row) => row[name])).filter(Boolean));
 const violated = new Set(rows.flatMap((row) => Object.keys(row.violated)));
 const named = Object.fromEntries(Object.entries(metrics).map(([short, words]) => [short, `${words} (${short})`]));
 options("violated", Object.keys(metrics).filter((name) => violated.has(name)), named);
-for (const id of ["city", "type", "violated", "low", "high", "find"]) byId(id).addEventListener("input", refresh);
+for (const id of FILTERS) byId(id).addEventListener("input", refilter);
+for (const [id, value] of new URLSearchParams(location.hash.slice(1))) {
+  if (id in chosen) chosen[id] = value;
+  else if (FILTERS.includes(id)) byId(id).value = value;
+}
 for (const th of byId("list").tHead.querySelectorAll("[data-key]")) {
   th.tabIndex = 0;
   const sort = () => {

@@ -1,7 +1,6 @@
 "use strict";
 // A run under way: asks for its state twice a second, and keeps the last one when it has ended.
 
-const byId = (id) => document.getElementById(id);
 const key = new URLSearchParams(location.search).get("token") || "";
 const EVERY = 500; // ms between two questions
 const SILENT = 6; // questions without an answer after which nothing more is asked
@@ -18,51 +17,27 @@ function minutes(seconds) {
   return parts.slice(parts[0] ? 0 : 1).map((part, i) => (i ? `${part}`.padStart(2, "0") : part)).join(":");
 }
 
-function cell(content, kind) {
-  const td = document.createElement("td");
-  if (kind) td.className = kind;
-  td.append(content === null || content === undefined ? "–" : content);
-  return td;
-}
+const cell = (content, className = "") => make("td", { className }, content ?? "–");
 
 function fillRows(id, rows, empty) {
   const body = byId(id).tBodies[0];
-  const lines = rows.map((cells) => {
-    const tr = document.createElement("tr");
-    tr.append(...cells);
-    return tr;
-  });
-  if (!lines.length) {
-    const tr = document.createElement("tr");
-    const td = cell(empty, "none");
-    td.colSpan = byId(id).tHead.rows[0].cells.length;
-    tr.append(td);
-    lines.push(tr);
-  }
-  body.replaceChildren(...lines);
+  const colSpan = byId(id).tHead.rows[0].cells.length;
+  if (!rows.length) rows = [[make("td", { className: "none", colSpan }, empty)]];
+  body.replaceChildren(...rows.map((cells) => make("tr", {}, ...cells)));
 }
 
 // mean and interval on a scale from 0 to 100
 function range({ mean, interval: [low = mean, high = mean] }, colour) {
-  const box = document.createElement("div");
-  box.className = "range";
-  const [line, dot] = [document.createElement("i"), document.createElement("b")];
-  line.style.left = `${low}%`;
-  line.style.width = `${high - low}%`;
-  dot.style.left = `${mean}%`;
-  box.style.setProperty("--own", colour);
-  box.append(line, dot);
-  return box;
+  const line = make("i", { style: `left: ${low}%; width: ${high - low}%` });
+  const dot = make("b", { style: `left: ${mean}%` });
+  return make("div", { className: "range", style: `--own: ${colour}` }, line, dot);
 }
 
 function scenario(row, ended) {
   if (row.replay === null || ended) return row.token;
-  const link = document.createElement("a");
   const at = row.at === null ? "" : `#t=${row.at.toFixed(2)}`;
-  link.href = `/replay?id=${row.replay}&token=${encodeURIComponent(key)}${at}`;
-  link.target = "_blank";
-  link.textContent = row.token;
-  return link;
+  const href = `/replay?id=${row.replay}&token=${encodeURIComponent(key)}${at}`;
+  return make("a", { href, target: "_blank" }, row.token);
 }
 
 function seedOf(row) {

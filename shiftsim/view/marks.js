@@ -1,5 +1,15 @@
 "use strict";
-// What all pages share: planners with their markers, as in all figures, and thumbnails of scenarios.
+// What all pages share: elements, planners with their markers, as in all figures, and thumbnails.
+
+const byId = (id) => document.getElementById(id);
+
+function make(name, properties, ...children) {
+  const element = Object.assign(document.createElement(name), properties);
+  element.append(...children);
+  return element;
+}
+
+const span = (kind, ...content) => make("span", { className: kind }, ...content);
 
 // markers of about 9 units around their middle
 const SHAPES = {
@@ -28,13 +38,6 @@ function svgOf(name, attributes, ...children) {
   const element = document.createElementNS(SVG, name);
   for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
   element.append(...children);
-  return element;
-}
-
-function span(kind, ...content) {
-  const element = document.createElement("span");
-  element.className = kind;
-  element.append(...content);
   return element;
 }
 

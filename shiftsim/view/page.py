@@ -22,10 +22,10 @@ from shiftsim.world.scenario import Scenario, require_scenario
 
 MAX_ROLLOUTS = 6  # of a replay
 _HERE = Path(__file__).parent
-_SCENE = ("marks.js", "world.js")
+_THEME, _SCENE = "../report/theme.css", ("marks.js", "world.js", "player.js")
 _FILES = {  # style and script of each page; its body is the file of its name
-    "list": (["list.css"], ["marks.js", "list.js"]),
-    "live": (["list.css", "live.css"], ["marks.js", "live.js"]),
+    "list": ([_THEME, "list.css"], ["marks.js", "list.js"]),
+    "live": ([_THEME, "list.css", "live.css"], ["marks.js", "live.js"]),
     "replay": (["replay.css"], ["codec.js", *_SCENE, "strips.js", "waterfall.js", "replay.js"]),
     "review": (["replay.css", "review.css"], ["codec.js", *_SCENE, "review.js"]),
 }
@@ -103,10 +103,12 @@ def replay_page(
     drawn = shown[:MAX_ROLLOUTS]
     words = f"{len(drawn)} of {len(shown)} rollouts shown" if len(drawn) < len(shown) else ""
     replay = Replay(scenario, drawn, seeds)
+    first, *others = (rollout_fields(replay, index) for index in range(len(drawn)))
     data = {
         "meta": describe_scene(replay) | {"back": back, "shown": words} | dict(more or {}),
         "scene": pack(scene_fields(replay)),
-        **{f"rollout{n}": pack(rollout_fields(replay, n)) for n in range(len(drawn))},
+        "rollout0": pack(first),
+        **{f"rollout{n}": pack(fields, first) for n, fields in enumerate(others, 1)},
     }
     return framed("replay", title=f"{scenario.token} · shiftsim", images="data:", data=data)
 
@@ -143,7 +145,7 @@ def framed(
 
 @cache
 def _asset(name: str) -> str:
-    """A file of this folder."""
+    """A file by its place from this folder."""
     return (_HERE / name).read_text(encoding="utf-8")
 
 

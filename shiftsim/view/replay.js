@@ -17,7 +17,6 @@ const LENGTH_CLEAR = 4.2; // m that no ego reaches from its rear axle
 const TOLD = 2; // s that the words of a violation stay
 const FADE = 500; // ms in which whole plans appear once a moment is chosen
 
-const byId = (id) => document.getElementById(id);
 const meta = JSON.parse(byId("data-meta").textContent);
 
 const state = {
@@ -47,31 +46,18 @@ const rollouts = meta.rollouts.map(() => null); // fields, once decoded
 let scene, map, times, strips, waterfall, panels, highlighted = -1;
 let tubes = []; // the seeds of each planner together: {planner, noise, colour, dots, area, across, along}
 
-const canvas = byId("scene");
-const context = canvas.getContext("2d", { alpha: false });
 const isNoisy = (rollout) => rollout.noise !== "none";
 const dashOf = (rollout) => (isNoisy(rollout) ? NOISY : CLEAN);
 const labelOf = (rollout) =>
   rollout.noise === "none" ? rollout.planner : `${rollout.planner} ${rollout.noise} #${rollout.seed}`;
-const duration = () => times[times.length - 1];
 
 // ---- time ----
-
-function sampleAt(t) {
-  let row = Math.min(Math.floor((t / duration()) * (times.length - 1)), times.length - 1);
-  while (row > 0 && times[row] > t + 1e-6) row--;
-  while (row + 1 < times.length && times[row + 1] <= t + 1e-6) row++;
-  const next = Math.min(row + 1, times.length - 1);
-  const span = times[next] - times[row];
-  return { row, next, share: span > 0 ? Math.min(Math.max((t - times[row]) / span, 0), 1) : 0 };
-}
 
 function seek(t) {
   state.t = Math.min(Math.max(t, 0), duration());
   byId("time").value = state.t;
   byId("time").setAttribute("aria-valuetext", `${state.t.toFixed(1)} seconds`);
-  if (state.playing) return draw();
-  saveState();
+  if (!state.playing) saveState();
   fadePlans();
 }
 
@@ -86,38 +72,6 @@ function fadePlans() {
     if (!state.playing && planned < 1) fading = requestAnimationFrame(go);
   };
   go(began);
-}
-
-function stepBy(samples) {
-  pause();
-  const { row } = sampleAt(state.t);
-  seek(times[Math.min(Math.max(row + samples, 0), times.length - 1)]);
-}
-
-let lastFrame = 0;
-function frame(now) {
-  if (!state.playing) return;
-  const t = state.t + (state.rate * (now - lastFrame)) / 1000;
-  lastFrame = now;
-  if (t >= duration()) pause();
-  seek(t);
-  if (state.playing) requestAnimationFrame(frame);
-}
-
-function play() {
-  planned = 0;
-  if (state.t >= duration() - 1e-6) state.t = 0;
-  state.playing = true;
-  byId("play").textContent = "❚❚";
-  lastFrame = performance.now();
-  requestAnimationFrame(frame);
-}
-
-function pause() {
-  state.playing = false;
-  byId("play").textContent = "▶";
-  saveState();
-  if (panels) fadePlans();
 }
 
 // ---- violations ----
@@ -170,8 +124,13 @@ function tracksOf(index) {
     : { fields: scene, names: meta.tracks };
 }
 
+async function load(index) {
+  if (index) await load(0); // which the others are stored from
+  rollouts[index] ??= await readSection(`rollout${index}`, rollouts[0]);
+}
+
 async function show(index, on) {
-  if (on && !rollouts[index]) rollouts[index] = await readSection(`rollout${index}`);
+  if (on) await load(index);
   state.shown[index] = on;
   if (!state.shown.some(Boolean)) state.shown[index] = true; // something must remain
   if (!state.shown[state.focus]) state.focus = state.shown.indexOf(true);
@@ -218,10 +177,7 @@ function readTube(tube, number) {
 // ---- drawing ----
 
 function layOut() {
-  const ratio = window.devicePixelRatio || 1;
-  const { clientWidth: width, clientHeight: height } = byId("stage");
-  canvas.width = Math.round(width * ratio);
-  canvas.height = Math.round(height * ratio);
+  const { width, height, ratio } = sizeCanvas();
   const groups = state.side ? visible().map((i) => [i]) : [visible()];
   const across = panelsAcross(groups.length, width > height);
   const down = Math.ceil(groups.length / across);
@@ -577,44 +533,30 @@ function listRollouts() {
   for (const { losses } of meta.rollouts) tellLosses(losses);
   byId("rollouts").replaceChildren();
   for (const [index, rollout] of meta.rollouts.entries()) {
-    const box = document.createElement("div");
-    box.className = "rollout";
-    box.addEventListener("click", () => setFocus(index));
-    const name = document.createElement("div");
-    name.className = "name";
-    const check = document.createElement("input");
-    check.type = "checkbox";
-    check.setAttribute("aria-label", `show ${labelOf(rollout)}`);
+    const check = make("input", { type: "checkbox", ariaLabel: `show ${labelOf(rollout)}` });
     check.addEventListener("click", (event) => event.stopPropagation());
     check.addEventListener("change", () => show(index, check.checked));
-    const label = document.createElement("span");
-    label.className = "label";
-    for (const part of rollout.planner.split(/(?<=[:/._-])/)) label.append(part, document.createElement("wbr"));
-    label.title = labelOf(rollout);
-    const cls = document.createElement("span");
-    cls.className = "cls";
-    cls.textContent = rollout.cls === null ? "–" : (100 * rollout.cls).toFixed(1);
-    name.append(check, swatch(rollout), label, cls);
+    const parts = rollout.planner.split(/(?<=[:/._-])/).flatMap((part) => [part, make("wbr")]);
+    const label = make("span", { className: "label", title: labelOf(rollout) }, ...parts);
+    const cls = span("cls", rollout.cls === null ? "–" : (100 * rollout.cls).toFixed(1));
+    const name = make("div", { className: "name" }, check, swatch(rollout), label, cls);
     const buttons = rollout.violations.map((item) => violationButton(item, index));
     const undated = rollout.losses.filter((loss) => loss.t === null);
     const lines = undated.map((loss) => smallLine(`${loss.words} ${loss.told}`));
     const lists = [...buttons, ...lines, ...forkLines(rollout, index)];
-    box.append(name, noiseOf(rollout), scoresOf(rollout), ...lists);
+    const box = make("div", { className: "rollout" }, name, noiseOf(rollout), scoresOf(rollout), ...lists);
+    box.addEventListener("click", () => setFocus(index));
     byId("rollouts").append(box);
   }
 }
 
-function smallLine(words) {
-  const line = document.createElement("div");
-  return Object.assign(line, { className: "scores", textContent: words });
-}
+const smallLine = (words) => make("div", { className: "scores" }, words);
 
 // from where on a collision could not be avoided, and what is driven from there
 function forkLines({ fork }, index) {
   if (!fork) return [];
   if (!fork.branches.length) return [smallLine(forkWords(fork))];
-  const button = document.createElement("button");
-  button.textContent = `${fork.t.toFixed(1)}\u00a0s  last chance to avoid the collision`;
+  const button = make("button", {}, `${fork.t.toFixed(1)}\u00a0s  last chance to avoid the collision`);
   button.addEventListener("click", (event) => {
     event.stopPropagation();
     [state.focus, state.fork] = [index, false];
@@ -634,11 +576,7 @@ function showLoss(loss) {
 }
 
 function swatch(rollout) {
-  const picture = document.createElement("canvas");
-  picture.width = 56;
-  picture.height = 28;
-  picture.style.width = "28px";
-  picture.style.height = "14px";
+  const picture = make("canvas", { width: 56, height: 28, style: "width: 28px; height: 14px" });
   const pen = picture.getContext("2d");
   pen.scale(2, 2);
   pen.setLineDash(dashOf(rollout).length ? [4, 3] : []);
@@ -653,35 +591,27 @@ function swatch(rollout) {
   return picture;
 }
 
-function noiseOf(rollout) {
-  const line = document.createElement("div");
-  line.className = "noise";
-  line.textContent = rollout.noise === "none" ? "" : `${rollout.noise} · seed ${rollout.seed}`;
-  return line;
+function noiseOf({ noise, seed }) {
+  return make("div", { className: "noise" }, noise === "none" ? "" : `${noise} · seed ${seed}`);
 }
 
 function scoresOf(rollout) {
-  const line = document.createElement("div");
-  line.className = "scores";
-  for (const [name, value] of Object.entries(rollout.scores)) {
-    if (value >= 1) continue;
-    const part = document.createElement("abbr");
-    part.textContent = `${name} ${(100 * value).toFixed(0)}`;
-    part.title = meta.metrics[name] || name;
-    line.append(part, " ");
+  const line = make("div", { className: "scores" });
+  for (const [name, value] of Object.entries(rollout.scores).filter(([, score]) => score < 1)) {
+    const title = meta.metrics[name] || name;
+    line.append(make("abbr", { title }, `${name} ${(100 * value).toFixed(0)}`), " ");
   }
   if (rollout.degraded) line.append(`${rollout.degraded} degraded steps`);
   return line;
 }
 
 function violationButton(violation, index) {
-  const button = document.createElement("button");
   const words = violation.words.replace(/(\d) (?=m|s|rad)/g, "$1\u00a0"); // a number keeps its unit
-  button.textContent = `${violation.t.toFixed(1)}\u00a0s  ${words}`;
-  const loss = meta.rollouts[index].losses.find((one) => one.metric === violation.metric);
-  if (loss) button.append(" ", Object.assign(document.createElement("b"), { textContent: loss.told }));
   const limit = violation.threshold === null ? "" : `, bound ${violation.threshold}`;
-  button.title = `${violation.metric} (${violation.short})${limit}`;
+  const title = `${violation.metric} (${violation.short})${limit}`;
+  const button = make("button", { title }, `${violation.t.toFixed(1)}\u00a0s  ${words}`);
+  const loss = meta.rollouts[index].losses.find((one) => one.metric === violation.metric);
+  if (loss) button.append(" ", make("b", {}, loss.told));
   button.addEventListener("click", (event) => {
     event.stopPropagation();
     jumpTo({ ...violation, index });
@@ -690,20 +620,14 @@ function violationButton(violation, index) {
 }
 
 function listLegend() {
-  byId("legend").replaceChildren();
-  const used = new Set();
-  const fields = meta.ownTracks ? rollouts[state.focus] : scene;
-  for (const kind of fields.get("tracks.kind").data) used.add(kind);
+  const used = new Set((meta.ownTracks ? rollouts[state.focus] : scene).get("tracks.kind").data);
   const entries = [...used].sort().map((kind) => [agentColour(kind), KIND_NAMES[kind]]);
   if (meta.edited.length) entries.push([COLOURS.edited, "edited"]);
   entries.push([COLOURS.route, "route"], [COLOURS.crosswalk, "crosswalk"]);
-  for (const [colour, text] of entries) {
-    const item = document.createElement("span");
-    const sample = document.createElement("i");
-    sample.style.background = colour;
-    item.append(sample, text);
-    byId("legend").append(item);
-  }
+  const items = entries.map(([colour, text]) =>
+    make("span", {}, make("i", { style: `background: ${colour}` }), text),
+  );
+  byId("legend").replaceChildren(...items);
 }
 
 const LINKED = ["side", "up", "tube", "fork"]; // of them, what the link says
@@ -729,18 +653,11 @@ function setOption(name, on) {
   saveState();
 }
 
-// ---- light and dark ----
-
-const prefersDark = window.matchMedia("(prefers-color-scheme: dark)");
-const isDark = () => document.documentElement.dataset.theme === "dark";
-
-function setTheme(dark) {
-  document.documentElement.dataset.theme = dark ? "dark" : "light";
-  readColours();
+function repaint() {
   const branches = meta.rollouts.flatMap(({ fork }) => fork?.branches || []);
   for (const item of [...meta.rollouts, ...tubes, ...branches].filter(({ colour }) => colour)) {
     item.given ??= item.colour;
-    item.colour = dark ? lightened(item.given) : item.given;
+    item.colour = isDark() ? lightened(item.given) : item.given;
   }
   if (!map) return;
   map.version++;
@@ -749,39 +666,16 @@ function setTheme(dark) {
   changed();
 }
 
-function toggleTheme() {
-  setTheme(!isDark());
-  try {
-    localStorage.setItem("shiftsim-theme", isDark() ? "dark" : "light");
-  } catch {
-    // a page inside a notebook keeps nothing
-  }
-}
-
-function startTheme() {
-  let wanted = null;
-  try {
-    wanted = localStorage.getItem("shiftsim-theme");
-  } catch {
-    // nothing is kept here
-  }
-  setTheme(wanted ? wanted === "dark" : prefersDark.matches);
-  prefersDark.addEventListener("change", () => setTheme(prefersDark.matches));
-}
-
 // a scale within its bounds, as the link has it
 function rounded(scale) {
   return Number(Math.min(Math.max(scale, MIN_SCALE), MAX_SCALE).toFixed(2));
 }
 
-const fit = () => showAround([...rollouts[state.focus].get("ego.xy").data], AROUND);
+const fit = () => showAround(rollouts[state.focus].get("ego.xy").data, AROUND);
 
 // the view of places x, y, x, y, … and some metres around them
 function showAround(xy, around) {
-  const ends = [0, 1].map((axis) => {
-    const values = xy.filter((value, i) => i % 2 === axis && Number.isFinite(value));
-    return [Math.min(...values) - around, Math.max(...values) + around];
-  });
+  const ends = boundsOf(xy, around);
   const { width, height } = panels[0].panel;
   const scale = Math.min(width / (ends[0][1] - ends[0][0]), height / (ends[1][1] - ends[1][0]));
   state.scale = rounded(scale);
@@ -809,37 +703,14 @@ function inside(panel, px, py) {
   return dx >= 0 && dy >= 0 && dx <= panel.width && dy <= panel.height;
 }
 
-function drag(event) {
-  const start = [event.clientX, event.clientY];
-  const from = [...panels[0].panel.centre];
-  const move = (e) => {
-    if (state.follow) setOption("follow", false);
-    state.centre = [
-      from[0] - (e.clientX - start[0]) / state.scale,
-      from[1] + (e.clientY - start[1]) / state.scale,
-    ];
-    draw();
-  };
-  const end = () => {
-    window.removeEventListener("pointermove", move);
-    window.removeEventListener("pointerup", end);
-    saveState();
-  };
-  window.addEventListener("pointermove", move);
-  window.addEventListener("pointerup", end);
+function press(event) {
+  drag(event, panels[0].panel, () => setOption("follow", false), saveState);
 }
 
 function hover(event) {
-  const tip = byId("tip");
-  const box = canvas.getBoundingClientRect();
-  const [px, py] = [event.clientX - box.left, event.clientY - box.top];
+  const [px, py] = pointer(event);
   const found = panels.find(({ panel }) => inside(panel, px, py));
-  const text = found && event.buttons === 0 ? describeAt(found, px, py) : "";
-  tip.hidden = !text;
-  if (!text) return;
-  tip.textContent = text;
-  tip.style.left = `${Math.min(px + 14, box.width - 160)}px`;
-  tip.style.top = `${py + 12}px`;
+  showTip(found && event.buttons === 0 ? describeAt(found, px, py) : "", [px, py]);
 }
 
 function describeAt({ panel, members }, px, py) {
@@ -873,7 +744,7 @@ function trackSpeed(fields, index, at) {
 }
 
 const KEYS = {
-  " ": () => (state.playing ? pause() : play()),
+  " ": play,
   ArrowLeft: (e) => stepBy(e.shiftKey ? -10 : -1),
   ArrowRight: (e) => stepBy(e.shiftKey ? 10 : 1),
   Home: () => seek(0),
@@ -935,18 +806,7 @@ function connect() {
       else setOption(name, e.target.checked);
     });
   }
-  canvas.addEventListener("pointerdown", drag);
-  canvas.addEventListener("pointermove", hover);
-  canvas.addEventListener("pointerleave", () => (byId("tip").hidden = true));
-  canvas.addEventListener(
-    "wheel",
-    (e) => {
-      e.preventDefault();
-      const box = canvas.getBoundingClientRect();
-      zoom(e.deltaY < 0 ? 1.15 : 1 / 1.15, e.clientX - box.left, e.clientY - box.top);
-    },
-    { passive: false },
-  );
+  connectCanvas();
   const scrub = (e) => seek(strips.timeAt(e.clientX - byId("curves").getBoundingClientRect().left));
   byId("curves").addEventListener("pointerdown", (e) => {
     pause();
@@ -991,10 +851,8 @@ async function copyLink() {
 }
 
 function savePicture() {
-  const link = document.createElement("a");
-  link.download = `${meta.token}-${state.t.toFixed(2)}s.png`;
-  link.href = canvas.toDataURL("image/png");
-  link.click();
+  const download = `${meta.token}-${state.t.toFixed(2)}s.png`;
+  make("a", { download, href: canvas.toDataURL("image/png") }).click();
 }
 
 let written = "";
@@ -1033,7 +891,7 @@ async function loadState() {
   state.follow = !(at.length === 2 && at.every(Number.isFinite));
   if (!state.follow) [state.centre, state.up] = [at, false];
   for (const [index, shown] of state.shown.entries()) {
-    if (shown && !rollouts[index]) rollouts[index] = await readSection(`rollout${index}`);
+    if (shown) await load(index);
   }
   state.t = Math.min(Math.max(number("t", 0), 0), duration());
 }
@@ -1042,18 +900,11 @@ async function start() {
   byId("token").textContent = meta.token;
   byId("about").textContent = [meta.type, meta.city, meta.log].filter(Boolean).join(" · ");
   byId("settings").textContent = meta.settings || "";
-  for (const line of meta.edits) {
-    const item = document.createElement("li");
-    item.textContent = line;
-    byId("edits").append(item);
-  }
+  byId("edits").append(...meta.edits.map((line) => make("li", {}, line)));
   byId("edits").hidden = !meta.edits.length;
   byId("shown").textContent = meta.shown || "";
-  for (const [index, [words, name]] of (meta.parts || []).entries()) {
-    const link = document.createElement(index === meta.part ? "b" : "a");
-    link.textContent = words;
-    link.href = name;
-    byId("shown").append(" ", link);
+  for (const [index, [words, href]] of (meta.parts || []).entries()) {
+    byId("shown").append(" ", make(index === meta.part ? "b" : "a", { href }, words));
   }
   if (meta.back) {
     byId("back").hidden = false;

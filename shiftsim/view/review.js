@@ -1,11 +1,8 @@
 "use strict";
 // The review page: walks through scenarios, keeps every decision at once, edits routes by clicking.
 
-const byId = (id) => document.getElementById(id);
 const secret = new URLSearchParams(location.search).get("token") || "";
-const ROUTE = "rgba(40, 140, 90, 0.38)";
 const CHANGED = "rgba(224, 138, 0, 0.45)";
-const EGO = "#0b62c4";
 const NUMBERS = { // results of the filter, in words
   max_outside_m: (value) => `${value.toFixed(2)} m off the road`,
   path_m: (value) => `${value.toFixed(1)} m path`,
@@ -13,16 +10,11 @@ const NUMBERS = { // results of the filter, in words
   first_violation_s: (value) => `first violation ${value.toFixed(1)} s`,
   partner_token: (value) => `with ${value}`,
 };
-const CLICK = 4; // pixels a pointer may move between down and up to count as a click
 
 let listing, current, fields, scene, map, panel, blocks;
-let playing = false;
-let now = 0;
-let highlighted = -1;
-const view = { scale: 4, centre: [0, 0] };
+let times = [0];
+const state = { t: 0, playing: false, rate: 1, scale: 4, centre: [0, 0] };
 const undone = []; // {token, values} that bring back what was before
-const canvas = byId("scene");
-const context = canvas.getContext("2d", { alpha: false });
 
 async function ask(path, body) {
   const options = { headers: { "X-Shiftsim-Token": secret } };
@@ -84,16 +76,15 @@ function showList() {
     `${listing.scenarios.length} scenarios · ${count("accept")} accepted · ` +
     `${count("reject")} rejected · ${count("")} open`;
   const lines = chosen().map((row) => {
-    const line = document.createElement("li");
-    line.classList.toggle("current", row.token === current);
     const sign = { accept: "✓", reject: "✗", "": "" }[row.decision] + (row.route ? " ⤳" : "");
     const result = row.reason && `${row.verdict}: ${row.reason}`;
     const about = [row.city, result].filter(Boolean).join(" · ");
     const box = span("box");
     box.dataset.token = row.token;
     seen.observe(box);
-    line.append(box, span("token", row.token), span("sign", sign), span("about", about));
-    line.title = `${row.city} · ${row.type} · filter: ${row.verdict} ${row.reason}`;
+    const title = `${row.city} · ${row.type} · filter: ${row.verdict} ${row.reason}`;
+    const parts = [box, span("token", row.token), span("sign", sign), span("about", about)];
+    const line = make("li", { title, className: row.token === current ? "current" : "" }, ...parts);
     line.addEventListener("click", () => open(row.token));
     return line;
   });
@@ -112,16 +103,16 @@ function move(step) {
 // ---- one scenario ----
 
 async function open(token) {
-  stop();
+  pause();
   const found = await ask(`/api/scenario?id=${encodeURIComponent(token)}`);
   scene = await unpack(found.scene);
+  times = scene.get("time").data;
   fields = await unpack(found.rollout);
   blocks = readBlocks(await unpack(found.blocks), found.blockIds);
   map = new MapPicture(scene);
   map.layers.route = false;
   panel = new Panel(map);
   current = token;
-  highlighted = -1;
   byId("token").textContent = token;
   byId("about").textContent = [found.meta.type, found.meta.city, found.meta.log].join(" · ");
   const numbers = Object.entries(found.numbers).map(([name, value]) => NUMBERS[name](value));
@@ -130,7 +121,7 @@ async function open(token) {
   Object.assign(open, { found });
   history.replaceState(null, "", `${location.pathname}${location.search}#${encodeURIComponent(token)}`);
   byId("time").max = duration();
-  now = 0;
+  state.t = 0;
   wholeScene();
   showReview(found);
   showList();
@@ -156,32 +147,21 @@ function readBlocks(packed, ids) {
   });
 }
 
-function showReview(state) {
-  Object.assign(open.found, state);
-  Object.assign(rowOf(current), {
-    decision: state.decision, comment: state.comment, route: state.route,
-  });
-  byId("accept").classList.toggle("on", state.decision === "accept");
-  byId("reject").classList.toggle("on", state.decision === "reject");
-  if (document.activeElement !== byId("comment")) byId("comment").value = state.comment;
+function showReview(review) {
+  Object.assign(open.found, review);
+  const { decision, comment, route } = review;
+  Object.assign(rowOf(current), { decision, comment, route });
+  byId("accept").classList.toggle("on", decision === "accept");
+  byId("reject").classList.toggle("on", decision === "reject");
+  if (document.activeElement !== byId("comment")) byId("comment").value = comment;
   byId("undo").disabled = !undone.length;
-  byId("recorded").disabled = !state.route;
-  const items = state.current.map((id) => {
-    const line = document.createElement("li");
-    line.textContent = id;
-    line.classList.toggle("corrected", !open.found.recordedRoute.includes(id));
-    return line;
-  });
+  byId("recorded").disabled = !route;
+  const kindOf = (id) => (open.found.recordedRoute.includes(id) ? "" : "corrected");
+  const items = review.current.map((id) => make("li", { className: kindOf(id) }, id));
   byId("blocks").replaceChildren(...items);
-  const problems = state.problems.length ? state.problems : ["the route is connected"];
-  byId("problems").classList.toggle("good", !state.problems.length);
-  byId("problems").replaceChildren(
-    ...problems.map((text) => {
-      const line = document.createElement("li");
-      line.textContent = text;
-      return line;
-    }),
-  );
+  const problems = review.problems.length ? review.problems : ["the route is connected"];
+  byId("problems").classList.toggle("good", !review.problems.length);
+  byId("problems").replaceChildren(...problems.map((text) => make("li", {}, text)));
   draw();
 }
 
@@ -189,10 +169,10 @@ async function keep(values, { undo = true, token = current } = {}) {
   const before = rowOf(token);
   const old = Object.fromEntries(Object.keys(values).map((name) => [name, before[name]]));
   try {
-    const state = await ask("/api/review", { token, values });
+    const review = await ask("/api/review", { token, values });
     if (undo) undone.push({ token, values: old });
-    if (token === current) showReview(state);
-    else Object.assign(before, { decision: state.decision, comment: state.comment, route: state.route });
+    if (token === current) showReview(review);
+    else Object.assign(before, { decision: review.decision, comment: review.comment, route: review.route });
     say("kept");
     showList();
   } catch (error) {
@@ -249,75 +229,61 @@ function blockAt(px, py) {
 
 // ---- drawing and time ----
 
-const times = () => scene.get("time").data;
-const duration = () => times()[times().length - 1];
-
-function sampleAt(t) {
-  const all = times();
-  let row = 0;
-  while (row + 1 < all.length && all[row + 1] <= t + 1e-6) row++;
-  const next = Math.min(row + 1, all.length - 1);
-  const span = all[next] - all[row];
-  return { row, next, share: span > 0 ? Math.min((t - all[row]) / span, 1) : 0 };
+function seek(t) {
+  state.t = Math.min(Math.max(t, 0), duration());
+  draw();
 }
 
 function wholeScene() {
-  const xy = fields.get("ego.xy").data;
-  const [xs, ys] = [0, 1].map((k) => [...xy].filter((_, i) => i % 2 === k));
-  const range = (values) => [Math.min(...values), Math.max(...values)];
-  const [[x0, x1], [y0, y1]] = [range(xs), range(ys)];
+  const [[x0, x1], [y0, y1]] = boundsOf(fields.get("ego.xy").data, 30);
   const { clientWidth: width, clientHeight: height } = byId("stage");
-  view.centre = [(x0 + x1) / 2, (y0 + y1) / 2];
-  view.scale = Math.min(width / (x1 - x0 + 60), height / (y1 - y0 + 60), 12);
+  state.centre = [(x0 + x1) / 2, (y0 + y1) / 2];
+  state.scale = Math.min(width / (x1 - x0), height / (y1 - y0), 12);
   layOut();
 }
 
 function layOut() {
   if (!panel) return;
-  const ratio = window.devicePixelRatio || 1;
-  const { clientWidth: width, clientHeight: height } = byId("stage");
-  canvas.width = Math.round(width * ratio);
-  canvas.height = Math.round(height * ratio);
-  panel.place(0, 0, width, height, view.scale, ratio);
+  const { width, height, ratio } = sizeCanvas();
+  panel.place(0, 0, width, height, state.scale, ratio);
   draw();
 }
 
 function draw() {
   if (!panel) return;
-  const at = sampleAt(now);
+  const at = sampleAt(state.t);
   const ratio = window.devicePixelRatio || 1;
-  panel.scale = view.scale;
-  panel.centre = view.centre;
+  panel.scale = state.scale;
+  panel.centre = state.centre;
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   panel.drawMap(context);
-  drawRoute(ratio);
+  panel.inWorld(context, fillRoute);
   drawLights(context, scene, panel, at);
-  drawAgents(context, scene, panel, at, highlighted);
-  drawPath(context, scene.get("expert.xy").data, at, panel, EGO, [], 2);
+  drawAgents(context, scene, panel, at, -1);
+  drawPath(context, scene.get("expert.xy").data, at, panel, COLOURS.link, [], 2);
   drawTicks();
-  drawEgo(context, poseAt(fields, "ego", 1, 0, at), open.found.meta.vehicle, panel, EGO, true);
-  byId("clock").textContent = `${now.toFixed(1)} s of ${duration().toFixed(1)} s`;
-  byId("time").value = now;
+  drawEgo(context, poseAt(fields, "ego", 1, 0, at), open.found.meta.vehicle, panel, COLOURS.link, true);
+  byId("clock").textContent = `${state.t.toFixed(1)} s of ${duration().toFixed(1)} s`;
+  byId("time").value = state.t;
 }
 
-function drawRoute(ratio) {
-  const zoom = view.scale * ratio;
-  context.save();
-  const [left, top] = panel.toScreen(0, 0);
-  context.setTransform(zoom, 0, 0, -zoom, left * ratio, top * ratio);
-  for (const { id, path } of blocks) {
-    if (!open.found.current.includes(id)) continue;
-    context.fillStyle = open.found.recordedRoute.includes(id) ? ROUTE : CHANGED;
+function repaint() {
+  if (map) map.version++;
+  draw();
+}
+
+function fillRoute() {
+  for (const { id, path } of blocks.filter((block) => open.found.current.includes(block.id))) {
+    context.fillStyle = open.found.recordedRoute.includes(id) ? COLOURS.route : CHANGED;
     context.fill(path, "evenodd");
   }
-  context.restore();
 }
 
 function drawTicks() {
   const xy = scene.get("expert.xy").data;
-  context.fillStyle = EGO;
+  context.fillStyle = COLOURS.link;
   context.font = "10px system-ui, sans-serif";
-  times().forEach((t, i) => {
+  times.forEach((t, i) => {
     if (Math.abs(t - Math.round(t)) > 0.02 || Math.round(t) % 5) return;
     const [px, py] = panel.toScreen(xy[2 * i], xy[2 * i + 1]);
     context.fillRect(px - 2, py - 2, 4, 4);
@@ -325,83 +291,27 @@ function drawTicks() {
   });
 }
 
-let lastFrame = 0;
-function frame(stamp) {
-  if (!playing) return;
-  now = Math.min(now + (stamp - lastFrame) / 1000, duration());
-  lastFrame = stamp;
-  draw();
-  if (now >= duration()) stop();
-  else requestAnimationFrame(frame);
-}
-
-function play() {
-  if (playing) return stop();
-  if (now >= duration() - 1e-6) now = 0;
-  playing = true;
-  byId("play").textContent = "❚❚";
-  lastFrame = performance.now();
-  requestAnimationFrame(frame);
-}
-
-function stop() {
-  playing = false;
-  byId("play").textContent = "▶";
-}
-
-function step(samples) {
-  stop();
-  const row = Math.min(Math.max(sampleAt(now).row + samples, 0), times().length - 1);
-  now = times()[row];
-  draw();
-}
-
 // ---- controls ----
 
 function zoom(factor, px, py) {
   const [x, y] = panel.toWorld(px, py);
-  view.scale = Math.min(Math.max(view.scale * factor, 0.3), 60);
-  panel.scale = view.scale;
+  state.scale = panel.scale = Math.min(Math.max(state.scale * factor, 0.3), 60);
   const [after, aside] = panel.toWorld(px, py);
-  view.centre = [view.centre[0] + x - after, view.centre[1] + y - aside];
+  state.centre = [state.centre[0] + x - after, state.centre[1] + y - aside];
   draw();
 }
 
-function pointer(event) {
-  const box = canvas.getBoundingClientRect();
-  return [event.clientX - box.left, event.clientY - box.top];
-}
-
-function onDown(event) {
-  const start = [event.clientX, event.clientY];
-  const from = [...view.centre];
-  let dragged = false;
-  const onMove = (e) => {
-    const [dx, dy] = [e.clientX - start[0], e.clientY - start[1]];
-    if (Math.hypot(dx, dy) > CLICK) dragged = true;
-    if (!dragged) return;
-    view.centre = [from[0] - dx / view.scale, from[1] + dy / view.scale];
-    draw();
-  };
-  const onUp = (e) => {
-    window.removeEventListener("pointermove", onMove);
-    window.removeEventListener("pointerup", onUp);
-    const id = dragged ? "" : blockAt(...pointer(e));
+function press(event) {
+  drag(event, panel, () => {}, (moved, up) => {
+    const id = moved ? "" : blockAt(...pointer(up));
     if (id) toggleBlock(id);
-  };
-  window.addEventListener("pointermove", onMove);
-  window.addEventListener("pointerup", onUp);
+  });
 }
 
-function onHover(event) {
-  const tip = byId("tip");
-  const [px, py] = pointer(event);
-  const id = panel && event.buttons === 0 ? blockAt(px, py) : "";
-  tip.hidden = !id;
-  if (!id) return;
-  tip.textContent = `${id} · click to ${open.found.current.includes(id) ? "take out" : "add"}`;
-  tip.style.left = `${px + 14}px`;
-  tip.style.top = `${py + 12}px`;
+function hover(event) {
+  const id = panel && event.buttons === 0 ? blockAt(...pointer(event)) : "";
+  const verb = id && open.found.current.includes(id) ? "take out" : "add";
+  showTip(id && `${id} · click to ${verb}`, pointer(event));
 }
 
 const KEYS = {
@@ -413,9 +323,10 @@ const KEYS = {
   c: () => byId("comment").focus(),
   o: () => keep({ route: null }),
   f: wholeScene,
+  d: toggleTheme,
   " ": play,
-  ArrowLeft: () => step(-1),
-  ArrowRight: () => step(1),
+  ArrowLeft: () => stepBy(-1),
+  ArrowRight: () => stepBy(1),
   "+": () => zoom(1.25, canvas.clientWidth / 2, canvas.clientHeight / 2),
   "-": () => zoom(0.8, canvas.clientWidth / 2, canvas.clientHeight / 2),
 };
@@ -437,25 +348,19 @@ async function start() {
   const first = listing.scenarios.find((row) => row.token === wanted) ||
     listing.scenarios.find(isOpen) || listing.scenarios[0];
   byId("which").value = isOpen(first) ? "open" : "all";
-  for (const [id, key] of [["accept", "a"], ["reject", "r"], ["undo", "u"], ["recorded", "o"], ["play", " "]]) {
+  for (const [id, key] of [["accept", "a"], ["reject", "r"], ["undo", "u"], ["recorded", "o"], ["play", " "], ["theme", "d"]]) {
     byId(id).addEventListener("click", KEYS[key]);
   }
   byId("which").addEventListener("change", showList);
   byId("comment").addEventListener("change", keepComment);
   byId("time").addEventListener("input", (e) => {
-    stop();
-    now = Number(e.target.value);
-    draw();
+    pause();
+    seek(Number(e.target.value));
   });
-  canvas.addEventListener("pointerdown", onDown);
-  canvas.addEventListener("pointermove", onHover);
-  canvas.addEventListener("pointerleave", () => (byId("tip").hidden = true));
-  canvas.addEventListener("wheel", (e) => {
-    e.preventDefault();
-    zoom(e.deltaY < 0 ? 1.15 : 1 / 1.15, ...pointer(e));
-  }, { passive: false });
+  connectCanvas();
   window.addEventListener("keydown", onKey);
   window.addEventListener("resize", layOut);
+  startTheme();
   await open(first.token);
 }
 

@@ -4,9 +4,10 @@ Positions are relative to a whole-metre origin near the scene, so that quantised
 
 A page holds sections of them as text: base64 of a zlib stream of the length of the JSON header
 (uint32, little endian), the header (a list of fields), and the fields' bytes one after the other. A
-quantised field holds int32 differences along its first axis as four byte planes, least significant
-first: neighbouring samples differ little, so that three of the planes are nearly constant.
-`codec.js` reads it.
+quantised field holds second differences along its first axis, one series after the other, as int32
+with the sign in the lowest bit and in four byte planes, least significant first: smooth motion
+leaves small numbers, and three planes nearly constant. A field with a base holds what is to be
+added to the first rollout's, as most traffic is the same in all rollouts. `codec.js` reads it.
 """
 
 import base64
@@ -301,13 +302,9 @@ def describe_violations(item: ShownRollout) -> list[dict[str, Any]]:
         {
             "metric": one.row["metric"],
             "short": one.short,
-            "multiplier": one.is_multiplier,
             "t": one.time,
-            "value": _finite(one.row["first_violation_value"]),
-            "threshold": _finite(one.row["threshold"]),
-            "unit": one.row["unit"],
+            "threshold": one.row["threshold"] if np.isfinite(one.row["threshold"] or 0.0) else None,
             "partner": one.row["partner_token"],
-            "score": one.row["score"],
             "words": violation_words(one.row, item.log.tracks),
         }
         for one in violations(item.metrics)
@@ -345,11 +342,6 @@ def _describe_fork(item: ShownRollout, styles: Mapping[str, Style]) -> dict[str,
         branches.append({"name": one.name, "hit": hit, "words": words, **style})
     start = item.fork.start
     return {"t": float(seconds[start]), "row": start, "branches": branches}
-
-
-def _finite(value: float | None) -> float | None:
-    """JSON has no infinity."""
-    return value if value is not None and np.isfinite(value) else None
 
 
 def map_lines(
@@ -410,29 +402,44 @@ def _lines(lines: list[FloatArray], box: FloatArray) -> list[FloatArray]:
     return [coords for part in found.values() if len(coords := shapely.get_coordinates(part)) > 1]
 
 
-def pack(fields: Mapping[str, Quantised | np.ndarray]) -> str:
-    """One section: quantised arrays, and byte arrays (bool or uint8) as they are."""
-    header = []
-    chunks = []
+def pack(fields: Fields, base: Fields | None = None) -> str:
+    """One section: quantised arrays, and byte arrays (bool or uint8) as they are.
+
+    What is quantised is stored as its difference from the array of its name and shape in `base`,
+    the fields of the first rollout, where that is shorter.
+    """
+    header, chunks = [], []
     for name, value in fields.items():
+        about = {"name": name, "step": 0.0}
         if isinstance(value, Quantised):
-            shape, step = value.values.shape, value.step
-            chunks.append(_planes(value))
+            steps, other = _steps(value), (base or {}).get(name)
+            ways = [_planes(steps)]
+            if isinstance(other, Quantised) and other.values.shape == steps.shape:
+                ways.append(_planes(steps - _steps(other)))
+            chunk = min(ways, key=lambda planes: len(zlib.compress(planes)))
+            about |= {"step": value.step, "base": chunk is not ways[0]}
         else:
-            shape, step = value.shape, 0.0
-            chunks.append(np.ascontiguousarray(value, np.uint8).tobytes())
-        header.append({"name": name, "shape": list(shape), "step": step})
+            steps = np.ascontiguousarray(value, np.uint8)
+            chunk = steps.tobytes()
+        chunks.append(chunk)
+        header.append(about | {"shape": list(steps.shape)})
     text = json.dumps(header, separators=(",", ":")).encode()
     body = len(text).to_bytes(4, "little") + text + b"".join(chunks)
     return base64.b64encode(zlib.compress(body, 9)).decode("ascii")
 
 
-def _planes(field: Quantised) -> bytes:
+def _steps(field: Quantised) -> np.ndarray:
     missing = np.isnan(field.values)
     scaled = np.rint(np.where(missing, 0.0, field.values) / field.step)
     steps = np.clip(scaled, -_LARGEST, _LARGEST).astype(np.int64)
     steps[missing] = MISSING
-    if len(steps) > 1:
-        steps[1:] -= steps[:-1].copy()
-    wrapped = (steps & 0xFFFFFFFF).astype("<u4")
-    return wrapped.reshape(-1, 1).view(np.uint8).T.tobytes()
+    return steps
+
+
+def _planes(steps: np.ndarray) -> bytes:
+    steps = steps.copy()
+    steps[1:] -= steps[:-1].copy()
+    steps[2:] -= steps[1:-1].copy()
+    wrapped = np.moveaxis(steps, 0, -1).astype(np.int32)
+    signed = ((wrapped << 1) ^ (wrapped >> 31)).astype("<i4")
+    return signed.reshape(-1, 1).view(np.uint8).T.tobytes()

@@ -8,10 +8,40 @@ function readColours() {
   const style = getComputedStyle(document.documentElement);
   const names =
     "ground walkway drivable route crosswalk stop boundary centre vehicle pedestrian bicycle " +
-    "object edge edged edited alarm alarm-ink partner paper glass ink soft line recorded";
+    "object edge edged edited alarm alarm-ink partner paper glass ink soft line recorded link";
   for (const name of names.split(" ")) COLOURS[name] = style.getPropertyValue(`--${name}`).trim();
 }
 readColours();
+
+const isDark = () => document.documentElement.dataset.theme === "dark";
+
+// the page's `repaint` draws everything in the colours of a theme
+function setTheme(dark) {
+  document.documentElement.dataset.theme = dark ? "dark" : "light";
+  readColours();
+  repaint();
+}
+
+function toggleTheme() {
+  setTheme(!isDark());
+  try {
+    localStorage.setItem("shiftsim-theme", isDark() ? "dark" : "light");
+  } catch {
+    // a page inside a notebook keeps nothing
+  }
+}
+
+function startTheme() {
+  let wanted = null;
+  try {
+    wanted = localStorage.getItem("shiftsim-theme");
+  } catch {
+    // nothing is kept here
+  }
+  const prefersDark = window.matchMedia("(prefers-color-scheme: dark)");
+  setTheme(wanted ? wanted === "dark" : prefersDark.matches);
+  prefersDark.addEventListener("change", () => setTheme(prefersDark.matches));
+}
 
 function luminance(colour) {
   const part = (i) => {
@@ -35,6 +65,7 @@ const agentColour = (kind) => COLOURS[["vehicle", "pedestrian", "bicycle"][kind]
 const KIND_NAMES = ["vehicle", "pedestrian", "bicycle", "cone", "barrier", "sign", "object"];
 const LIGHT_COLOURS = [null, "#1f9d4d", "#d9a400", "#d02a1e", null]; // absent, green, yellow, red, unknown
 const LIGHT = 0.31; // luminance of what stands 3 : 1 from the route on a dark page
+const SHADE = 0.11; // luminance of what stands 3 : 1 from the route on a light page
 const CACHE_MARGIN = 0.35; // share of the view around it that the cached map also covers
 
 // Path2D of a layer in world coordinates; rings of one layer fill by the even-odd rule
@@ -256,21 +287,40 @@ function drawLights(context, fields, panel, at) {
   context.globalAlpha = 0.75;
   for (let i = 0; i < shape[1]; i++) {
     const colour = LIGHT_COLOURS[data[at.row * shape[1] + i]];
-    if (colour) strokeLine(context, xy, vertex, vertex + counts[i], panel, colour);
+    context.strokeStyle = colour;
+    if (colour) traceLine(context, xy, vertex, vertex + counts[i], panel);
+    if (colour) context.stroke();
     vertex += counts[i];
   }
   context.globalAlpha = 1;
 }
 
-function strokeLine(context, xy, first, stop, panel, colour) {
+function traceLine(context, xy, first, stop, panel) {
   context.beginPath();
   for (let i = first; i < stop; i++) {
     const [px, py] = panel.toScreen(xy[2 * i], xy[2 * i + 1]);
     if (i === first) context.moveTo(px, py);
     else context.lineTo(px, py);
   }
+}
+
+// the line that was traced; on a light page a bright colour, which the road would swallow, is edged
+// unless it is drawn faint
+function strokeEdged(context, colour) {
+  const width = context.lineWidth;
+  if (!isDark() && context.globalAlpha === 1 && luminance(colour) > SHADE) {
+    context.lineWidth = width + 3;
+    context.strokeStyle = COLOURS.edge;
+    context.stroke();
+  }
+  context.lineWidth = width;
   context.strokeStyle = colour;
   context.stroke();
+}
+
+function strokeLine(context, xy, first, stop, panel, colour) {
+  traceLine(context, xy, first, stop, panel);
+  strokeEdged(context, colour);
 }
 
 // the driven path: what is past strong, what is to come faint
@@ -346,7 +396,7 @@ function drawEgo(context, pose, vehicle, panel, colour, filled, dash = []) {
     context.globalAlpha = 1;
   }
   context.setLineDash(dash);
-  context.stroke();
+  strokeEdged(context, colour);
   context.setLineDash([]);
   const [x, y, heading] = pose;
   const tip = panel.toScreen(x + front * Math.cos(heading), y + front * Math.sin(heading));

@@ -25,7 +25,7 @@ def rows(**wanted):
 def test_where_nothing_is_there_every_row_names_what_to_get(place):
     found = inventory.list_available_data()
     assert found["stores"] == []
-    assert len(found["rows"]) == 25
+    assert len(found["rows"]) == 26
     [row] = rows(track="state-drift", planner="diffusion-planner")
     assert [lack["what"] for lack in row["missing"]] == [
         "Val14 (1118 scenarios)",

@@ -61,6 +61,15 @@ class Page:
         self.browser.get(address)
         self.wait(ready)
 
+    def prefer(self, mode):
+        """Let the browser ask for light or dark pages, until the end of the test."""
+        self.emulate(features=[{"name": "prefers-color-scheme", "value": mode}])
+
+    def emulate(self, media="", features=()):
+        """What the page is shown on, such as `print`."""
+        values = {"media": media, "features": list(features)}
+        self.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", values)
+
     def run(self, script):
         """Value of an expression in the page."""
         return self.browser.execute_script(f"return {script}")
@@ -118,4 +127,5 @@ def page(chromium):
     """The browser as one page; errors on its console fail the test."""
     out = Page(chromium)
     yield out
+    out.emulate()
     assert out.complaints() == []

@@ -95,6 +95,22 @@ class TestMatrix:
         assert listing.text("count") == "4 of 12 rollouts"
         assert pressed(listing) == [["", "none"]]
 
+    def test_the_address_keeps_the_filter(self, listing):
+        cell(listing, "log-future", "ou-high").click()
+        listing.browser.find_element("id", "find").send_keys("0001")
+        listing.wait("byId('count').textContent === '1 of 12 rollouts'")
+        address = listing.browser.current_url
+        assert address.endswith("#planner=log-future&noise=ou-high&find=0001")
+
+        listing.open(address)
+
+        assert listing.text("count") == "1 of 12 rollouts"
+        assert pressed(listing) == [["log-future", "ou-high"]]
+        listing.browser.find_element("id", "find").clear()
+        cell(listing, "log-future", "ou-high").click()
+        assert listing.text("count") == "12 of 12 rollouts"
+        assert listing.browser.current_url.endswith("#")
+
     def test_no_mean_is_shown_where_rollouts_have_no_score(self, page, tmp_path):
         lost = made_row(3, cls=None, failed="failed: boom", violated={}, at=None)
         other = made_row(4, planner="simple")
@@ -215,15 +231,13 @@ class TestRows:
 @pytest.mark.parametrize("mode", ["light", "dark"])
 @pytest.mark.parametrize("size", [DESK, TABLET, PHONE])
 def test_the_page_fits_every_window_and_can_be_read(page, folder, size, mode, tmp_path):
-    scheme = [{"name": "prefers-color-scheme", "value": mode}]
-    page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
+    page.prefer(mode)
 
     page.open((folder / "index.html").as_uri(), size)
 
     assert page.run("document.documentElement.scrollWidth") <= size[0]
     assert page.run(FAINT) == []
     page.shoot(tmp_path / "list.png")
-    page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
 
 
 def test_rows_are_cards_on_a_phone(page, folder):

@@ -66,10 +66,8 @@ def test_progress_grows_and_the_last_state_stays(page, watched, size, tmp_path):
     watched.thread.join()
 
     for mode in ("light", "dark"):
-        scheme = [{"name": "prefers-color-scheme", "value": mode}]
-        page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
+        page.prefer(mode)
         assert page.run(FAINT) == []
-    page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
     page.shoot(tmp_path / "finished.png")
     assert "finished" in page.text("state")
     assert page.run("document.querySelectorAll('#scores tbody tr').length") == 2

@@ -2,7 +2,9 @@ import json
 from dataclasses import replace
 from itertools import pairwise
 
+import numpy as np
 import pytest
+from pages import sections, unpack
 from stores import write_toy_store
 from worlds import cruise_scenario, standing_tracks
 
@@ -398,6 +400,33 @@ def test_hostile_texts_stay_texts(page, tmp_path):
     assert HOSTILE in page.text("token")
     assert page.run("document.title") != "owned"
     assert page.run("document.images.length") == 0
+
+
+def test_each_rollout_is_read_as_it_was_packed_also_where_it_is_stored_from_the_first(
+    page, tmp_path
+):
+    bare = cruise_scenario()
+    cars = standing_tracks(len(bare.time_us), [[30.0, 0.0, 0.0], [0.0, 4.0, 1.0]], [1, 0])
+    scene = replace(bare, tracks=replace(cars, velocities=cars.velocities + 2.0))
+    names = ("constant-velocity", "idm", "idm")
+    logs = [simulate(scene, load_planner(name), traffic="reactive") for name in names]
+    logs[2].plans[5:, 3:] = np.nan
+    text = replay_page(
+        scene, [ShownRollout(n, "none", 0, one) for n, one in zip(names, logs, strict=True)]
+    )
+    file = tmp_path / "page.html"
+    file.write_text(text, "utf-8")
+    page.open(file.as_uri() + "#on=3")
+    parts = sections(text)
+    for index, section in enumerate(("rollout0", "rollout2", "scene")):
+        held = ("rollouts[0]", "rollouts[2]", "scene")[index]
+        for name, values in unpack(parts[section], parts["rollout0"]).items():
+            data = page.run(f"[...{held}.get({name!r}).data]")
+            expected = np.ravel(values).astype(np.float32)
+            np.testing.assert_array_equal(np.array(data, float), expected, name)
+    assert page.run("rollouts[1]") is None  # nothing of it was asked for
+    with pytest.raises(TypeError):
+        unpack(parts["rollout2"])  # some of it is stored from the first
 
 
 def test_a_notebook_frame_plays(page, folder, tmp_path):

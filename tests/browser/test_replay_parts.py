@@ -222,6 +222,20 @@ def over(colour, ground):
     return "#" + "".join(f"{value:02x}" for value in mixed)
 
 
+# colours of the pixels across a path of a colour on a ground
+ACROSS_A_PATH = """(() => {
+  const pen = document.createElement("canvas").getContext("2d", { willReadFrequently: true });
+  pen.fillStyle = "%(ground)s";
+  pen.fillRect(0, 0, 40, 40);
+  const colour = isDark() ? lightened("%(colour)s") : "%(colour)s";
+  const panel = { toScreen: (x, y) => [x, y] };
+  drawPath(pen, [0, 20.5, 40, 20.5], { row: 1 }, panel, colour, [], 1.8);
+  const hex = (value) => value.toString(16).padStart(2, "0");
+  const at = (y) => [...pen.getImageData(20, y, 1, 1).data].slice(0, 3).map(hex).join("");
+  return [...Array(40).keys()].map((y) => `#${at(y)}`);
+})()"""
+
+
 class TestColours:
     @pytest.mark.parametrize("theme", ["light", "dark"])
     def test_what_carries_meaning_stands_out(self, replay, theme):
@@ -245,17 +259,20 @@ class TestColours:
         assert contrast(c["drivable"], c["ground"]) >= 1.35
         assert contrast(c["route"], c["drivable"]) >= 1.3
 
-    def test_planners_stand_out_from_the_dark_road(self, replay):
-        replay.run("setTheme(true)")
+    @pytest.mark.parametrize("theme", ["light", "dark"])
+    def test_paths_of_planners_stand_out_from_the_road(self, replay, theme):
+        replay.run(f"setTheme({str(theme == 'dark').lower()})")
+        road = replay.run("COLOURS.drivable")
         for style in (*_KNOWN.values(), *_OTHERS):
-            drawn = replay.run(f"lightened({style.colour!r})")
-            route = over(replay.run("COLOURS.route"), replay.run("COLOURS.drivable"))
-            assert contrast(drawn, route) >= 3.0, style
+            for ground in (road, over(replay.run("COLOURS.route"), road)):
+                drawn = replay.run(ACROSS_A_PATH % {"ground": ground, "colour": style.colour})
+                assert max(contrast(one, ground) for one in drawn) >= 3.0, (style, ground)
+                if theme == "light":  # its own colour is seen, on a dark edge where it is bright
+                    assert drawn[20] == style.colour
 
     def test_the_page_follows_the_system_and_the_key_turns_it(self, replay):
         assert replay.run("document.documentElement.dataset.theme") == "light"
-        media = [{"name": "prefers-color-scheme", "value": "dark"}]
-        replay.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": media})
+        replay.prefer("dark")
         replay.wait("isDark()")
         dark = replay.pixels()
 
@@ -264,7 +281,6 @@ class TestColours:
         assert not replay.run("isDark()")
         assert replay.pixels() != dark
         replay.browser.execute_script("localStorage.clear()")
-        replay.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
 
 
 def test_each_noise_is_one_curve_with_steering_beside(replay):

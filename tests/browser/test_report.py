@@ -169,19 +169,18 @@ def test_the_best_of_each_setting_is_bold(page, folder):
 @pytest.mark.parametrize("name", ["one/report.html", "site/index.html"])
 @pytest.mark.parametrize("mode", ["light", "dark"])
 def test_a_report_can_be_read(page, folder, name, mode):
-    scheme = [{"name": "prefers-color-scheme", "value": mode}]
-    page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
+    page.prefer(mode)
     page.open((folder / name).as_uri(), ready=LOADED)
     assert page.run(FAINT) == []
-    page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+    ground = page.run("getComputedStyle(document.body).backgroundColor.match(/\\d+/)[0]")
+    assert (int(ground) < 60) == (mode == "dark")
 
 
 def test_printed_no_table_of_a_report_is_cut_off(page, folder):
     page.open((folder / "site" / "index.html").as_uri(), ready=LOADED)
-    page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    page.emulate("print")
     boxes = "[...document.querySelectorAll('.report .wide')]"
     assert set(page.run(f"{boxes}.map((box) => getComputedStyle(box).overflowX)")) == {"visible"}
-    page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
 
 
 def test_a_click_on_the_citation_selects_all_of_it(page, folder):

@@ -76,6 +76,28 @@ def test_the_list_has_thumbnail_city_and_why_the_filter_dropped_a_scenario(page,
     assert faint == []  # but for buttons that cannot be used now
 
 
+@pytest.mark.parametrize("mode", ["light", "dark"])
+def test_it_can_be_read_as_the_system_has_it_and_by_its_key(page, store, mode):
+    page.prefer(mode)
+    faint = f"{FAINT}.filter((text) => !/ (recorded route|undo|[uo])$/.test(text))"
+    with reviewing(store) as server:
+        page.open(server.address)
+        page.run("byId('which').value = 'all'")
+        grounds, drawn = [], []
+        for _ in range(2):  # the system's, and the other one
+            page.press("r")  # what was decided has a ground of its own
+            page.wait(f"document.getElementById('token').textContent === {SECOND!r}")
+            page.press("b")
+            page.wait("document.getElementById('reject').classList.contains('on')")
+            assert page.run(faint) == []
+            grounds.append(page.run("luminance(COLOURS.paper) > 0.5"))
+            drawn.append(page.pixels())
+            page.press("u", "d")
+            page.wait("!document.getElementById('reject').classList.contains('on')")
+    assert grounds == [mode == "light", mode != "light"]
+    assert drawn[0] != drawn[1]
+
+
 def test_on_a_phone_the_list_is_a_strip_above_the_scene(page, server):
     page.open(server.address, (390, 844))
 
@@ -178,6 +200,6 @@ def test_play_moves_the_recording(desk):
     before = desk.pixels()
 
     desk.press(" ")
-    desk.wait("now > 0.2")
+    desk.wait("state.t > 0.2")
 
     assert desk.pixels() != before

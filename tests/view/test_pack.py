@@ -23,6 +23,25 @@ def test_a_quantised_field_comes_back_within_half_a_step(values, step):
     np.testing.assert_allclose(found, values, rtol=1e-9, atol=0.51 * step)
 
 
+@given(
+    hnp.arrays(np.float64, (2, 5, 3), elements=st.one_of(st.floats(-1e6, 1e6), st.just(np.nan))),
+    st.floats(-0.04, 0.04),
+)
+def test_what_is_stored_from_another_section_comes_back_as_exactly(both, much):
+    first, other = both[0], np.where(np.arange(5)[:, None] < 3, both[0], both[1] + much)
+    base, alone = {"field": Quantised(first, 0.01)}, {"field": Quantised(other, 0.01)}
+
+    found = unpack(pack(alone, base), pack(base))["field"]
+
+    np.testing.assert_array_equal(found, unpack(pack(alone))["field"])
+
+
+def test_what_another_section_holds_takes_no_room(rng):
+    field = {"field": Quantised(rng.uniform(-80, 80, (150, 60)), 0.01)}
+
+    assert len(pack(field, field)) < 0.02 * len(pack(field))
+
+
 def test_bytes_come_back_as_they_are_between_quantised_fields():
     flags = np.array([[True, False], [False, True], [True, True]])
 

@@ -216,6 +216,24 @@ def test_sixty_agents_take_less_than_the_promised_room(rng):
     assert len(page) < 400_000
 
 
+def test_four_rollouts_with_traffic_of_their_own_take_less_than_the_promised_room(rng):
+    bare = cruise_scenario()
+    still = standing_tracks(len(bare.time_us), rng.uniform(-60, 60, (60, 3)), [0] * 60)
+    driven = np.cumsum(np.cumsum(rng.normal(0, 0.02, (len(bare.time_us), 60, 3)), axis=0), axis=0)
+    crowded = replace(bare, tracks=replace(still, poses=still.poses + driven))
+    items = []
+    for number in range(4):
+        item = shown(crowded, noise="ou-high", seed=number)
+        tracks = item.log.tracks.copy()
+        tracks.poses[40:, number] += np.cumsum(rng.normal(0, 0.1, tracks.poses[40:, 0].shape), 0)
+        items.append(replace(item, log=replace(item.log, tracks=tracks)))
+
+    page = replay_page(crowded, items)
+
+    assert json.loads(sections(page)["meta"])["ownTracks"]
+    assert len(page) < 150_000
+
+
 @pytest.fixture
 def gallery(clean_run, toy):
     return Gallery([clean_run], open_store(toy))
