@@ -246,8 +246,12 @@ class Rollout:
         self._ego[self._start : self._start + snapshot.iteration + 1] = snapshot.ego
         self._commands[past], self._seconds[past] = snapshot.commands, snapshot.planning_seconds
         self._degraded[past] = snapshot.degraded
-        for row in range(self._start + self.iteration, self._start + snapshot.iteration):
-            self._traffic.step(self.iteration, self._ego[row], self._tracks, row + 1)
+        begin, end = self._start + self.iteration, self._start + snapshot.iteration
+        if steps := getattr(self._traffic, "steps", None):
+            steps(self.iteration, self._ego[begin:end], self._tracks, begin + 1)
+        for row in range(begin, end):
+            if steps is None:
+                self._traffic.step(self.iteration, self._ego[row], self._tracks, row + 1)
             self._go_on()
 
     def _require_truth(self) -> None:

@@ -200,7 +200,7 @@ class _Start:
         status = follow_plans(*times, states, noise, NUPLAN, driven, commands)
         raise_for_status(int(status), int(times[0][0]), times[1])
         if self.is_replayed and follow == steps:
-            return self._rated(driven, [self.rollout], np.full(len(plans), "", object))
+            return self._rated(driven, [], np.full(len(plans), "", object))
         forks, errors = self._forks(driven[:, 1:], commands)
         if follow < steps:
             self._drive_on(forks, errors, planner, steps - follow)
@@ -258,7 +258,7 @@ class _Start:
                 errors[number] = str(result)
 
     def _rated(self, driven: FloatArray, worlds: list[Rollout], errors: np.ndarray) -> Branches:
-        """Parts of all branches, in one world or in one each."""
+        """Parts of all branches, in one world each, or in the recorded one."""
         now, count = self.snapshot.iteration, driven.shape[1]
         observation, road = self.rollout.observe(), self.scenario.map
         planner = PdmClosed(map_radius=navsim.RADIUS, lateral_offsets=())
@@ -266,24 +266,21 @@ class _Start:
         place = planner.look(observation)[0].place
         ground = navsim.ground_around(road, place, observation.ego.center)
         ego, lights = observation.history.ego, self.scenario.iteration_rows[now : now + count]
-        dark = _around(self.rollout.log().tracks.rows(slice(now, now + 1)), ego[-1])
-        lit = navsim.with_lights(dark, self.scenario, lights, 1)
+        # beyond what was driven only a recording is known
+        known = slice(now, now + count + (_TTC if self.is_replayed else 0))
+        around = [_around(one.log().tracks.rows(known), ego[-1]) for one in (self.rollout, *worlds)]
+        lit = navsim.with_lights(around[0], self.scenario, lights, 1)
         tables = [
             {name: np.full(len(driven), np.nan) for name in names} for names in (PARTS, FIRST)
         ]
-        # beyond what was driven only a recording is known
-        known = count + (_TTC if self.is_replayed else 0)
-        for number, world in enumerate(worlds):
-            rows = slice(None) if world is self.rollout else slice(number, number + 1)
-            if any(errors[rows]):
-                continue
-            around = _around(world.log().tracks.rows(slice(now, now + known)), ego[-1])
-            around = around._replace(connectors=lit.connectors, red=lit.red)
+        good = np.flatnonzero(errors == "")
+        if len(good):
             past = np.ascontiguousarray(ego[-1 - _PAST : -1])
-            parts = navsim.evaluate(driven[rows], ground, around, "v2", past)
-            for table, found in zip(tables, (parts, _first_steps(parts, around)), strict=True):
+            own = tuple(around[1 + number] for number in good if worlds)
+            parts = navsim.evaluate(driven[good], ground, lit, "v2", past, own)
+            for table, found in zip(tables, (parts, _first_steps(parts, lit)), strict=True):
                 for name, column in table.items():
-                    column[rows] = found[name]
+                    column[good] = found[name]
         driven[errors != ""] = np.nan
         return Branches(states=driven, parts=tables[0], first=tables[1], errors=errors)
 
