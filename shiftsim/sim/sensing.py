@@ -225,21 +225,17 @@ def ar1(normals: FloatArray, tau: float) -> FloatArray:
     return normals
 
 
-class Latency:
-    """Plans on their way: each is followed some steps after it was made."""
+def first_plans(milliseconds: int, past: FloatArray, now_us: int) -> deque[Plan]:
+    """Those under way at first: keep speed and curvature of the past (H, 11), the present last."""
+    steps = milliseconds // DT_MS
+    return deque[Plan]([coasting(past, now_us, steps + _COAST)] * steps)
 
-    def __init__(self, milliseconds: int, past: FloatArray, now_us: int) -> None:
-        """Begin with the plan to keep speed and curvature of the past (H, 11), the present last."""
-        steps = milliseconds // DT_MS
-        self._waiting = deque[Plan]([coasting(past, now_us, steps + _COAST)] * steps)
 
-    def exchange(self, plan: Plan, next_us: int) -> Plan:
-        """The plan that is followed until `next_us`, as this one is made."""
-        if not self._waiting:
-            return plan
-        self._waiting.append(plan)
-        plan = self._waiting.popleft()
-        return plan if isinstance(plan, Command) else _reaching(plan, next_us)
+def exchange(waiting: deque[Plan], plan: Plan, next_us: int) -> Plan:
+    """The plan that is followed until `next_us`, of those under way, as this one is made."""
+    waiting.append(plan)
+    plan = waiting.popleft()
+    return plan if isinstance(plan, Command) else _reaching(plan, next_us)
 
 
 def _reaching(plan: Trajectory, time_us: int) -> Trajectory:

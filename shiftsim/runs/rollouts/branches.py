@@ -47,7 +47,9 @@ from shiftsim.world.state import (
     LAST_AGENT_KIND,
     NUM_STATE,
     PACIFICA,
+    Command,
     Tracks,
+    Trajectory,
     X,
     Y,
     center_poses,
@@ -169,7 +171,7 @@ class _Start:
         self.setting = setting or snapshot.setting
         if self.setting.controller != "lqr":
             raise ConfigError(f"branches need the controller 'lqr', not {self.setting.controller}")
-        self.rollout = Rollout(scenario, ConstantVelocity(), self.setting)
+        self.rollout = Rollout(scenario, ConstantVelocity(), self.setting).fork()
         self.rollout.resume(snapshot)
         # whether the others do the same whatever the ego does
         named, script = self.setting.traffic, scenario.script
@@ -196,12 +198,21 @@ class _Start:
         driven = np.empty((len(plans), follow + 1, NUM_STATE))
         driven[:, 0] = ego
         times = log.time_us[now : now + follow + 1], plan_us.astype(np.int64)
+        if late := min(len(self.snapshot.plans), follow):  # what all do before their plans arrive
+            before = self.rollout.fork()
+            for _ in range(late):
+                before.advance(Command(0.0, 0.0))  # is not followed any more
+            driven[:, : late + 1] = before.log().ego[now : now + late + 1]
+            commands[:, :late] = before.log().commands[now : now + late]
         noise = log.noise[now : now + follow]
-        status = follow_plans(*times, states, noise, NUPLAN, driven, commands)
+        status = follow_plans(*times, states, late, noise, NUPLAN, driven, commands)
         raise_for_status(int(status), int(times[0][0]), times[1])
         if self.is_replayed and follow == steps:
             return self._rated(driven, [], np.full(len(plans), "", object))
-        forks, errors = self._forks(driven[:, 1:], commands)
+        waiting = [
+            (*self.snapshot.plans[follow:], *[Trajectory(times[1], plan)] * late) for plan in states
+        ]
+        forks, errors = self._forks(driven[:, 1:], commands, waiting)
         if follow < steps:
             self._drive_on(forks, errors, planner, steps - follow)
         out = np.full((len(plans), steps + 1, NUM_STATE), np.nan)
@@ -224,7 +235,9 @@ class _Start:
                 hint="drive fewer steps, or let a planner go on: follow=…, planner=…",
             )
 
-    def _forks(self, driven: FloatArray, commands: FloatArray) -> tuple[list[Rollout], np.ndarray]:
+    def _forks(
+        self, driven: FloatArray, commands: FloatArray, waiting: Sequence[Any]
+    ) -> tuple[list[Rollout], np.ndarray]:
         """A rollout of each branch, in which the others have seen what it drove."""
         forks, errors, before = [], np.full(len(driven), "", object), self.snapshot
         for number, (states, sent) in enumerate(zip(driven, commands, strict=True)):
@@ -235,6 +248,7 @@ class _Start:
                 commands=np.concatenate([before.commands, sent]),
                 planning_seconds=np.append(before.planning_seconds, np.zeros(len(sent))),
                 degraded=np.append(before.degraded, np.zeros(len(sent), np.bool_)),
+                plans=waiting[number],
             )
             try:
                 fork.resume(more)
@@ -328,9 +342,10 @@ def follow_plans(
     time_us: IntArray,  # (S + 1,) time stamps, from now on [us]
     plan_us: IntArray,  # (H,) those of the poses of plans [us]
     plans: FloatArray,  # (K, H, 11) states of plans; only the poses are read
+    first: int,  # the step at which they are there; states before are given
     noise: FloatArray,  # (S, 2) of the commands
     params: LqrParameters,
-    states: FloatArray,  # (K, S + 1, 11) the first ones are there; receives the others
+    states: FloatArray,  # (K, S + 1, 11) receives those after that step
     commands: FloatArray,  # (K, S, 2) receives the commands before noise
 ) -> int:
     """What `track_and_step` does step by step, for many plans that are not made anew.
@@ -343,7 +358,7 @@ def follow_plans(
     dt, target, ahead = params.step_us / 1e6, np.empty(plans.shape[2]), np.empty(params.horizon)
     for row in range(len(plans)):
         speeds, curvatures = fit_profiles(plan_us, plans[row], params)
-        for step in range(len(noise)):
+        for step in range(first, len(noise)):
             now, state = time_us[step] * 1e-6, states[row, step]
             if not interpolate(plan_us, plans[row], time_us[step], target):
                 return NOT_COVERED
