@@ -56,9 +56,8 @@ def mine(
     """
     one_of("kind", kind, KINDS)
     if run.manifest.get("edits"):
-        raise ConfigError(
-            f"run {run.path.name!r} drove edited scenarios", "mine a run of recorded ones"
-        )
+        hint = "an edit has no second beginning: run without --edits, and mine that run"
+        raise ConfigError(f"run {run.path.name!r} drove edited scenarios", hint)
     window = before + AFTER if window is None else window
     edits = list(_edits(run, kind, before, window, planner))
     if not edits:
