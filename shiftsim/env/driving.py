@@ -7,7 +7,7 @@ infraction: a corner of the ego off the road, or a collision of the moving ego.
 import signal
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cache, partial
 from multiprocessing import TimeoutError as NoAnswerError
 from multiprocessing.connection import wait
@@ -117,14 +117,10 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         if missing or not self._tokens:
             what = f"lacks {len(missing)} of the split {split!r}" if missing else "has no scenarios"
             raise DataError(f"store {str(store)!r} {what}", hint="choose another store or split")
+        named = traffic_name(traffic) if isinstance(traffic, str) else deepcopy(traffic)
         drift = make_drift(noise, perception, localization, latency)
-        self._setting = Setting(
-            noise=drift.noise,
-            traffic=traffic_name(traffic) if isinstance(traffic, str) else deepcopy(traffic),
-            perception=drift.perception,
-            localization=drift.localization,
-            latency=drift.latency,
-        )
+        models: Any = {item.name: getattr(drift, item.name) for item in fields(drift)}
+        self._setting = Setting(traffic=named, **models)
         if isinstance(traffic, str):
             make_traffic(traffic)
         if isinstance(observation, str):

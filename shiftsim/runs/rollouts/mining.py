@@ -77,9 +77,8 @@ def _edits(
     store, traffic = open_run_store(run), run.manifest["determining"]["traffic"]
     for row in run.metrics.to_pylist():
         at = row["first_violation_iteration"]
-        if row["metric"] != KINDS[kind] or at is None or row["score"] == 1.0:
-            continue
-        if planner and row["planner"] != planner:
+        is_wrong = row["metric"] == KINDS[kind] and at is not None and row["score"] != 1.0
+        if not is_wrong or planner not in ("", row["planner"]):
             continue
         task = Task(*(row[name] for name in Task._fields))
         scenario = store.read(task.token)
