@@ -252,10 +252,10 @@ class Rollout:
         self._commands[past], self._seconds[past] = snapshot.commands, snapshot.planning_seconds
         self._degraded[past] = snapshot.degraded
         begin, end = self._start + self.iteration, self._start + snapshot.iteration
-        if steps := getattr(self._traffic, "steps", None):
-            steps(self.iteration, self._ego[begin:end], self._tracks, begin + 1)
+        if step_many := getattr(self._traffic, "step_many", None):
+            step_many(self.iteration, self._ego[begin:end], self._tracks, begin + 1)
         for row in range(begin, end):
-            if steps is None:
+            if step_many is None:
                 self._traffic.step(self.iteration, self._ego[row], self._tracks, row + 1)
             self._go_on()
 

@@ -134,24 +134,17 @@ def branch(
     """
     plans = np.asarray(plans, np.float64)
     if isinstance(snapshot, Snapshot):
-        found = [_Start(snapshot, store, setting).branch(plans, steps, spacing, follow, planner)]
-        return _joined(found, squeeze=True)
+        return _Start(snapshot, store, setting).branch(plans, steps, spacing, follow, planner)
     if len(plans) != len(snapshot) or not len(plans):
         raise ConfigError(f"{len(snapshot)} snapshots, and plans for {len(plans)} of them")
     starts = (_Start(one, store, setting) for one in snapshot)
     pairs = zip(starts, plans, strict=True)
-    return _joined([one.branch(own, steps, spacing, follow, planner) for one, own in pairs])
-
-
-def _joined(found: Sequence[Branches], *, squeeze: bool = False) -> Branches:
-    def join(arrays: list[np.ndarray]) -> Any:
-        return arrays[0] if squeeze else np.stack(arrays)
-
+    found = [one.branch(own, steps, spacing, follow, planner) for one, own in pairs]
     return Branches(
-        states=join([one.states for one in found]),
-        parts={name: join([one.parts[name] for one in found]) for name in PARTS},
-        first={name: join([one.first[name] for one in found]) for name in FIRST},
-        errors=join([one.errors for one in found]),
+        states=np.stack([one.states for one in found]),
+        parts={name: np.stack([one.parts[name] for one in found]) for name in PARTS},
+        first={name: np.stack([one.first[name] for one in found]) for name in FIRST},
+        errors=np.stack([one.errors for one in found]),
     )
 
 

@@ -133,9 +133,9 @@ class IdmTraffic:
         Raises:
             TrafficError: An agent is outside of its own corridor.
         """
-        self.steps(iteration, ego[None], tracks, row)
+        self.step_many(iteration, ego[None], tracks, row)
 
-    def steps(self, iteration: int, egos: FloatArray, tracks: Tracks, row: int) -> None:
+    def step_many(self, iteration: int, egos: FloatArray, tracks: Tracks, row: int) -> None:
         """Several steps, with the ego states (S, 11) at their beginnings; else as `step`."""
         scene, rows = self._scene, row_of(tracks, slice(None))
         if scene is None:
