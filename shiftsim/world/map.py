@@ -145,5 +145,5 @@ class VectorMap:
 
 
 # makes a function of arrays that depend on the map only: they are built once per map, and kept for
-# the latest ones: towns are many, but small
-PerMap = lru_cache(maxsize=256)
+# the latest few, as a run rarely visits more maps at a time
+PerMap = lru_cache(maxsize=4)
