@@ -21,7 +21,7 @@ from shiftsim.metrics.result import NUPLAN
 from shiftsim.planners.pdm.forecast import ring_of
 from shiftsim.planners.pdm.planner import PdmClosed
 from shiftsim.planners.pdm.rollout import roll_out
-from shiftsim.planners.pdm.scorer import AHEAD_SECONDS, TTC_STEPS, Place, first_violations
+from shiftsim.planners.pdm.scorer import AHEAD_SECONDS, TTC_STEPS, Place, meet
 from shiftsim.planners.proposals import contacts, places
 from shiftsim.planners.proposals.areas import Areas, areas_of
 from shiftsim.planners.proposals.comfort import ComfortBounds, comfort
@@ -134,9 +134,8 @@ def frame_world(scenario: Scenario, iteration: int = 0, version: str = "v2") -> 
     before = row - step * np.arange(3, -1, -1)
     if before[0] < 0 or after[-1] >= len(scenario.time_us):
         raise DataError(
-            f"scenario {scenario.token!r}: iteration {iteration} has too little recording around "
-            f"it for NAVSIM's score {version}",
-            f"1.5 s before and {rules.seconds:g} s after it are needed",
+            f"scenario {scenario.token!r}: iteration {iteration} has too little recording around",
+            f"NAVSIM's score {version} needs 1.5 s before it and {rules.seconds:g} s after it",
         )
     ego, time_us = scenario.ego[row].copy(), int(scenario.time_us[row])
     around = recorded_surroundings(scenario.tracks.rows(after), rules.ttc_steps)
@@ -186,10 +185,8 @@ def score(
     if previous is not None:
         seconds = (world.time_us - previous.time_us) * 1e-6
         if not 0.0 < seconds < MAX_INTERVAL or previous.states.shape != states.shape:
-            raise ValueError(
-                f"extended comfort compares {len(plans)} plans with as many of at most "
-                f"{MAX_INTERVAL} s before, not {len(previous.score)} of {seconds:.3g} s before"
-            )
+            found = f"{len(previous.score)} of {seconds:.3g} s before"
+            raise ValueError(f"extended comfort compares {len(plans)} plans; {found} do not fit")
         differences = extended_differences(states, previous.states, seconds)
         parts["two_frame_extended_comfort"] = 1.0 * (differences <= EXTENDED_LIMITS).all(axis=1)
     human = world.human if human_filter and world.version == "v2" else None
@@ -198,13 +195,18 @@ def score(
 
 
 def evaluate(
-    states: FloatArray, ground: Ground, around: Surroundings, version: str, past: FloatArray
+    states: FloatArray,
+    ground: Ground,
+    around: Surroundings,
+    version: str,
+    past: FloatArray,
+    worlds: tuple[Surroundings, ...] = (),
 ) -> Parts:
     """Sub-scores of driven states (P, T, 11), all but those that compare plans, by name.
 
     `past` (H, 11) comes before them where comfort looks back; without rows all are comfortable.
+    With `worlds` (P,) each is among the others of its own one.
     """
-    others, rows, crossings = around.others, around.rows, ground.intersections
     on_lanes, on_road = (
         places.find_places(states, SIZE, areas, near, np.zeros(len(areas.lane)), by_center=True)
         for areas, near in (ground[:2], ground[2:4])
@@ -213,9 +215,10 @@ def evaluate(
     flags, crosses = on_lanes.flags.copy(), ~on_road.flags[..., places.OFF_ROUTE]
     off_road = flags[..., places.OFF_ROAD] = on_road.flags[..., places.OFF_ROAD]
     at = on_lanes._replace(flags=flags, off_lane=flags[..., places.MULTIPLE] | off_road)
-    near = contacts.near_others(at, others, int(rows[-1]) + 1, AHEAD_SECONDS)
-    fault, fault_index = contacts.first_faults(at, others, near, rows[: states.shape[1]], True)
-    ttc_index = first_violations(at, others, near, rows, around.reaches, SIZE, crossings)
+    each: list[Any] = [[c[row : row + 1] for c in at] for row in range(len(worlds))] or [at]
+    pairs = zip(each, (one[:3] for one in worlds or [around]), strict=True)
+    met = (meet(places.ProposalStates(*a), *b, SIZE, ground.intersections) for a, b in pairs)
+    fault, fault_index, ttc_index = map(np.concatenate, zip(*met, strict=True))
     points = shapely.points(at.centers)
     along = shapely.line_locate_point(ground.centerline, points[:, [0, -1]])
     # nuPlan rule 743: v2 has no wrong direction within intersections

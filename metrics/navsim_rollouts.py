@@ -22,7 +22,6 @@ from shiftsim.planners.proposals.tracker import SCORED
 from shiftsim.sim.log import SimulationLog
 from shiftsim.sim.planner import rollout_rows
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import Tracks, TrafficLights
 
 STRIDE = 5  # iterations between frames
 MODES = ("plans", "windows")
@@ -97,27 +96,20 @@ vars(metric_rows)["of_scenario"] = True  # it needs more than the map
 def driven_scenario(log: SimulationLog, scenario: Scenario) -> Scenario:
     """The scenario as it would be if the rollout were its recording."""
     rows, start = rollout_rows(scenario)
-    tracks, status = log.tracks, log.traffic_lights.status
-    blank = (np.full((start, *part.shape[1:]), np.nan) for part in _floats(tracks))
-    parts = (np.concatenate(pair) for pair in zip(blank, _floats(tracks), strict=True))
-    valid = np.concatenate([np.zeros((start, tracks.num_tracks), np.bool_), tracks.valid])
-    poses, velocities, sizes = parts
+    index = np.maximum(np.arange(-start, len(log.ego)), 0)
+    tracks = log.tracks.rows(index)  # a copy
+    tracks.valid[:start] = False
+    for values in (tracks.poses, tracks.velocities, tracks.sizes):
+        values[:start] = np.nan
     return replace(
         scenario,
         time_us=np.concatenate([scenario.time_us[rows[:start]], log.time_us]),
         ego=np.concatenate([scenario.ego[rows[:start]], log.ego]),
-        tracks=replace(tracks, valid=valid, poses=poses, velocities=velocities, sizes=sizes),
-        traffic_lights=TrafficLights(
-            log.traffic_lights.connector_ids,
-            np.concatenate([np.repeat(status[:1], start, axis=0), status]),
-        ),
+        tracks=tracks,
+        traffic_lights=log.traffic_lights.rows(index),
         iteration_rows=start + np.arange(len(log.ego)),
         row_step=1,
     )
-
-
-def _floats(tracks: Tracks) -> tuple[FloatArray, ...]:
-    return tracks.poses, tracks.velocities, tracks.sizes
 
 
 def plan_at(log: SimulationLog, iteration: int) -> FloatArray | None:

@@ -49,9 +49,8 @@ def demo_store(path: Path) -> Path:
         for town in DEMO_TOWNS:
             recordings.make_town(parts, town)
         _join(parts, DEMO_TOWNS, store, {"name": "demo"})
-        tokens = _sample(ScenarioStore(store))
         (store / "splits").mkdir(exist_ok=True)
-        listed = "".join(f'    "{token}",\n' for token in tokens)
+        listed = "".join(f'    "{token}",\n' for token in _sample(ScenarioStore(store)))
         text = f'name = "{DEMO_SPLIT}"\ntokens = [\n{listed}]\n'
         (store / f"splits/{DEMO_SPLIT}.toml").write_text(text, encoding="utf-8")
     return path
@@ -65,19 +64,22 @@ def _made_in_place(path: Path) -> Iterator[tuple[Path, Path]]:
         parts, store = Path(scratch).resolve() / "parts", Path(scratch) / "store"
         parts.mkdir()
         yield parts, store
-        store.rename(path)
+        try:
+            store.rename(path)
+        except OSError:  # another process has made the same in the meantime
+            if not (path / MANIFEST).is_file():
+                raise
 
 
 def town_specs(towns: int, seed: int, domain: str = "all") -> list[recordings.TownSpec]:
     """The random towns of a seed and a domain, of every kind in turn."""
     name, crowd = ("foreign", CROWD) if domain == "foreign" else ("town", 1.0)
     kinds = {"home": [kind for kind in KINDS if kind not in FOREIGN], "foreign": list(FOREIGN)}
-    wanted = kinds.get(domain, list(KINDS))
     numbered = zip(count(1), cycle(KINDS))  # the same town in every store that has it
     specs = (
         recordings.TownSpec(f"{name}-{seed}-{number:03d}", kind, number, crowd=crowd)
         for number, kind in numbered
-        if kind in wanted
+        if kind in kinds.get(domain, KINDS)
     )
     return list(islice(specs, towns))
 

@@ -57,14 +57,15 @@ def agent_features(history: History, center: FloatArray, max_agents: int) -> Age
     )
     others = (tracks.poses, tracks.velocities, tracks.sizes, tracks.valid)
     poses, velocities, sizes, seen = (
-        np.concatenate([one[:, None], rows[-SAMPLES:, nearest]], axis=1)
+        np.concatenate([one[:, None], rows[-SAMPLES:].take(nearest, axis=1)], axis=1)
         for one, rows in zip(own, others, strict=True)
     )
 
     def filled(values: np.ndarray, kind: Any = np.float32) -> np.ndarray:
         """(A, 21, ...) samples of rows (T, A, ...); 0 where nothing was seen."""
         out = np.zeros((SAMPLES, *values.shape[1:]), kind)
-        out[SAMPLES - len(values) :][seen] = values[seen]
+        part = out[SAMPLES - len(values) :]
+        np.copyto(part.T, values.T, where=seen.T, casting="same_kind")
         return out.swapaxes(0, 1)
 
     category = np.zeros(len(nearest) + 1, np.int64)

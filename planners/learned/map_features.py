@@ -25,6 +25,7 @@ class RoadObjects(NamedTuple):
     """Lanes, then connectors, then crosswalks of a map, each in the order of its layer."""
 
     lines: FloatArray  # (M, 3, 21, 2) centre, left and right polyline in the map frame [m]
+    steps: FloatArray  # (M, 3, 20, 2) from each point to the next one [m]
     angles: FloatArray  # (M, 3, 20) orientation of the steps [rad]
     kind: IntArray  # (M,) LANE, CONNECTOR or CROSSWALK
     block: IntArray  # (M,) block of the object, or NONE
@@ -66,7 +67,8 @@ def _make_road_objects(road: VectorMap) -> RoadObjects:
     block[:num_edges] = road.block_of
     limit = np.full(len(lines), np.nan)
     limit[:num_edges] = road.speed_limits
-    return RoadObjects(lines, np.arctan2(steps[..., 1], steps[..., 0]), kind, block, limit)
+    angles = np.arctan2(steps[..., 1], steps[..., 0])
+    return RoadObjects(lines, steps, angles, kind, block, limit)
 
 
 road_objects = PerMap(_make_road_objects)
@@ -189,13 +191,11 @@ def road_features(
     edges = meeting(road.edges.polygons, square)
     near = np.concatenate([edges, len(road.edges) + meeting(road.crosswalks.polygons, square)])
     heading = float(ego[2])
-    offsets = turned(known.lines[near, 0, :-1] - ego[:2], heading)
-    valid: BoolArray = np.all(np.abs(offsets) < radius, axis=-1)
+    offsets = turned(known.lines[near, :, :-1] - ego[:2], heading)
+    valid: BoolArray = np.all(np.abs(offsets[:, 0]) < radius, axis=-1)
     seen = valid.any(axis=1)
-    chosen, valid = near[seen], valid[seen]
-    lines = known.lines[chosen]
-    points = turned(lines[:, :, :-1] - ego[:2], heading).astype(np.float32)
-    vectors = turned(np.diff(lines, axis=2), heading).astype(np.float32)
+    chosen, valid, points = near[seen], valid[seen], offsets[seen].astype(np.float32)
+    vectors = turned(known.steps[chosen], heading).astype(np.float32)
     orientations = (known.angles[chosen] - heading).astype(np.float32)
     limit = known.limit[chosen]
     has_limit = ~np.isnan(limit)

@@ -71,10 +71,8 @@ def score(
     places = find_places(states, size, areas, place.selected, no_limits, by_center=True)
     rows = np.arange(count + TTC_STEPS[-1]) // 2
     reaches = (AHEAD_SECONDS + DT) * others.speeds[0]
-    near = near_others(places, others, rows[-1] + 1, AHEAD_SECONDS)
-    # nuPlan rule 195: what is not at fault when it is first touched is not looked at again
-    no_collision, collision_index = first_faults(places, others, near, rows[:count], True)
-    ttc_index = first_violations(places, others, near, rows, reaches, size, place.intersections)
+    known = others, rows, reaches
+    no_collision, collision_index, ttc_index = meet(places, *known, size, place.intersections)
     raw_progress, direction = _follow_route(places, place.centerline, params.direction_limits)
     drivable = np.where(places.flags[..., OFF_ROAD].any(axis=1), 0.0, 1.0)
     factor = no_collision * drivable * direction
@@ -94,6 +92,21 @@ def score(
         ttc_index=ttc_index,
         flags=places.flags,
     )
+
+
+def meet(
+    places: ProposalStates,
+    others: Obstacles,
+    rows: IntArray,  # row of time of each time index
+    reaches: FloatArray,  # (N,) how far each of the others gets within the projection [m]
+    size: EgoBox,
+    intersections: Polygons,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(P,) factors of at-fault collisions, their first time indices, those of a violated TTC."""
+    near, count = near_others(places, others, rows[-1] + 1, AHEAD_SECONDS), places.states.shape[1]
+    # nuPlan rule 195: what is not at fault when it is first touched is not looked at again
+    faults = first_faults(places, others, near, rows[:count], True)
+    return *faults, first_violations(places, others, near, rows, reaches, size, intersections)
 
 
 def weighted_mean(

@@ -7,6 +7,7 @@ infraction: a corner of the ego off the road, or a collision of the moving ego.
 import signal
 from collections.abc import Callable, Sequence
 from copy import deepcopy
+from dataclasses import fields, replace
 from functools import cache, partial
 from multiprocessing import TimeoutError as NoAnswerError
 from multiprocessing.connection import wait
@@ -29,7 +30,8 @@ from shiftsim.kernels import FloatArray
 from shiftsim.planners.learned.carl.planner import command_of
 from shiftsim.runs.scenarios import find_split
 from shiftsim.sim.log import Setting, Snapshot
-from shiftsim.sim.noise import NoiseModel, parse_noise
+from shiftsim.sim.noise import NoiseModel
+from shiftsim.sim.perception import Localization, Perception, make_drift
 from shiftsim.sim.traffic import Traffic, make_traffic, traffic_name
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import Command, Trajectory
@@ -74,6 +76,9 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         observation: str | Observer = "vector",
         reward: str | Reward = "regular",
         noise: str | NoiseModel = "none",
+        perception: str | Perception = "none",
+        localization: str | Localization = "none",
+        latency: int = 0,
         traffic: str | Traffic = "nonreactive",
         action: str = "command",
         terminate: bool = True,
@@ -89,6 +94,9 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
             reward: `regular`, `nuplan` or `survival` as CaRL has them, `score`, or a function of
                 the `Episode`.
             noise: Actuation noise, by name or model.
+            perception: How boxes are seen, by name or model; rewards and scores know the truth.
+            localization: Where the ego takes itself to be, by name or model.
+            latency: Time from an action until it acts [ms], a multiple of 100.
             traffic: Traffic, by name or model.
             action: `command` or `trajectory`.
             terminate: Whether an infraction ends the episode.
@@ -109,10 +117,10 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         if missing or not self._tokens:
             what = f"lacks {len(missing)} of the split {split!r}" if missing else "has no scenarios"
             raise DataError(f"store {str(store)!r} {what}", hint="choose another store or split")
-        self._setting = Setting(
-            noise=parse_noise(noise) if isinstance(noise, str) else noise,
-            traffic=traffic_name(traffic) if isinstance(traffic, str) else deepcopy(traffic),
-        )
+        named = traffic_name(traffic) if isinstance(traffic, str) else deepcopy(traffic)
+        drift = make_drift(noise, perception, localization, latency)
+        models: Any = {item.name: getattr(drift, item.name) for item in fields(drift)}
+        self._setting = Setting(traffic=named, **models)
         if isinstance(traffic, str):
             make_traffic(traffic)
         if isinstance(observation, str):
@@ -173,7 +181,7 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
             chosen |= {"token": snapshot.token, "noise_seed": snapshot.setting.seed}
         chosen = drawn | chosen
         scenario = self._store.read(chosen["token"])
-        setting = Setting(self._setting.noise, chosen["noise_seed"], self._setting.traffic)
+        setting = replace(self._setting, seed=chosen["noise_seed"])
         self._episode = episode = Episode(scenario, setting, np.zeros_like(self._high))
         self.observer.start(episode)
         seen, first = self.observer.look(episode), episode.snapshot()
@@ -195,7 +203,7 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
             raise ConfigError("the episode has ended", hint="call reset()")
         episode = self.episode
         episode.action = given = bounded(action, self._high)
-        episode.advance(plan_of(given, episode.log.ego[episode.iteration]))
+        episode.advance(plan_of(given, episode.observe().history.ego[-1]))
         infraction, is_over = episode.infraction, episode.is_over
         info: dict[str, Any] = {"terms": episode.terms, "infraction": infraction}
         info["snapshot"] = episode.snapshot()

@@ -163,4 +163,7 @@ def turned(vectors: FloatArray, heading: float) -> FloatArray:
     """Vectors (..., 2) in a frame that is turned to a heading [rad]: forward and left."""
     cos, sin = np.cos(heading), np.sin(heading)
     x, y = vectors[..., 0], vectors[..., 1]
-    return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
+    out = np.empty((*x.shape, 2))
+    np.add(cos * x, sin * y, out=out[..., 0])
+    np.subtract(cos * y, sin * x, out=out[..., 1])
+    return out

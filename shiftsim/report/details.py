@@ -300,7 +300,7 @@ def _borne(planner: str, mode: str, groups: Mapping[str, Group]) -> str:
     """How late the plans of a planner may be before its score falls; empty where it is unknown."""
     scores = {noise: _score(group) for noise, group in groups.items() if group.is_complete}
     late = [name for name in noise_order(scores) if name[8:].isdecimal()]
-    if "none" not in scores or not late:
+    if not scores.get("none", 0.0) > _BORNE or not late:  # there is nothing that could fall
         return ""
     falls = [name for name in late if scores[name] < scores["none"] - _BORNE]
     borne = late[: late.index(falls[0])] if falls else late

@@ -30,10 +30,17 @@ from shiftsim.sim.perception import LEVELS
 _NOISES = {"awgn": "white noise (AWGN)", "ou": "correlated noise (OU)"}
 _BOXES = {"perception": "errors", "miss": "misses", "dropout": "drop-outs"}
 _TIMES = {"localization": "own pose", "latency": "latency"}
-_CURVES = {  # figures by name: panels by kind, label of the axis, title
-    "robustness": (_NOISES, "strength of the noise", "Noise robustness"),
-    "perception": (_BOXES, "level", "Perception"),
-    "latency": (_TIMES, "level, latency [ms]", "Localization and latency"),
+_CURVES = {  # figures by name: panels by kind, what planners are under, title
+    "robustness": (_NOISES, "noise", "Noise robustness"),
+    "perception": (_BOXES, "drift", "Perception"),
+    "latency": (_TIMES, "drift", "Localization and latency"),
+}
+_LABELS = {  # of the axes of their panels
+    "errors": "errors of the boxes",
+    "misses": "missed detections",
+    "drop-outs": "lost tracks",
+    "own pose": "error of the pose",
+    "latency": "latency of the plans [ms]",
 }
 _TRAFFIC = {"NR": "non-reactive traffic", "R": "reactive traffic"}
 _SPREAD = 0.62  # how much of a place on the axis the planners share
@@ -102,14 +109,14 @@ def figures(groups: Sequence[Group], *, form: FigureFormat = DEFAULT_FORM) -> li
         shown = [group for group in mine if group.estimate().value is not None]
         clean = [group for group in shown if group.noise == "none"]
         found = {g.noise.partition("-")[0] for g in shown if "+" not in g.noise}
-        for kind, (panels, label, words) in _CURVES.items():
+        for kind, (panels, under, words) in _CURVES.items():
             if not (kinds := {panels[k]: _levels(k, shown) for k in panels if k in found}):
                 continue
-            labels = (label, "closed-loop score")
+            labels = ("strength of the noise", "closed-loop score")
             drawn = _scores(shown, kinds, styles, form, noise="some", labels=labels)
             bars = f"bars: standard deviation over seeds; without several, {_BARS.split(': ')[1]}"
             note = f"n = {len(data.tokens)} scenarios; {bars}; thin line: the clean score"
-            note, samples = f"{data.rules}\n{note}", {"clean": "none", "under noise": "some"}
+            note, samples = f"{data.rules}\n{note}", {"clean": "none", f"under {under}": "some"}
             add(kind, f"{words} on {data.label}", drawn, note, samples=samples)
         if not clean:
             continue
@@ -259,8 +266,8 @@ def _scores(
 ) -> Any:
     """Planners side by side at every place, a row of panels per traffic mode.
 
-    `columns` are the panels of a row by title, `labels` those of the axes. Places are joined by
-    lines if a `noise` is given, which look like it.
+    `columns` are the panels of a row by title, `labels` those of axes without their own. Places are
+    joined by lines if a `noise` is given, which look like it.
     """
     planners = list(dict.fromkeys(group.planner for group in groups))
     spread = {"": _SPREAD, "none": 0.06 * len(planners)}.get(noise, 0.02 * len(planners))
@@ -282,7 +289,7 @@ def _scores(
         _set_headings(axes, headings)
         margin = 0.35 if noise else 0.5
         axes.set_xlim(-margin, len(headings) - 1 + margin)
-        axes.set_xlabel(labels[0], fontsize=SMALL)
+        axes.set_xlabel(_LABELS.get(title, labels[0]), fontsize=SMALL)
         words = (title, _TRAFFIC.get(traffic, traffic))
         is_alone = form.plain and len(panels) == 1
         _finish_axes(axes, "" if is_alone else ", ".join(filter(None, words)), labels[1])

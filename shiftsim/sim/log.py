@@ -15,7 +15,7 @@ from shiftsim.sim.noise import NoiseModel
 from shiftsim.sim.perception import Drift, Localization, Perception, make_drift
 from shiftsim.sim.traffic import Traffic
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import Tracks, TrafficLights
+from shiftsim.world.state import Command, Tracks, TrafficLights, Trajectory
 
 NUM_KEPT = 18  # poses of a plan
 CONTROLLERS = ("lqr", "perfect", "log-playback")
@@ -130,6 +130,7 @@ class Snapshot:
         commands: (i, 2) as of `SimulationLog`.
         planning_seconds: (i,) time the planner took for each call [s].
         degraded: (i,) whether the plan was a fallback.
+        plans: Those under way, the next one first; as many as the latency has steps.
         action: The last action, in the environment.
         scenario: The scenario; None where the snapshot comes from another process.
     """
@@ -140,6 +141,7 @@ class Snapshot:
     commands: FloatArray
     planning_seconds: FloatArray
     degraded: BoolArray
+    plans: tuple[Trajectory | Command, ...] = ()
     action: Any = None
     scenario: Scenario | None = None
 
@@ -152,7 +154,11 @@ class Snapshot:
         return tuple(getattr(self, item.name) for item in fields(self)[:-1])
 
     def _bytes(self) -> tuple[Any, ...]:
-        return *self._content()[:2], *(np.asarray(part).tobytes() for part in self._content()[2:-1])
+        token, setting, *parts, plans, _ = self._content()
+        for plan in plans:
+            one = isinstance(plan, Command) and [plan.acceleration, plan.steering_rate]
+            parts += [one] if one else [plan.time_us, plan.states]
+        return token, setting, *(np.asarray(part).tobytes() for part in parts)
 
     def __reduce__(self) -> Any:
         return Snapshot, self._content()

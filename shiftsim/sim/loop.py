@@ -6,6 +6,7 @@ times; its last answer is never executed, and the state at T - 1 is neither reac
 """
 
 import warnings
+from collections import deque
 from collections.abc import Callable, Sequence
 from copy import copy, deepcopy
 from dataclasses import replace
@@ -35,7 +36,7 @@ from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import NUM_STATE, Command, Trajectory, center_poses
 
 if TYPE_CHECKING:
-    from shiftsim.sim.sensing import Latency, Sensing
+    from shiftsim.sim.sensing import Sensing
 
 T = TypeVar("T")
 P = ParamSpec("P")
@@ -92,19 +93,19 @@ class Rollout:
 
             self._traffic = Scripted(self._traffic)
         self._traffic.start(scenario, self._tracks, start)
-        drift, seed, token = setting.drift, setting.seed, scenario.token
-        truth = self._ego, self._tracks
+        self._drift, seed, token = setting.drift, setting.seed, scenario.token
         self._sensing: Sensing | None = None
-        self._latency: Latency | None = None
-        if drift.senses or drift.latency:  # few runs need them
-            from shiftsim.sim import sensing
+        self._waiting = deque[Trajectory | Command]()  # plans under way, the next one first
+        if late := self._drift.latency:
+            from shiftsim.sim.sensing import first_plans  # few runs need it
 
-            self._sensing = sensing.Sensing(drift, seed, token, truth) if drift.senses else None
-            past, present = self._ego[: start + 1], int(self._time_us[start])
-            self._latency = sensing.Latency(drift.latency, past, present)
-        ego, tracks = (self._sensing.ego, self._sensing.tracks) if self._sensing else truth
-        self._observations = ObservationBuilder(self._time_us, ego, tracks, self._lights)
-        self._noise = sample_noise(drift.noise, seed=seed, token=token, num_steps=self.num_samples)
+            now_us = int(self._time_us[start])
+            self._waiting = first_plans(late, self._ego[: start + 1], now_us)
+        arrays = self._time_us, self._ego, self._tracks, self._lights
+        self._observations = ObservationBuilder(*arrays)
+        self._noise = sample_noise(
+            self._drift.noise, seed=seed, token=token, num_steps=self.num_samples
+        )
         self._commands = np.full((self.num_samples, 2), np.nan)
         self._plans = np.full((self.num_samples, len(KEPT_US), 3), np.nan)
         self._seconds = np.zeros(self.num_samples)
@@ -143,8 +144,10 @@ class Rollout:
             plan = self._checked(plan)
         if iteration + 1 == self.num_samples:
             return None
-        if plan is not None and self._latency is not None:
-            plan = self._latency.exchange(plan, int(self._time_us[row + 1]))
+        if plan is not None and self._waiting:
+            from shiftsim.sim.sensing import exchange
+
+            plan = exchange(self._waiting, plan, int(self._time_us[row + 1]))
         # nuPlan rule 13: the ego moves first, and the traffic sees where it was before
         self._move_ego(plan)
         return Move(iteration, self._ego[row], self._tracks, row + 1)
@@ -208,19 +211,16 @@ class Rollout:
 
         Raises:
             DataError: The rollout has ended.
-            ConfigError: What is seen drifts, or plans are late: those under way are not kept.
         """
-        self._require_truth()
         if self.done:
             raise DataError(f"the rollout of {self.scenario.token!r} has ended")
         # views: nobody writes to the rows that lie behind
         past, end = slice(self.iteration), self._start + self.iteration + 1
-        noise, traffic = self.setting.noise, self.setting.traffic
-        named = replace(
-            self.setting,
-            noise=noise if isinstance(noise, str) else noise.name,
-            traffic=traffic if isinstance(traffic, str) else type(traffic).__name__,
-        )
+        names: Any = {}
+        for name in ("noise", "perception", "localization", "traffic"):
+            if not isinstance(given := getattr(self.setting, name), str):
+                names[name] = type(given).__name__ if name == "traffic" else given.name
+        named = replace(self.setting, **names)
         return Snapshot(
             token=self.scenario.token,
             setting=named,
@@ -228,6 +228,7 @@ class Rollout:
             commands=self._commands[past],
             planning_seconds=self._seconds[past],
             degraded=self._degraded[past],
+            plans=tuple(self._waiting),
             action=action,
             scenario=self.scenario,
         )
@@ -238,33 +239,34 @@ class Rollout:
         The planner is not asked before, so it remembers nothing, and its plans are not there.
 
         Raises:
-            DataError: The snapshot is of another scenario, or the scenario has ended before.
+            DataError: The snapshot is of another scenario or latency, or the scenario has ended
+                before.
         """
         if snapshot.token != self.scenario.token or snapshot.iteration >= self.num_samples:
             raise DataError(f"{snapshot!r} is none of scenario {self.scenario.token!r}")
+        if len(snapshot.plans) != len(self._waiting):
+            raise DataError(f"{snapshot!r} has {len(snapshot.plans)} plans under way")
+        self._waiting = deque(snapshot.plans)
         past = slice(snapshot.iteration)
         self._ego[self._start : self._start + snapshot.iteration + 1] = snapshot.ego
         self._commands[past], self._seconds[past] = snapshot.commands, snapshot.planning_seconds
         self._degraded[past] = snapshot.degraded
-        for row in range(self._start + self.iteration, self._start + snapshot.iteration):
-            self._traffic.step(self.iteration, self._ego[row], self._tracks, row + 1)
+        begin, end = self._start + self.iteration, self._start + snapshot.iteration
+        if step_many := getattr(self._traffic, "step_many", None):
+            step_many(self.iteration, self._ego[begin:end], self._tracks, begin + 1)
+        for row in range(begin, end):
+            if step_many is None:
+                self._traffic.step(self.iteration, self._ego[row], self._tracks, row + 1)
             self._go_on()
 
-    def _require_truth(self) -> None:
-        if self._latency is not None:
-            raise ConfigError(
-                "there are no snapshots and forks under perception, localization or latency",
-                hint="take them from a rollout without, or with actuation noise only",
-            )
-
     def fork(self) -> "Rollout":
-        """Another rollout that has come as far, without a planner; errors as of `snapshot`."""
-        self._require_truth()
+        """Another rollout that has come as far, without a planner; it observes the truth."""
         other, scenario = copy(self), self.scenario
         for name in ("_ego", "_tracks", "_commands", "_plans", "_seconds", "_degraded"):
             setattr(other, name, getattr(self, name).copy())
         arrays = other._time_us, other._ego, other._tracks, other._lights
         other._observations, other.planner = ObservationBuilder(*arrays), None
+        other._sensing, other._waiting = None, self._waiting.copy()
         shared = {id(one): one for one in (scenario, scenario.map)}
         other._traffic = deepcopy(self._traffic, shared)
         return other
@@ -272,9 +274,14 @@ class Rollout:
     def drive_by(self, planner: Planner) -> None:
         """Have a planner drive from here on."""
         self.planner, believed = planner, None
-        if self._sensing is not None:
-            self._sensing.see(self._start)
-            believed = self._sensing.ego[self._start, :3]
+        if self._drift.senses:
+            from shiftsim.sim.sensing import Sensing  # few runs need it
+
+            key, truth = (self.setting.seed, self.scenario.token), (self._ego, self._tracks)
+            self._sensing = sensing = Sensing(self._drift, *key, truth)
+            sensing.see(self._start)
+            believed, seen = sensing.ego[self._start, :3], (sensing.ego, sensing.tracks)
+            self._observations = ObservationBuilder(self._time_us, *seen, self._lights)
         planner.reset(scene_info(self.scenario, self.setting.seed, planner, believed))
 
     def log(self) -> SimulationLog:

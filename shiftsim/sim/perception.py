@@ -226,10 +226,8 @@ def parse_drift(name: str) -> Drift:
 def _seen(before: Perception, part: str) -> Perception:
     """A perception with one more of its named errors."""
     kind, _, level = part.partition("-")
-    if kind == "range":
-        more: dict[str, float] = {"range": float(_number(part, level))}
-    else:
-        more = _KINDS[kind][one_of(kind, level, LEVELS)]
+    ranged = {"range": float(_number(part, level))} if kind == "range" else {}
+    more = ranged or _KINDS[kind][one_of(kind, level, LEVELS)]
     name = part if before.name == "none" else f"{before.name}+{part}"
     return replace(before, **more, name=name)
 

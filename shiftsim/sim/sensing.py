@@ -23,6 +23,7 @@ from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.sim.log import Seen
 from shiftsim.sim.noise import channel_key, keyed_generator
 from shiftsim.sim.perception import DT, DT_MS, Drift
+from shiftsim.sim.traffic.idm.scene import Row, row_of
 from shiftsim.world.state import HEADING, VX, Command, Tracks, Trajectory
 
 FAR = 50.0  # m, beyond which detections are missed twice as often
@@ -31,15 +32,6 @@ SMALLEST = 0.2  # of the true length and width
 _COAST = 11  # poses of the first plan beyond the latency: the tracker looks 1 s ahead
 _CURVED = 0.5  # m driven, below which the curvature of a path is not known
 Plan: TypeAlias = Trajectory | Command
-
-
-class _Span(NamedTuple):
-    """The rows in which a track has one token."""
-
-    number: int  # of its drop-outs before
-    track: int
-    begin: int
-    end: int
 
 
 class _Model(NamedTuple):
@@ -55,18 +47,9 @@ class _Model(NamedTuple):
     spans: IntArray  # (C, 3) of each column that is seen: track, first row, row behind the last
 
 
-class _Boxes(NamedTuple):
-    """Tracks as arrays of rows and columns."""
-
-    valid: BoolArray
-    poses: FloatArray
-    velocities: FloatArray
-    sizes: FloatArray
-
-
 @kernel
 def see_boxes(
-    row: int, ego: FloatArray, believed: FloatArray, model: _Model, truth: _Boxes, seen: _Boxes
+    row: int, ego: FloatArray, believed: FloatArray, model: _Model, truth: Row, seen: Row
 ) -> None:
     """Fill a row of what is seen, NaN so far, after those before; `ego`, `believed` are poses."""
     turn = believed[2] - ego[2]
@@ -138,7 +121,7 @@ class Sensing:
             lost = self._draw("dropout", lambda one, out: one.random(out=out))
         spans = _spans(lost < model.lost * DT, max(round(model.lost_for / DT), 1), len(tokens))
         numbers = (exp(-DT / model.tau), model.missed, DT / model.gap, model.range)
-        table = np.array([(s.track, s.begin, s.end) for s in spans], np.int64).reshape(-1, 3)
+        table = np.array([span[1:] for span in spans], np.int64).reshape(-1, 3)
         drawn = (errors.reshape(-1, rows, 6), draws, table)
         self._model = _Model(*numbers, model.sigmas, *drawn)
         self._shift: FloatArray | None = None
@@ -147,16 +130,11 @@ class Sensing:
             sigmas = (place.position, place.position, place.heading)
             self._shift = ar1(normals, place.tau) * sigmas
         self.ego = self._ego if self._shift is None else np.full(self._ego.shape, np.nan)
-        names = tuple(
-            f"{tokens[s.track]}~{s.number}" if s.number else tokens[s.track] for s in spans
-        )
+        names = tuple(f"{tokens[at]}~{n}" if n else tokens[at] for n, at, *_ in spans)
         shape = (rows, len(spans))
-        boxes = _Boxes(
-            np.zeros(shape, np.bool_), *(np.full((*shape, w), np.nan) for w in (3, 2, 2))
-        )
+        boxes = Row(np.zeros(shape, np.bool_), *(np.full((*shape, w), np.nan) for w in (3, 2, 2)))
         self.tracks = Tracks(*boxes, kinds[table[:, 0]], names)
-        arrays = self._tracks.valid, self._tracks.poses, self._tracks.velocities, self._tracks.sizes
-        self._boxes = _Boxes(*arrays), boxes
+        self._boxes = row_of(self._tracks, slice(None)), boxes
 
     def _draw(self, channel: str, draw: Callable[..., Any], *shape: int) -> FloatArray:
         """(N, R, ...) random numbers of every track, each from a generator with a key of its own.
@@ -200,17 +178,20 @@ class Sensing:
         return Seen(self.ego[rows, :3], self.tracks.rows(rows))
 
 
-def _spans(begins: BoolArray, length: int, count: int) -> list[_Span]:
-    """The tokens of tracks, which are lost for some rows where a drop-out begins (N or 0, R)."""
-    found = list[_Span]()
+def _spans(begins: BoolArray, length: int, count: int) -> list[tuple[int, ...]]:
+    """Rows in which tracks, lost for some where a drop-out begins (N or 0, R), have one token.
+
+    Of each the drop-outs before, the track, the first row, and the row behind the last.
+    """
+    found = list[tuple[int, ...]]()
     for track in range(count):
         begin = number = 0
         for row in np.flatnonzero(begins[track : track + 1]).tolist():
             if row >= begin:  # not lost already
-                found.append(_Span(number, track, begin, row))
+                found.append((number, track, begin, row))
                 begin, number = row + length, number + 1
-        found.append(_Span(number, track, begin, begins.shape[1]))
-    return sorted(found, key=lambda span: (span.number > 0, span.track, span.number))
+        found.append((number, track, begin, begins.shape[1]))
+    return sorted(found, key=lambda span: (span[0] > 0, span[1], span[0]))
 
 
 def ar1(normals: FloatArray, tau: float) -> FloatArray:
@@ -225,21 +206,17 @@ def ar1(normals: FloatArray, tau: float) -> FloatArray:
     return normals
 
 
-class Latency:
-    """Plans on their way: each is followed some steps after it was made."""
+def first_plans(milliseconds: int, past: FloatArray, now_us: int) -> deque[Plan]:
+    """Those under way at first: keep speed and curvature of the past (H, 11), the present last."""
+    steps = milliseconds // DT_MS
+    return deque[Plan]([coasting(past, now_us, steps + _COAST)] * steps)
 
-    def __init__(self, milliseconds: int, past: FloatArray, now_us: int) -> None:
-        """Begin with the plan to keep speed and curvature of the past (H, 11), the present last."""
-        steps = milliseconds // DT_MS
-        self._waiting = deque[Plan]([coasting(past, now_us, steps + _COAST)] * steps)
 
-    def exchange(self, plan: Plan, next_us: int) -> Plan:
-        """The plan that is followed until `next_us`, as this one is made."""
-        if not self._waiting:
-            return plan
-        self._waiting.append(plan)
-        plan = self._waiting.popleft()
-        return plan if isinstance(plan, Command) else _reaching(plan, next_us)
+def exchange(waiting: deque[Plan], plan: Plan, next_us: int) -> Plan:
+    """The plan that is followed until `next_us`, of those under way, as this one is made."""
+    waiting.append(plan)
+    plan = waiting.popleft()
+    return plan if isinstance(plan, Command) else _reaching(plan, next_us)
 
 
 def _reaching(plan: Trajectory, time_us: int) -> Trajectory:

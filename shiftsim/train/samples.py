@@ -8,7 +8,7 @@ planner to planner is in `KINDS`.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -17,7 +17,8 @@ import shapely
 import torch
 from torch import Tensor
 
-from shiftsim.geometry.boxes import boxes_to_corners, boxes_touch, from_frame, to_frame, turned
+from shiftsim.geometry.boxes import boxes_to_corners, from_frame, to_frame, turned
+from shiftsim.geometry.polylines import arc_lengths, project_on_polyline
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.learned import features
 from shiftsim.planners.learned.base import LearnedPlanner
@@ -26,6 +27,7 @@ from shiftsim.planners.learned.diffusion.features import Features as DiffusionFe
 from shiftsim.planners.learned.plantf import planner as plantf
 from shiftsim.planners.learned.pluto import planner as pluto
 from shiftsim.planners.learned.pluto.world import red_lights
+from shiftsim.planners.proposals.contacts import touches_boxes
 from shiftsim.sim.planner import History, Observation, observe_log, past_rows
 from shiftsim.world.layers import contains
 from shiftsim.world.scenario import Scenario
@@ -119,7 +121,7 @@ def perturbed_state(state: FloatArray, noise: FloatArray) -> FloatArray:
 def is_free(pose: FloatArray, others: FloatArray, sizes: FloatArray) -> bool:
     """Whether the ego with its rear axle at a pose (3,) touches none of boxes (N, 3), (N, 2)."""
     own = boxes_to_corners(center_poses(pose)[None], np.array([[PACIFICA.length, PACIFICA.width]]))
-    return not any(boxes_touch(own[0], box) for box in boxes_to_corners(others, sizes))
+    return not touches_boxes(own[0], boxes_to_corners(others, sizes)).any()
 
 
 def targets(present: FloatArray, future: FloatArray, frame: FloatArray) -> np.ndarray:
@@ -161,10 +163,13 @@ def projections(lines: Sequence[FloatArray], ego: FloatArray) -> np.ndarray:
         lines: R reference lines (K, 3).
         ego: (80, 3) poses of the rear axle in the 8 s.
     """
-    points = shapely.points(ego[9::10, :2])
-    curves = np.array([shapely.linestrings(line[:, :2]) for line in lines])[:, None]
-    both = [shapely.line_locate_point(curves, points), shapely.distance(curves, points)]
-    return np.stack(both, axis=-1).astype(np.float32)
+    points, out = ego[9::10, :2], np.empty((len(lines), 8, 2), np.float32)
+    for line, both in zip(lines, out, strict=True):
+        xy = np.ascontiguousarray(line[:, :2])
+        arc = arc_lengths(xy, np.array([0, len(xy)]))
+        both[:, 0] = [project_on_polyline(xy, arc, 0, len(xy), x, y) for x, y in points.tolist()]
+        both[:, 1] = shapely.distance(shapely.linestrings(xy), shapely.points(points))
+    return out
 
 
 def way_back(speed: float, path: FloatArray) -> FloatArray:
@@ -229,7 +234,6 @@ class Future(NamedTuple):
 
     present: FloatArray  # (A, 3) poses now
     poses: FloatArray  # (A, 80, 3)
-    velocities: FloatArray  # (A, 80, 2) in the frame of the map [m/s]
     valid: BoolArray  # (A, 80) whether there was a row
 
 
@@ -244,28 +248,36 @@ class Moment(NamedTuple):
     # there already, or at once
     beside: int | None
 
+    @property
+    def rows(self) -> slice:
+        """Those of the 8 s after it."""
+        step = self.scenario.row_step
+        return slice(self.row + step, self.row + step * STEPS + 1, step)
+
     def future(self, near: IntArray) -> Future:
         """Of the ego from where it is now, and of some tracks."""
-        scenario, tracks, step = self.scenario, self.scenario.tracks, self.scenario.row_step
-        rows = slice(self.row + step, self.row + step * STEPS + 1, step)
-        ego = scenario.ego[rows]
-        poses, velocities, valid = (  # (80, A - 1, ...); indexing with two arrays is slow
-            values[rows].take(near, axis=1)
-            for values in (tracks.poses, tracks.velocities, tracks.valid)
-        )
-        cos, sin, vx, vy = np.cos(ego[:, 2]), np.sin(ego[:, 2]), ego[:, VX], ego[:, VY]
-        own, drive = np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy]), ego[:, :3]
-        now = self.observation.history.ego[-1:, :3]
+        scenario, tracks, rows = self.scenario, self.scenario.tracks, self.rows
+        poses = np.empty((1 + len(near), STEPS, 3))
+        valid = np.ones(poses.shape[:2], np.bool_)
+        # take: indexing with two arrays is slow
+        poses[1:] = tracks.poses[rows].take(near, axis=1).swapaxes(0, 1)
+        valid[1:] = tracks.valid[rows].take(near, axis=1).T
+        now, poses[0] = self.observation.history.ego[-1:, :3], scenario.ego[rows, :3]
         if self.beside is not None:
-            path = scenario.ego[self.beside : rows.stop : step, :3]
-            drive = from_frame(way_back(self.state[3], to_frame(path, now[0])), now[0])
-            own = np.diff(np.vstack([now, drive])[:, :2], axis=0) / STEP
-        return Future(
-            np.vstack([now, tracks.poses[self.row, near]]),
-            np.concatenate([drive[None], poses.swapaxes(0, 1)]),
-            np.concatenate([own[None], velocities.swapaxes(0, 1)]),
-            np.vstack([np.ones((1, STEPS), np.bool_), valid.T]),
-        )
+            path = scenario.ego[self.beside : rows.stop : rows.step, :3]
+            poses[0] = from_frame(way_back(self.state[3], to_frame(path, now[0])), now[0])
+        return Future(np.vstack([now, tracks.poses[self.row, near]]), poses, valid)
+
+    def velocities(self, near: IntArray, future: Future) -> FloatArray:
+        """(A, 80, 2) in the frame of the map [m/s], of the same."""
+        ego, velocities = self.scenario.ego[self.rows], self.scenario.tracks.velocities
+        cos, sin, vx, vy = np.cos(ego[:, 2]), np.sin(ego[:, 2]), ego[:, VX], ego[:, VY]
+        own = np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy])
+        if self.beside is not None:
+            drive = np.vstack([future.present[:1], future.poses[0]])
+            own = np.diff(drive[:, :2], axis=0) / STEP
+        others = velocities[self.rows].take(near, axis=1).swapaxes(0, 1)
+        return np.concatenate([own[None], others])
 
 
 def _plantf_sample(planner: plantf.PlanTF, read: plantf.Features, now: Moment) -> Sample | str:
@@ -281,9 +293,11 @@ def _pluto_sample(planner: pluto.Pluto, read: pluto.SceneInputs, now: Moment) ->
         return _NO_LINE
     read.current_state[3:] = now.state[3:]
     seen = planner.surroundings
-    future = now.future(seen.agents.tracks)
+    near = seen.agents.tracks
+    future = now.future(near)
     future.valid[0, steps_before_red(planner, now, future.poses[0]) :] = False
-    target = motion_targets(*future[:3], future.present[0])
+    motion = now.velocities(near, future)
+    target = motion_targets(future.present, future.poses, motion, future.present[0])
     return Sample(read, target, future.valid, projections(seen.lines, future.poses[0]))
 
 
@@ -370,7 +384,7 @@ def make_sample(
         if moved is not None:
             ego, state = observation.history.ego.copy(), moved
             ego[-1, :3] = features.map_poses(state[:3], ego[-1])
-            observation = observe_log(scenario, iteration, ego=ego)
+            observation = replace(observation, history=replace(observation.history, ego=ego))
     goes_back = moved is not None and not (as_published and kind.noise[3])
     now = Moment(scenario, row, observation, state, row if goes_back else None)
     return kind.label(planner, planner.features(observation), now)

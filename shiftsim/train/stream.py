@@ -26,7 +26,7 @@ from shiftsim.world.scenario import Scenario
 
 BATCH, PER_BLOCK = 32, 64  # samples; scenarios, enough that batches differ little
 # share of iterations that are samples: those in whose 8 s the ego turns, drives on, stands
-DRAWN = (0.2, 0.08, 0.025)
+DRAWN = (0.4, 0.16, 0.05)
 DRIVEN = 0.4  # share of those that a planner has driven
 TURNING, STANDING = 0.35, 1.0  # rad from which it turns, m below which it stands
 
@@ -69,6 +69,7 @@ class BlockMaker:
         self._stream, self._store = stream, open_store(stream.store)
         self._kind = KINDS[stream.planner]
         self._planner = self._kind.planner.asking(lambda scenes: ())
+        self._validated: set[str] = set()  # scenarios whose numbers are in their ranges
         self._driven: dict[str, list[tuple[Run, Task]]] = {}
         for run in map(open_run, stream.driven):
             for task, place in run.rollout_places.items():
@@ -94,7 +95,8 @@ class BlockMaker:
         """Samples of a scenario."""
         made: list[Sample] = []
         try:
-            scenario = self._store.read(token)
+            scenario = self._store.read(token, validate=token not in self._validated)
+            self._validated.add(token)
             self._planner.reset(scene_info(scenario))
         except ShiftsimError as error:
             failed[type(error).__name__] += 1

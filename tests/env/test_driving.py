@@ -16,9 +16,10 @@ import shiftsim
 import shiftsim.env
 from shiftsim.env.driving import DrivingEnv
 from shiftsim.errors import ConfigError, DataError, InvalidTrajectoryError
-from shiftsim.planners.learned.carl.planner import command_of
+from shiftsim.planners.learned.carl.planner import MAX_ACCELERATION, command_of
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.noise import sample_noise
+from shiftsim.sim.perception import Localization, Perception
 from shiftsim.world.state import AgentKind
 
 TOKEN = "0001cafe"  # of the toy store: a car is parked in the lane
@@ -232,6 +233,8 @@ def test_observations_and_rewards_of_ones_own(source_of):
         ({"observation": "pixels"}, ConfigError, "observation 'pixels' unknown"),
         ({"action": "steer"}, ConfigError, "action 'steer' unknown"),
         ({"noise": "loud"}, ConfigError, "noise 'loud' unknown"),
+        ({"perception": "blurred"}, ConfigError, "noise 'blurred' unknown"),
+        ({"latency": 150}, ConfigError, "not a multiple of 100 ms"),
         ({"traffic": "busy"}, ConfigError, "traffic 'busy' unknown"),
         ({"split": "none"}, ConfigError, "split 'none' unknown"),
         ({"render_mode": "human"}, ConfigError, "render_mode 'human' unknown"),
@@ -333,6 +336,57 @@ def test_an_episode_can_be_copied(toy, duplicate):
     twin = duplicate(env.episode)
     assert (twin.iteration, twin.terms) == (1, env.episode.terms)
     assert twin.snapshot() == env.episode.snapshot()
+
+
+def episode_under(toy, actions=None, **drift):
+    """Observations, steps as texts, and the environment at the end."""
+    env = DrivingEnv(store=str(toy), terminate=False, **drift)
+    seen, info = env.reset(options={"token": TOKEN, "noise_seed": 4})
+    shown, told = [seen], []
+    for action in weave(140) if actions is None else actions:
+        seen, *step, info = env.step(action)
+        shown.append(seen)
+        told.append(repr((step, info["terms"], info["infraction"], info.get("scores"))))
+        if step[-1]:
+            break
+    return np.array(shown), told, env
+
+
+@pytest.mark.parametrize("kind", ["perception", "localization"])
+def test_observations_drift_and_the_truth_does_not(toy, kind):
+    shown, told, env = episode_under(toy)
+    zero = {"perception": Perception(), "localization": Localization(), "latency": 0}
+    same, said, _ = episode_under(toy, **zero)
+    assert same.tobytes() == shown.tobytes()
+    assert said == told
+    other, said, drifting = episode_under(toy, **{kind: "high"})
+    assert said == told
+    assert drifting.episode.log.ego.tobytes() == env.episode.log.ego.tobytes()
+    assert (other != shown).any(axis=1).all()
+
+
+def test_actions_arrive_late(toy):
+    first = np.zeros((8, 2), np.float32)
+    first[0, 0] = 1.0
+    for latency in (0, 300):
+        _, _, env = episode_under(toy, latency=latency, actions=first)
+        sent = env.episode.log.commands[:8, 0]
+        assert np.flatnonzero(sent == MAX_ACCELERATION).tolist() == [latency // 100]
+
+
+@pytest.mark.parametrize("action", ["command", "trajectory"])
+def test_an_episode_under_drift_goes_on_from_a_snapshot(toy, action):
+    drift = {"perception": "high", "localization": "high", "latency": 200, "action": action}
+    ahead = np.zeros((10, 3), np.float32)
+    ahead[:, 0] = 0.5 * np.arange(1, 11)
+    actions = weave(9) if action == "command" else [ahead] * 9
+    *_, env = episode_under(toy, actions=actions, **drift)
+    twin = copy.deepcopy(env)
+    for given in actions:
+        (seen, *step), (seen_by_twin, *step_of_twin) = env.step(given), twin.step(given)
+        np.testing.assert_array_equal(seen_by_twin, seen)
+        assert step_of_twin == step
+    assert twin.episode.log.ego.tobytes() == env.episode.log.ego.tobytes()
 
 
 def test_a_snapshot_of_another_setting_is_refused(toy):

@@ -119,6 +119,21 @@ def test_axes_are_labelled(groups):
     assert {axes.get_xlabel() for axes in robustness.axes} == {"strength of the noise"}
 
 
+def test_panels_of_drifts_have_axes_of_their_own(tmp_path):
+    noise = "none", "perception-low", "miss-high", "localization-mid", "latency-100", "latency-300"
+    pictures = drawn(read_groups([write_run(tmp_path / "run", noise=noise)]))
+    boxes, times = (pictures[f"{kind}_made-up"].drawn for kind in ("perception", "latency"))
+    assert [axes.get_xlabel() for axes in boxes.axes] == [
+        "errors of the boxes",
+        "missed detections",
+    ]
+    pose, late = times.axes
+    assert pose.get_xlabel() == "error of the pose"
+    assert late.get_xlabel() == "latency of the plans [ms]"
+    assert [text.get_text() for text in late.get_xticklabels()] == ["0", "100", "300"]
+    assert {"clean", "under drift"} <= {text for text, _ in written(times)}
+
+
 def test_metrics_stand_in_the_order_of_all_tables_with_words_first(groups):
     axes = drawn(groups)["metrics_made-up"].drawn.axes[0]
     headings = [label.get_text().replace("\n", " ") for label in axes.get_xticklabels()]

@@ -64,17 +64,52 @@ def test_a_branch_is_what_a_rollout_drives_without_a_snapshot(scenario, traffic)
 
 
 @pytest.mark.parametrize("traffic", ["nonreactive", "reactive"])
-def test_a_planner_goes_on_after_the_plan(scenario, traffic):
-    rollout = rollout_at(scenario, AT, traffic=traffic)
-    plans = plans_at(6.0, [0.0, 0.02], count=10)
-    found = shiftsim.branch(rollout.snapshot(), plans, STEPS, follow=8, planner="pdm-closed")
+@pytest.mark.parametrize("latency", [200, 500])
+def test_plans_of_a_branch_arrive_late_as_others(scenario, traffic, latency):
+    setting = {"traffic": traffic, "latency": latency, "perception": "high"}
+    rollout = rollout_at(scenario, AT, **setting)
+    plans = plans_at(6.0, [-0.05, 0.05])
+    found = shiftsim.branch(rollout.snapshot(), plans, STEPS)
+    soon = shiftsim.branch(rollout_at(scenario, AT, traffic=traffic).snapshot(), plans, STEPS)
+    assert not np.array_equal(found.states, soon.states)
     for plan, states in zip(plans, found.states, strict=True):
-        alone = rollout_at(scenario, AT, traffic=traffic)
+        alone = rollout_at(scenario, AT, **setting)
         fixed = absolute(plan, alone)
-        for _ in range(8):
+        for _ in range(STEPS):
+            alone.advance(fixed)
+        assert states.tobytes() == alone.log().ego[AT : AT + STEPS + 1].tobytes()
+    at_once = latency // 100
+    assert np.array_equal(found.states[0, : at_once + 1], found.states[1, : at_once + 1])
+
+
+def test_errors_of_the_pose_move_no_plan_of_a_branch(scenario):
+    states = []
+    for localization in ("none", "high"):
+        start = rollout_at(scenario, 0, localization=localization).snapshot()
+        states.append(shiftsim.branch(start, plans_at(6.0, [0.05]), STEPS).states)
+    assert states[0].tobytes() == states[1].tobytes()
+
+
+@pytest.mark.parametrize(
+    ("traffic", "follow", "drift"),
+    [
+        ("nonreactive", 8, {}),
+        ("reactive", 8, {}),
+        ("nonreactive", 2, {"latency": 300}),
+        ("reactive", 8, {"latency": 300, "perception": "high"}),
+    ],
+)
+def test_a_planner_goes_on_after_the_plan(scenario, traffic, follow, drift):
+    rollout = rollout_at(scenario, AT, traffic=traffic, **drift)
+    plans = plans_at(6.0, [0.0, 0.02], count=10)
+    found = shiftsim.branch(rollout.snapshot(), plans, STEPS, follow=follow, planner="pdm-closed")
+    for plan, states in zip(plans, found.states, strict=True):
+        alone = rollout_at(scenario, AT, traffic=traffic, **drift)
+        fixed = absolute(plan, alone)
+        for _ in range(follow):
             alone.advance(fixed)
         alone.drive_by(shiftsim.load_planner("pdm-closed"))
-        for _ in range(STEPS - 8):
+        for _ in range(STEPS - follow):
             alone.advance(alone.planner.plan(alone.observe()))
         assert states.tobytes() == alone.log().ego[AT : AT + STEPS + 1].tobytes()
 

@@ -2,16 +2,25 @@
 
 import copy
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import shiftsim
-from shiftsim.errors import ConfigError, DataError
+from shiftsim.errors import DataError
+from shiftsim.planners.basic import ConstantVelocity as ConstantVelocityPlanner
 from shiftsim.sim.loop import Rollout, drive
 from shiftsim.sim.traffic.mixed import ConstantVelocity
+from shiftsim.world.state import Command
 
 TRAFFIC = ("nonreactive", "reactive", "constant-velocity", "learned")
+DRIFTS = (
+    {"perception": "high+miss-high+dropout-high"},
+    {"localization": "high"},
+    {"latency": 300},
+    {"perception": "mid", "localization": "mid", "latency": 200},
+)
 PARTS = ("ego", "commands", "noise", "degraded")
 
 
@@ -86,11 +95,46 @@ def test_views_show_the_noise_of_the_whole_rollout(scenario):
     assert np.abs(rollout.log().noise).max() > 0.0
 
 
-@pytest.mark.parametrize(
-    "drift", [{"perception": "low"}, {"localization": "low"}, {"latency": 200}]
-)
-def test_under_a_drift_there_are_no_snapshots_and_forks(scenario, drift):
-    rollout = Rollout(scenario, shiftsim.load_planner("constant-velocity"), **drift)
-    for take in (rollout.snapshot, rollout.fork):
-        with pytest.raises(ConfigError, match="no snapshots and forks"):
-            take()
+@pytest.mark.parametrize("traffic", ["nonreactive", "reactive"])
+@pytest.mark.parametrize("drift", DRIFTS)
+@pytest.mark.parametrize("iteration", [0, 40])
+def test_what_is_seen_and_plans_under_way_go_on_with_the_same_bytes(
+    scenario, traffic, drift, iteration
+):
+    setting = {"traffic": traffic, "noise": "ou-low", "seed": 3, **drift}
+    rollout = Rollout(scenario, shiftsim.load_planner("idm"), **setting)
+    snapshot = pickle.loads(pickle.dumps(run_to(rollout, iteration).snapshot()))
+    assert {snapshot, rollout.snapshot()} == {snapshot}
+    fork = rollout.fork()
+    fork.drive_by(shiftsim.load_planner("idm"))
+    other = Rollout(scenario, shiftsim.load_planner("idm"), snapshot.setting)
+    other.resume(snapshot)
+    whole = drive(rollout)
+    for one in (fork, other):
+        log = drive(one)
+        assert_same(log, whole)
+        if whole.seen is not None:
+            assert log.seen.ego.tobytes() == whole.seen.ego.tobytes()
+            assert log.seen.tracks.poses.tobytes() == whole.seen.tracks.poses.tobytes()
+
+
+def test_plans_under_way_are_part_of_a_snapshot(scenario):
+    rollout = run_to(Rollout(scenario, ConstantVelocityPlanner(), latency=200), 5)
+    snapshot = rollout.snapshot()
+    assert len(snapshot.plans) == 2
+    assert snapshot != replace(snapshot, plans=snapshot.plans[::-1])
+    sent = replace(snapshot, plans=(Command(1.0, 0.0), Command(0.0, 0.1)))
+    assert sent != replace(snapshot, plans=(Command(1.0, 0.0), Command(0.0, 0.2)))
+    assert sent == pickle.loads(pickle.dumps(sent))
+    with pytest.raises(DataError, match="has 0 plans under way"):
+        Rollout(scenario, ConstantVelocityPlanner(), latency=200).resume(
+            rollout.log().snapshot(5, rollout.setting)
+        )
+
+
+def test_a_fork_observes_the_truth_until_a_planner_drives_it(scenario):
+    rollout = run_to(Rollout(scenario, ConstantVelocityPlanner(), localization="high"), 5)
+    fork = rollout.fork()
+    assert fork.observe().ego.x == fork.log().ego[5, 0] != rollout.observe().ego.x
+    fork.drive_by(ConstantVelocityPlanner())
+    assert fork.observe().ego.x == rollout.observe().ego.x

@@ -142,7 +142,7 @@ def lanes_in_square(
     """
     lanes = meeting(areas, square)
     # nuPlan rule 334: the layer of lane connectors that is asked holds lines, not areas
-    crossing = np.sort(connectors.query(shapely.Polygon(square), predicate="intersects"))
+    crossing = np.sort(connectors.query(shapely.polygons(square), predicate="intersects"))
     return np.concatenate([lanes[lanes < num_lanes], num_lanes + crossing])
 
 
@@ -239,8 +239,8 @@ def _samples_of(valid: BoolArray) -> IntArray:
     """
     last = len(valid) - 1
     own = np.where(valid, np.arange(len(valid))[:, None], last)
-    later = np.minimum.accumulate(own[::-1])[:SAMPLES]
-    return np.pad(later, ((0, SAMPLES - len(later)), (0, 0)), mode="edge")[::-1]
+    later = np.minimum.accumulate(own[::-1])
+    return later[np.minimum(np.arange(SAMPLES)[::-1], last)]
 
 
 def _fill_poses(rows: Single, poses: FloatArray, anchor: FloatArray) -> None:

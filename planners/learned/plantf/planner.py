@@ -108,8 +108,9 @@ def current_state(history: History) -> np.ndarray:
     turn = wrap_angle(ego[-1, HEADING] - ego[-2, HEADING]) / features.STEP if len(ego) > 1 else 0.0
     steer = yaw_rate = 0.0
     if abs(speed) >= MIN_SPEED:
-        steer = np.clip(np.arctan(turn * PACIFICA.wheel_base / abs(speed)), -MAX_STEER, MAX_STEER)
-        yaw_rate = np.clip(turn, -MAX_YAW_RATE, MAX_YAW_RATE)
+        angle = np.arctan(turn * PACIFICA.wheel_base / abs(speed))
+        steer = min(max(angle, -MAX_STEER), MAX_STEER)
+        yaw_rate = min(max(turn, -MAX_YAW_RATE), MAX_YAW_RATE)
     return np.array([0.0, 0.0, 0.0, speed, ego[-1, AX], steer, yaw_rate], np.float32)
 
 

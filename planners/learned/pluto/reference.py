@@ -91,11 +91,12 @@ def reference_lines(
     `rear` (3,) and `center` (3,) are the poses of the rear axle and of the ego box.
     """
     x, y = float(rear[0]), float(rear[1])
-    near = road.edges.within_box(float(center[0]), float(center[1]), START_HALF_SIDE)
+    near = set(road.edges.within_box(float(center[0]), float(center[1]), START_HALF_SIDE).tolist())
     starts = [
         start
-        for start in route.starts[np.isin(route.starts, near)].tolist()
-        if road.baselines.length(start) > MIN_BASELINE
+        for start in route.starts.tolist()
+        if start in near
+        and road.baselines.length(start) > MIN_BASELINE
         and deviation(road.baselines, start, STRIDE, *rear.tolist())[1] < MAX_HEADING_ERROR
     ]
     after = {lane for start in starts for lane in road.outgoing.at(start).tolist()}
@@ -149,7 +150,8 @@ def _distinct(lines: list[FloatArray]) -> list[FloatArray]:
 def _cut(path: LanePath, x: float, y: float) -> tuple[FloatArray, float]:
     """The next 120 m of a path from (x, y) on: poses (K, 3), and their length [m]."""
     here = path.project(x, y)
-    low, high = np.clip([here, here + LINE_LENGTH], path.driven.progress[0], path.end).tolist()
+    first, last = float(path.driven.progress[0]), path.end
+    low, high = (min(max(at, first), last) for at in (here, here + LINE_LENGTH))
     line = sub_path(path.driven, low, high)
     # nuPlan rule 250: the ends are wrapped, vertices keep the angle between them
     turned = np.abs(line[:, 2]) > np.pi

@@ -47,7 +47,9 @@ from shiftsim.world.state import (
     LAST_AGENT_KIND,
     NUM_STATE,
     PACIFICA,
+    Command,
     Tracks,
+    Trajectory,
     X,
     Y,
     center_poses,
@@ -132,24 +134,17 @@ def branch(
     """
     plans = np.asarray(plans, np.float64)
     if isinstance(snapshot, Snapshot):
-        found = [_Start(snapshot, store, setting).branch(plans, steps, spacing, follow, planner)]
-        return _joined(found, squeeze=True)
+        return _Start(snapshot, store, setting).branch(plans, steps, spacing, follow, planner)
     if len(plans) != len(snapshot) or not len(plans):
         raise ConfigError(f"{len(snapshot)} snapshots, and plans for {len(plans)} of them")
     starts = (_Start(one, store, setting) for one in snapshot)
     pairs = zip(starts, plans, strict=True)
-    return _joined([one.branch(own, steps, spacing, follow, planner) for one, own in pairs])
-
-
-def _joined(found: Sequence[Branches], *, squeeze: bool = False) -> Branches:
-    def join(arrays: list[np.ndarray]) -> Any:
-        return arrays[0] if squeeze else np.stack(arrays)
-
+    found = [one.branch(own, steps, spacing, follow, planner) for one, own in pairs]
     return Branches(
-        states=join([one.states for one in found]),
-        parts={name: join([one.parts[name] for one in found]) for name in PARTS},
-        first={name: join([one.first[name] for one in found]) for name in FIRST},
-        errors=join([one.errors for one in found]),
+        states=np.stack([one.states for one in found]),
+        parts={name: np.stack([one.parts[name] for one in found]) for name in PARTS},
+        first={name: np.stack([one.first[name] for one in found]) for name in FIRST},
+        errors=np.stack([one.errors for one in found]),
     )
 
 
@@ -169,7 +164,7 @@ class _Start:
         self.setting = setting or snapshot.setting
         if self.setting.controller != "lqr":
             raise ConfigError(f"branches need the controller 'lqr', not {self.setting.controller}")
-        self.rollout = Rollout(scenario, ConstantVelocity(), self.setting)
+        self.rollout = Rollout(scenario, ConstantVelocity(), self.setting).fork()
         self.rollout.resume(snapshot)
         # whether the others do the same whatever the ego does
         named, script = self.setting.traffic, scenario.script
@@ -196,12 +191,21 @@ class _Start:
         driven = np.empty((len(plans), follow + 1, NUM_STATE))
         driven[:, 0] = ego
         times = log.time_us[now : now + follow + 1], plan_us.astype(np.int64)
+        if late := min(len(self.snapshot.plans), follow):  # what all do before their plans arrive
+            before = self.rollout.fork()
+            for _ in range(late):
+                before.advance(Command(0.0, 0.0))  # is not followed any more
+            driven[:, : late + 1] = before.log().ego[now : now + late + 1]
+            commands[:, :late] = before.log().commands[now : now + late]
         noise = log.noise[now : now + follow]
-        status = follow_plans(*times, states, noise, NUPLAN, driven, commands)
+        status = follow_plans(*times, states, late, noise, NUPLAN, driven, commands)
         raise_for_status(int(status), int(times[0][0]), times[1])
         if self.is_replayed and follow == steps:
-            return self._rated(driven, [self.rollout], np.full(len(plans), "", object))
-        forks, errors = self._forks(driven[:, 1:], commands)
+            return self._rated(driven, [], np.full(len(plans), "", object))
+        waiting = [
+            (*self.snapshot.plans[follow:], *[Trajectory(times[1], plan)] * late) for plan in states
+        ]
+        forks, errors = self._forks(driven[:, 1:], commands, waiting)
         if follow < steps:
             self._drive_on(forks, errors, planner, steps - follow)
         out = np.full((len(plans), steps + 1, NUM_STATE), np.nan)
@@ -224,7 +228,9 @@ class _Start:
                 hint="drive fewer steps, or let a planner go on: follow=…, planner=…",
             )
 
-    def _forks(self, driven: FloatArray, commands: FloatArray) -> tuple[list[Rollout], np.ndarray]:
+    def _forks(
+        self, driven: FloatArray, commands: FloatArray, waiting: Sequence[Any]
+    ) -> tuple[list[Rollout], np.ndarray]:
         """A rollout of each branch, in which the others have seen what it drove."""
         forks, errors, before = [], np.full(len(driven), "", object), self.snapshot
         for number, (states, sent) in enumerate(zip(driven, commands, strict=True)):
@@ -235,6 +241,7 @@ class _Start:
                 commands=np.concatenate([before.commands, sent]),
                 planning_seconds=np.append(before.planning_seconds, np.zeros(len(sent))),
                 degraded=np.append(before.degraded, np.zeros(len(sent), np.bool_)),
+                plans=waiting[number],
             )
             try:
                 fork.resume(more)
@@ -258,7 +265,7 @@ class _Start:
                 errors[number] = str(result)
 
     def _rated(self, driven: FloatArray, worlds: list[Rollout], errors: np.ndarray) -> Branches:
-        """Parts of all branches, in one world or in one each."""
+        """Parts of all branches, in one world each, or in the recorded one."""
         now, count = self.snapshot.iteration, driven.shape[1]
         observation, road = self.rollout.observe(), self.scenario.map
         planner = PdmClosed(map_radius=navsim.RADIUS, lateral_offsets=())
@@ -266,24 +273,21 @@ class _Start:
         place = planner.look(observation)[0].place
         ground = navsim.ground_around(road, place, observation.ego.center)
         ego, lights = observation.history.ego, self.scenario.iteration_rows[now : now + count]
-        dark = _around(self.rollout.log().tracks.rows(slice(now, now + 1)), ego[-1])
-        lit = navsim.with_lights(dark, self.scenario, lights, 1)
+        # beyond what was driven only a recording is known
+        known = slice(now, now + count + (_TTC if self.is_replayed else 0))
+        around = [_around(one.log().tracks.rows(known), ego[-1]) for one in (self.rollout, *worlds)]
+        lit = navsim.with_lights(around[0], self.scenario, lights, 1)
         tables = [
             {name: np.full(len(driven), np.nan) for name in names} for names in (PARTS, FIRST)
         ]
-        # beyond what was driven only a recording is known
-        known = count + (_TTC if self.is_replayed else 0)
-        for number, world in enumerate(worlds):
-            rows = slice(None) if world is self.rollout else slice(number, number + 1)
-            if any(errors[rows]):
-                continue
-            around = _around(world.log().tracks.rows(slice(now, now + known)), ego[-1])
-            around = around._replace(connectors=lit.connectors, red=lit.red)
+        good = np.flatnonzero(errors == "")
+        if len(good):
             past = np.ascontiguousarray(ego[-1 - _PAST : -1])
-            parts = navsim.evaluate(driven[rows], ground, around, "v2", past)
-            for table, found in zip(tables, (parts, _first_steps(parts, around)), strict=True):
+            own = tuple(around[1 + number] for number in good if worlds)
+            parts = navsim.evaluate(driven[good], ground, lit, "v2", past, own)
+            for table, found in zip(tables, (parts, _first_steps(parts, lit)), strict=True):
                 for name, column in table.items():
-                    column[rows] = found[name]
+                    column[good] = found[name]
         driven[errors != ""] = np.nan
         return Branches(states=driven, parts=tables[0], first=tables[1], errors=errors)
 
@@ -331,9 +335,10 @@ def follow_plans(
     time_us: IntArray,  # (S + 1,) time stamps, from now on [us]
     plan_us: IntArray,  # (H,) those of the poses of plans [us]
     plans: FloatArray,  # (K, H, 11) states of plans; only the poses are read
+    first: int,  # the step at which they are there; states before are given
     noise: FloatArray,  # (S, 2) of the commands
     params: LqrParameters,
-    states: FloatArray,  # (K, S + 1, 11) the first ones are there; receives the others
+    states: FloatArray,  # (K, S + 1, 11) receives those after that step
     commands: FloatArray,  # (K, S, 2) receives the commands before noise
 ) -> int:
     """What `track_and_step` does step by step, for many plans that are not made anew.
@@ -346,7 +351,7 @@ def follow_plans(
     dt, target, ahead = params.step_us / 1e6, np.empty(plans.shape[2]), np.empty(params.horizon)
     for row in range(len(plans)):
         speeds, curvatures = fit_profiles(plan_us, plans[row], params)
-        for step in range(len(noise)):
+        for step in range(first, len(noise)):
             now, state = time_us[step] * 1e-6, states[row, step]
             if not interpolate(plan_us, plans[row], time_us[step], target):
                 return NOT_COVERED

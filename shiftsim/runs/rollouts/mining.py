@@ -56,9 +56,8 @@ def mine(
     """
     one_of("kind", kind, KINDS)
     if run.manifest.get("edits"):
-        raise ConfigError(
-            f"run {run.path.name!r} drove edited scenarios", "mine a run of recorded ones"
-        )
+        hint = "an edit has no second beginning: run without --edits, and mine that run"
+        raise ConfigError(f"run {run.path.name!r} drove edited scenarios", hint)
     window = before + AFTER if window is None else window
     edits = list(_edits(run, kind, before, window, planner))
     if not edits:
@@ -78,9 +77,8 @@ def _edits(
     store, traffic = open_run_store(run), run.manifest["determining"]["traffic"]
     for row in run.metrics.to_pylist():
         at = row["first_violation_iteration"]
-        if row["metric"] != KINDS[kind] or at is None or row["score"] == 1.0:
-            continue
-        if planner and row["planner"] != planner:
+        is_wrong = row["metric"] == KINDS[kind] and at is not None and row["score"] != 1.0
+        if not is_wrong or planner not in ("", row["planner"]):
             continue
         task = Task(*(row[name] for name in Task._fields))
         scenario = store.read(task.token)

@@ -9,10 +9,11 @@ from shiftsim.benchmarks.speed.city import bench_scene
 from shiftsim.data.readers.dsc3d import open_site, read_recording
 from shiftsim.data.readers.windows import overlap_partners
 from shiftsim.data.store.reading import ScenarioStore
+from shiftsim.data.synthetic import store as store_module
 from shiftsim.data.synthetic.layouts import random_town
 from shiftsim.data.synthetic.roads import STEP
 from shiftsim.data.synthetic.routes import RandomRoutes, Route, make_path
-from shiftsim.data.synthetic.store import demo_store
+from shiftsim.data.synthetic.store import MANIFEST, demo_store
 from shiftsim.data.synthetic.town import Turn
 from shiftsim.metrics import compute_metrics
 from shiftsim.planners.registry import load_planner
@@ -162,6 +163,22 @@ def test_an_existing_demo_store_is_kept(store):
     before = (store.path / "store.json").stat().st_mtime_ns
     assert demo_store(store.path) == store.path
     assert (store.path / "store.json").stat().st_mtime_ns == before
+
+
+def test_a_demo_that_another_process_made_in_the_meantime_is_kept(tmp_path, monkeypatch):
+    path = tmp_path / "demo"
+
+    def make_town(parts, town):
+        path.mkdir(exist_ok=True)
+        (path / MANIFEST).write_text("theirs")
+
+    monkeypatch.setattr(store_module.recordings, "make_town", make_town)
+    monkeypatch.setattr(store_module, "_join", lambda parts, towns, place, fields: place.mkdir())
+    monkeypatch.setattr(store_module, "ScenarioStore", lambda place: place)
+    monkeypatch.setattr(store_module, "_sample", lambda made: [])
+    assert demo_store(path) == path
+    assert (path / MANIFEST).read_text() == "theirs"
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_the_benchmark_city_is_large_and_its_agents_are_near():

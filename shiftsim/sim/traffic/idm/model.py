@@ -38,7 +38,7 @@ from shiftsim.sim.traffic.idm.scene import (
     row_of,
     with_longer_paths,
 )
-from shiftsim.sim.traffic.idm.step import DONE, LEFT_PATH, LONGER_PATHS, advance, write_agents
+from shiftsim.sim.traffic.idm.step import LEFT_PATH, LONGER_PATHS, advance_steps, write_agents
 from shiftsim.sim.traffic.idm.yielding import make_yielding
 from shiftsim.sim.traffic.lanes import light_flags
 from shiftsim.world.events import CAUTIOUS, LOGGED, OFF
@@ -123,7 +123,7 @@ class IdmTraffic:
             set_box(self._scene.footprints, agent, *start.pose, *fleet.size[agent])
         self._light_edges, self._lights = light_flags(scenario)
         # nuPlan rule 11: a difference of epoch seconds
-        self._spans = np.diff(scenario.iteration_times * 1e-6).tolist()
+        self._spans = np.diff(scenario.iteration_times * 1e-6)
         _remove(tracks, row, ~is_replayed)
         write_agents(fleet, agents, row_of(tracks, row))
 
@@ -133,24 +133,30 @@ class IdmTraffic:
         Raises:
             TrafficError: An agent is outside of its own corridor.
         """
-        scene = self._scene
+        self.step_many(iteration, ego[None], tracks, row)
+
+    def step_many(self, iteration: int, egos: FloatArray, tracks: Tracks, row: int) -> None:
+        """Several steps, with the ego states (S, 11) at their beginnings; else as `step`."""
+        scene, rows = self._scene, row_of(tracks, slice(None))
         if scene is None:
             raise ConfigError("traffic was stepped before it was started", hint="call start first")
-        # nuPlan rule 130: the ego is one step old, lights and replayed tracks are one step ahead
-        if len(self._light_edges):
-            scene.graph.lights[self._light_edges] = self._lights[iteration + 1]
-        if scene.yielding.policy != OFF:
-            start = find_start(self._map, center_poses(ego[None, :3])[0])
-            scene.yielding.ego_block[0] = NONE if start is None else self._map.block_of[start.edge]
-        if len(self._stopped):
-            self._drop_far(ego, tracks, row)
-        end, what = -1, 0
-        while end != DONE:
-            end, what = advance(scene, row_of(tracks, row), ego, self._spans[iteration])
+        done, looks = 0, scene.yielding.policy != OFF
+        while done < len(egos):
+            if looks:
+                start = find_start(self._map, center_poses(egos[done, None, :3])[0])
+                edge = NONE if start is None else self._map.block_of[start.edge]
+                scene.yielding.ego_block[0] = edge
+            if len(self._stopped):
+                self._drop_far(egos[done], tracks, row + done)
+            stop = done + 1 if looks or len(self._stopped) else len(egos)
+            known = self._spans, self._light_edges, self._lights
+            given = row + done, egos[done:stop], iteration + done
+            count, end, what = advance_steps(scene, rows, *given, *known)
+            done += count
             if end == LEFT_PATH:
                 raise TrafficError(
                     f"reactive agent {tracks.tokens[scene.agents[what]]} is outside of its own "
-                    f"path at iteration {iteration + 1}",
+                    f"path at iteration {iteration + done + 1}",
                     hint="nuPlan fails here as well; leave the scenario out, or use other traffic",
                 )
             if end == LONGER_PATHS:

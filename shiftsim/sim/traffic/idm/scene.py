@@ -115,7 +115,7 @@ class Scene(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One row of tracks, as in `Tracks`: (N,), (N, 3), (N, 2), (N, 2)."""
+    """A row of tracks, as in `Tracks`: (N,), (N, 3), (N, 2), (N, 2); or several rows of them."""
 
     valid: BoolArray
     poses: FloatArray
@@ -123,8 +123,8 @@ class Row(NamedTuple):
     sizes: FloatArray
 
 
-def row_of(tracks: Tracks, row: int) -> Row:
-    """One row of tracks, as kernels take it."""
+def row_of(tracks: Tracks, row: int | slice) -> Row:
+    """One row of tracks, or several, as kernels take them."""
     return Row(tracks.valid[row], tracks.poses[row], tracks.velocities[row], tracks.sizes[row])
 
 
@@ -164,15 +164,15 @@ def make_scene(
 
 
 def _make_curves(fleet: Fleet) -> FloatArray:
-    # room for any curve: pages of zeros that nobody writes take no memory
+    # room for any curve: pages that nobody writes take no memory
     num_agents, longest, _ = fleet.path.shape
-    return np.zeros((num_agents + 2, curve_capacity(longest + _EXTRA_POINTS), 2))
+    return np.empty((num_agents + 2, curve_capacity(longest + _EXTRA_POINTS), 2))
 
 
 def _make_scratch(fleet: Fleet) -> Scratch:
     points = fleet.path.shape[1] + _EXTRA_POINTS
-    runs, outline = np.zeros(((points - 2) // RUN + 1, 4)), np.zeros((curve_capacity(points), 2))
-    return Scratch(np.zeros((points, 2)), runs, outline, np.zeros(1, np.int64))
+    runs, outline = np.empty(((points - 2) // RUN + 1, 4)), np.empty((curve_capacity(points), 2))
+    return Scratch(np.empty((points, 2)), runs, outline, np.zeros(1, np.int64))
 
 
 def with_longer_paths(scene: Scene, needed: int) -> Scene:

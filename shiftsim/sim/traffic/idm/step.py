@@ -29,6 +29,30 @@ _EGO_LENGTH, _EGO_WIDTH, _EGO_CENTER = PACIFICA.length, PACIFICA.width, PACIFICA
 
 
 @kernel
+def advance_steps(
+    scene: Scene,
+    tracks: Row,  # all rows of them
+    row: int,  # the one in which the first step ends
+    egos: FloatArray,  # (S, 11) ego states at the beginnings of the steps
+    iteration: int,  # at which the first step begins
+    spans: FloatArray,  # (T - 1,) how long each step is [s]
+    edges: IntArray,  # (L,) with a light
+    lights: IntArray,  # (T, L) which lights are listed at each iteration
+) -> tuple[int, int, int]:
+    """`advance` for several steps: how many were done, and how the last one ended."""
+    # nuPlan rule 130: the ego is one step old, lights and replayed tracks are one step ahead
+    for step in range(len(egos)):
+        for index in range(len(edges)):
+            scene.graph.lights[edges[index]] = lights[iteration + step + 1, index]
+        at = row + step
+        now = Row(tracks.valid[at], tracks.poses[at], tracks.velocities[at], tracks.sizes[at])
+        end, what = advance(scene, now, egos[step], spans[iteration + step])
+        if end != DONE:
+            return step, end, what
+    return len(egos), DONE, 0
+
+
+@kernel
 def advance(scene: Scene, row: Row, ego: FloatArray, span: float) -> tuple[int, int]:
     """Move every agent by one step, `span` [s] long, and write where it is.
 
