@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from shiftsim.planners.learned import encoders
 from shiftsim.planners.learned import network as layers
+from shiftsim.planners.learned import network_encoders as encoders
 from shiftsim.planners.learned.deterministic import DriveHead
 from shiftsim.planners.learned.network import DIM, Linear, head, perceptron
 
