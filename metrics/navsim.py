@@ -134,7 +134,7 @@ def frame_world(scenario: Scenario, iteration: int = 0, version: str = "v2") -> 
     before = row - step * np.arange(3, -1, -1)
     if before[0] < 0 or after[-1] >= len(scenario.time_us):
         raise DataError(
-            f"scenario {scenario.token!r}: iteration {iteration} has too little recording around",
+            f"scenario {scenario.token!r} has too little recording around iteration {iteration}",
             f"NAVSIM's score {version} needs 1.5 s before it and {rules.seconds:g} s after it",
         )
     ego, time_us = scenario.ego[row].copy(), int(scenario.time_us[row])
@@ -185,8 +185,8 @@ def score(
     if previous is not None:
         seconds = (world.time_us - previous.time_us) * 1e-6
         if not 0.0 < seconds < MAX_INTERVAL or previous.states.shape != states.shape:
-            found = f"{len(previous.score)} of {seconds:.3g} s before"
-            raise ValueError(f"extended comfort compares {len(plans)} plans; {found} do not fit")
+            text = f"extended comfort compares {len(plans)} plans with those of {MAX_INTERVAL} s before"
+            raise ValueError(f"{text} at most, not {len(previous.score)} of {seconds:.3g} s before")
         differences = extended_differences(states, previous.states, seconds)
         parts["two_frame_extended_comfort"] = 1.0 * (differences <= EXTENDED_LIMITS).all(axis=1)
     human = world.human if human_filter and world.version == "v2" else None
