@@ -185,8 +185,8 @@ def score(
     if previous is not None:
         seconds = (world.time_us - previous.time_us) * 1e-6
         if not 0.0 < seconds < MAX_INTERVAL or previous.states.shape != states.shape:
-            text = f"extended comfort compares {len(plans)} plans with those of {MAX_INTERVAL} s before"
-            raise ValueError(f"{text} at most, not {len(previous.score)} of {seconds:.3g} s before")
+            text = f"extended comfort compares {len(plans)} plans of up to {MAX_INTERVAL} s before"
+            raise ValueError(f"{text}, not {len(previous.score)} of {seconds:.3g} s before")
         differences = extended_differences(states, previous.states, seconds)
         parts["two_frame_extended_comfort"] = 1.0 * (differences <= EXTENDED_LIMITS).all(axis=1)
     human = world.human if human_filter and world.version == "v2" else None
