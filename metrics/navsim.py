@@ -15,6 +15,7 @@ import shapely
 from shiftsim.errors import DataError, one_of
 from shiftsim.geometry.boxes import boxes_to_corners, from_frame, to_frame, wrap_angles
 from shiftsim.geometry.fits import filter_signal, make_filter
+from shiftsim.geometry.rings import centroid
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.metrics.comfort import comfort_signals, unwrap, within_bounds
 from shiftsim.metrics.result import NUPLAN
@@ -103,6 +104,9 @@ class Scores:
     progress_m: FloatArray  # along the centerline [m]
     collision_index: FloatArray  # first time index of an at-fault collision, inf if none
     ttc_index: FloatArray  # first time index with too short a time to collision, inf if none
+    off_road_index: FloatArray  # and so on: with a corner off the drivable area
+    wrong_way_index: FloatArray  # too far off the route
+    red_light_index: FloatArray | None = None  # on a connector that is red
     flags: BoolArray  # (P, T, 3) whether the ego is on several lanes, off the road, off the route
     states: FloatArray  # (P, T, 11) as driven
     time_us: int  # of the frame [us]
@@ -223,21 +227,24 @@ def evaluate(
     along = shapely.line_locate_point(ground.centerline, points[:, [0, -1]])
     # nuPlan rule 743: v2 has no wrong direction within intersections
     wrong_way = flags[..., places.OFF_ROUTE] & ~(crosses & (version == "v2"))
-    most = way_off_route(at.centers, wrong_way).max(axis=1)
+    way, off_road_index = way_off_route(at.centers, wrong_way), _first(off_road)
     parts = {
         "no_at_fault_collisions": fault,
-        "drivable_area_compliance": 1.0 * ~off_road.any(axis=1),
-        "driving_direction_compliance": 0.5 * sum(1.0 * (most < m) for m in DIRECTION_LIMITS),
+        "drivable_area_compliance": 1.0 * (off_road_index == contacts.NEVER),
+        "driving_direction_compliance": 0.5 * sum(way.max(axis=1) < m for m in DIRECTION_LIMITS),
         "time_to_collision_within_bound": 1.0 * (ttc_index == contacts.NEVER),
         "progress_m": np.maximum(along[:, 1] - along[:, 0], 0.0),
         "collision_index": fault_index,
         "ttc_index": ttc_index,
+        "off_road_index": off_road_index,
+        "wrong_way_index": _first(way >= DIRECTION_LIMITS[0]),
         "flags": flags,
         "states": states,
     }
     if version == "v1":
         return {**parts, "comfort": comfort(states, ComfortBounds()).score}
-    parts["traffic_light_compliance"] = 1.0 * ~touches_red(at.corners, around).any(axis=1)
+    index = parts["red_light_index"] = _first(_touches_red(at.corners, around))
+    parts["traffic_light_compliance"] = 1.0 * (index == contacts.NEVER)
     # nuPlan rule 744: intersections are left out, as if they took no time
     outside = (row[~inside] for row, inside in zip(points, crosses, strict=True))
     leaves = [_leaves_line(row, ground.centerline) for row in outside]
@@ -246,6 +253,11 @@ def evaluate(
     whole = (np.concatenate([past, row]) for row in states if len(past))
     calm = [all(within_bounds(comfort_signals(times, row), NUPLAN)) for row in whole]
     return {**parts, "history_comfort": np.array(calm or [True] * len(states), np.float64)}
+
+
+def _first(violated: BoolArray) -> FloatArray:
+    """(P,) first of the steps (P, T) that violate, inf without one."""
+    return np.where(violated.any(axis=1), violated.argmax(axis=1), contacts.NEVER)
 
 
 def way_off_route(centers: FloatArray, wrong_way: BoolArray) -> FloatArray:
@@ -258,14 +270,11 @@ def way_off_route(centers: FloatArray, wrong_way: BoolArray) -> FloatArray:
 
 def _leaves_line(points: np.ndarray, line: shapely.LineString) -> bool:
     """Whether so many points (K,) in a row are too far from a line."""
-    each = DEVIATION_STEPS  # every so many points there is one in each such row
-    if shapely.dwithin(line, points[each - 1 :: each], MAX_DEVIATION).all():
-        return False
     near = np.flatnonzero(shapely.dwithin(line, points, MAX_DEVIATION))
-    return bool(np.diff(near, prepend=-1, append=len(points)).max() > each)
+    return bool(np.diff(near, prepend=-1, append=len(points)).max() > DEVIATION_STEPS)
 
 
-def touches_red(corners: FloatArray, around: Surroundings) -> BoolArray:
+def _touches_red(corners: FloatArray, around: Surroundings) -> BoolArray:
     """(P, T) whether the ego (P, T, 4, 2) touches a connector while it is red."""
     touched = np.zeros(corners.shape[:2], np.bool_)
     if around.connectors:
@@ -374,24 +383,13 @@ def recorded_surroundings(tracks: state.Tracks, ttc_steps: int) -> Surroundings:
     speeds = np.where(is_agent, np.hypot(*tracks.velocities[first, number].T), 0.0)
     boxes, centers = boxes_to_corners(poses, sizes), poses[..., :2]
     travel = np.hypot(*np.diff(centers, axis=0).T).max(axis=1, initial=0.0)
-    centers, middles = np.where(absent[..., None], np.inf, centers), _centroids(boxes)
+    centers = np.where(absent[..., None], np.inf, centers)
+    middles = np.array([centroid(box) for box in boxes.reshape(-1, 4, 2)]).reshape(centers.shape)
     speeds, radii = np.broadcast_to(speeds, absent.shape).copy(), 0.5 * np.hypot(*sizes.T)
     ignored = np.zeros(len(number), np.bool_)
     others = contacts.Obstacles(boxes, centers, middles, speeds, radii, is_agent, ignored)
     reaches = np.nan_to_num((TTC_STEPS[-1] + 1) * travel, nan=np.inf)
     return Surroundings(others, np.arange(ttc_steps), reaches, [], np.zeros((SCORED + 1, 0), bool))
-
-
-def _centroids(boxes: FloatArray) -> FloatArray:
-    """(..., 2) centroids of boxes (..., 4, 2), to the last bit those of `rings.centroid` [m]."""
-    x, y = np.moveaxis(boxes, (-1, -2), (0, 1))
-    area = sum_x = sum_y = 0.0
-    for a, b in ((1, 2), (2, 3)):
-        double = (x[a] - x[0]) * (y[b] - y[0]) - (x[b] - x[0]) * (y[a] - y[0])
-        sum_x = sum_x + double * (x[0] + x[a] + x[b])
-        sum_y = sum_y + double * (y[0] + y[a] + y[b])
-        area = area + double
-    return np.stack([sum_x / 3.0 / area, sum_y / 3.0 / area], axis=-1)
 
 
 def with_lights(on: Surroundings, scenario: Scenario, rows: IntArray, each: int) -> Surroundings:

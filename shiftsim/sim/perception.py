@@ -207,9 +207,10 @@ def parse_drift(name: str) -> Drift:
         kind, _, level = part.partition("-")
         if kind not in _AXES:
             model: Any = load_attribute("noise", part, _HINT) if ":" in part else None
-            known = isinstance(model, (Perception, Localization))
-            found = _joined(found, model if known else parse_noise(part))
-            kind = type(model).__name__.lower() if known else "noise"
+            if not isinstance(model, (Perception, Localization)):
+                model = parse_noise(part)
+            kind = _axis(model)
+            found = replace(found, **{kind: model})
         elif kind == "latency":
             found = replace(found, latency=_number(part, level))
         elif kind == "localization":
@@ -238,12 +239,8 @@ def _number(part: str, text: str) -> int:
     return int(text)
 
 
-def _joined(found: Drift, model: NoiseModel | Perception | Localization) -> Drift:
-    if isinstance(model, NoiseModel):
-        return replace(found, noise=model)
-    if isinstance(model, Perception):
-        return replace(found, perception=model)
-    return replace(found, localization=model)
+def _axis(model: NoiseModel | Perception | Localization) -> str:
+    return "noise" if isinstance(model, NoiseModel) else type(model).__name__.lower()
 
 
 def make_drift(
@@ -256,19 +253,16 @@ def make_drift(
     Raises:
         ConfigError: A name is unknown, or there are two of a kind.
     """
-    names, models = list[str](), list[Any]()
-    for kind, given in zip(
-        ("", "perception", "localization"), (noise, perception, localization), strict=True
-    ):
-        if not isinstance(given, str):
-            models.append(given)
-            continue
-        parts = given.split("+")
-        names += [f"{kind}-{part}" if kind and part in LEVELS else part for part in parts]
-    names += [f"latency-{latency}"] if latency else []
-    found = parse_drift("+".join(names or ["none"]))
+    names, models = [f"latency-{latency}"] if latency else ["none"], list[Any]()
+    given = {"": noise, "perception": perception, "localization": localization}
+    for kind, one in given.items():
+        if isinstance(one, str):
+            names += [f"{kind}-{n}" if kind and n in LEVELS else n for n in one.split("+")]
+        else:
+            models.append(one)
+    found = parse_drift("+".join(names))
     for model in models:
-        found = model if isinstance(model, Drift) else _joined(found, model)
+        found = model if isinstance(model, Drift) else replace(found, **{_axis(model): model})
     return found
 
 

@@ -209,35 +209,28 @@ def ar1(normals: FloatArray, tau: float) -> FloatArray:
 def first_plans(milliseconds: int, past: FloatArray, now_us: int) -> deque[Plan]:
     """Those under way at first: keep speed and curvature of the past (H, 11), the present last."""
     steps = milliseconds // DT_MS
-    return deque[Plan]([coasting(past, now_us, steps + _COAST)] * steps)
-
-
-def exchange(waiting: deque[Plan], plan: Plan, next_us: int) -> Plan:
-    """The plan that is followed until `next_us`, of those under way, as this one is made."""
-    waiting.append(plan)
-    plan = waiting.popleft()
-    return plan if isinstance(plan, Command) else _reaching(plan, next_us)
-
-
-def _reaching(plan: Trajectory, time_us: int) -> Trajectory:
-    """A plan that goes on as it ends, where it ends before a time."""
-    if plan.time_us[-1] >= time_us:
-        return plan
-    states, (before, last) = plan.states, plan.time_us[-2:].tolist()
-    end = states[-1].copy()
-    end[:2] += (states[-1, :2] - states[-2, :2]) * (time_us - last) / (last - before)
-    return Trajectory(np.append(plan.time_us, time_us), np.vstack([states, end]))
-
-
-def coasting(past: FloatArray, now_us: int, count: int) -> Trajectory:
-    """Poses 0.1 s apart of an ego that keeps its speed and the curvature of its past (H, 11)."""
     pose, before = past[-1, :3], past[max(len(past) - 6, 0), :3]
     driven = float(np.hypot(*(pose - before)[:2]))
     turn = float(wrap_angles(pose[2:] - before[2])[0])
     curvature = turn / driven if driven > _CURVED else 0.0
-    step = DT * past[-1, VX]
-    heading = pose[2] + curvature * step * np.arange(count)
+    times, step = DT * np.arange(steps + _COAST), DT * past[-1, VX]
+    heading = pose[2] + curvature * step * np.arange(len(times))
     middle = heading[:-1] + 0.5 * curvature * step
     x, y = (np.append(0.0, np.cumsum(step * of(middle))) for of in (np.cos, np.sin))
     poses = np.column_stack([pose[0] + x, pose[1] + y, heading])
-    return Trajectory.from_poses(DT * np.arange(count), poses).starting_at(now_us)
+    return deque[Plan]([Trajectory.from_poses(times, poses).starting_at(now_us)] * steps)
+
+
+def exchange(waiting: deque[Plan], plan: Plan, next_us: int) -> Plan:
+    """The plan that is followed until `next_us`, of those under way, as this one is made.
+
+    One that ends before goes on as it ends.
+    """
+    waiting.append(plan)
+    plan = waiting.popleft()
+    if isinstance(plan, Command) or plan.time_us[-1] >= next_us:
+        return plan
+    states, (before, last) = plan.states, plan.time_us[-2:].tolist()
+    end = states[-1].copy()
+    end[:2] += (states[-1, :2] - states[-2, :2]) * (next_us - last) / (last - before)
+    return Trajectory(np.append(plan.time_us, next_us), np.vstack([states, end]))

@@ -20,7 +20,7 @@ from shiftsim.sim.perception import (
     make_drifts,
     parse_drift,
 )
-from shiftsim.sim.sensing import Sensing, ar1, coasting
+from shiftsim.sim.sensing import Sensing, ar1, first_plans
 from shiftsim.world.state import AgentKind, Command, Trajectory, tracks_of_boxes
 
 ROWS, TRACKS = 400, 300
@@ -336,9 +336,10 @@ def test_the_first_plan_keeps_speed_and_curvature():
     past = np.zeros((11, 11))
     past[:, 0], past[:, 1], past[:, 2] = 50.0 * np.sin(turn), 50.0 * (1 - np.cos(turn)), turn
     past[:, 3] = 10.0
-    plan = coasting(past, 7, 11)
+    [plan] = first_plans(100, past, 7)
+    assert len(plan.time_us) == 12
     assert plan.time_us[0] == 7
-    ahead = turn[-1] + 0.02 * np.arange(11)
+    ahead = turn[-1] + 0.02 * np.arange(12)
     expected = np.c_[50.0 * np.sin(ahead), 50.0 * (1.0 - np.cos(ahead)), ahead]
     np.testing.assert_allclose(plan.states[:, :3], expected, rtol=0, atol=1e-3)
 

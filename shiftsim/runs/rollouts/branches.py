@@ -20,7 +20,7 @@ from shiftsim.metrics import navsim
 from shiftsim.planners.basic import ConstantVelocity
 from shiftsim.planners.pdm.planner import PdmClosed
 from shiftsim.planners.pdm.scorer import TTC_STEPS
-from shiftsim.planners.proposals import contacts, places
+from shiftsim.planners.proposals import contacts
 from shiftsim.planners.registry import load_planner
 from shiftsim.sim.dynamics.bicycle import step_bicycle, step_seconds
 from shiftsim.sim.dynamics.lqr import (
@@ -64,7 +64,13 @@ PARTS = (
     "history_comfort",
     "progress_m",
 )
-FIRST = PARTS[:5]  # those that are violated at a step
+FIRST = {  # those that are violated at a step, and what NAVSIM's scores call it
+    "no_at_fault_collisions": "collision_index",
+    "drivable_area_compliance": "off_road_index",
+    "driving_direction_compliance": "wrong_way_index",
+    "traffic_light_compliance": "red_light_index",
+    "time_to_collision_within_bound": "ttc_index",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -277,19 +283,19 @@ class _Start:
         known = slice(now, now + count + (_TTC if self.is_replayed else 0))
         around = [_around(one.log().tracks.rows(known), ego[-1]) for one in (self.rollout, *worlds)]
         lit = navsim.with_lights(around[0], self.scenario, lights, 1)
-        tables = [
-            {name: np.full(len(driven), np.nan) for name in names} for names in (PARTS, FIRST)
-        ]
+        parts = {name: np.full(len(driven), np.nan) for name in PARTS}
+        first = {name: np.full(len(driven), np.nan) for name in FIRST}
         good = np.flatnonzero(errors == "")
         if len(good):
             past = np.ascontiguousarray(ego[-1 - _PAST : -1])
             own = tuple(around[1 + number] for number in good if worlds)
-            parts = navsim.evaluate(driven[good], ground, lit, "v2", past, own)
-            for table, found in zip(tables, (parts, _first_steps(parts, lit)), strict=True):
-                for name, column in table.items():
-                    column[good] = found[name]
+            found = navsim.evaluate(driven[good], ground, lit, "v2", past, own)
+            for name, column in parts.items():
+                column[good] = found[name]
+            for name, column in first.items():
+                column[good] = found[FIRST[name]]
         driven[errors != ""] = np.nan
-        return Branches(states=driven, parts=tables[0], first=tables[1], errors=errors)
+        return Branches(states=driven, parts=parts, first=first, errors=errors)
 
 
 def _around(tracks: Tracks, ego: FloatArray) -> navsim.Surroundings:
@@ -306,28 +312,6 @@ def _around(tracks: Tracks, ego: FloatArray) -> navsim.Surroundings:
     way = np.nan_to_num(np.hypot(*np.diff(tracks.poses[..., :2], axis=0).T).T)
     reaches = (_TTC + 1) * way.max(axis=0, initial=0.0)
     return navsim.Surroundings(others, np.arange(len(boxes)), reaches, [], np.zeros((0, 0), bool))
-
-
-def _first_steps(parts: navsim.Parts, around: navsim.Surroundings) -> navsim.Parts:
-    """(K,) step of the first violation of what has one, inf without one."""
-    states, flags = parts["states"], parts["flags"]
-    centers = center_poses(states[..., :3])
-    way = navsim.way_off_route(centers[..., :2], flags[..., places.OFF_ROUTE])
-    when = {
-        "drivable_area_compliance": flags[..., places.OFF_ROAD],
-        "driving_direction_compliance": way >= navsim.DIRECTION_LIMITS[0],
-        "traffic_light_compliance": np.zeros(states.shape[:2], np.bool_),
-    }
-    if around.connectors:
-        corners = boxes_to_corners(centers, np.array([PACIFICA.length, PACIFICA.width]))
-        when["traffic_light_compliance"] = navsim.touches_red(corners, around)
-    steps = {name: np.where(m.any(axis=1), m.argmax(axis=1), np.inf) for name, m in when.items()}
-    right = parts["driving_direction_compliance"] == 1.0  # intersections do not count
-    steps["driving_direction_compliance"][right] = np.inf
-    return steps | {
-        "no_at_fault_collisions": parts["collision_index"],
-        "time_to_collision_within_bound": parts["ttc_index"],
-    }
 
 
 @kernel
