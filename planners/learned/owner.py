@@ -99,12 +99,7 @@ class InferenceClient:
         return InferenceClient, (self.address, self.name)
 
     def __call__(self, features: Sequence[Any]) -> Sequence[Any]:
-        """What the planner's `infer` returns.
-
-        Raises:
-            PlannerError: There is no owner, or it ended twice of this request.
-            ShiftsimError: `infer` failed.
-        """
+        """What `infer` returns or raises; a PlannerError if no owner answers, twice."""
         for left in reversed(range(_TRIES)):
             try:
                 self._connection = self._connection or self._connected()

@@ -1,7 +1,7 @@
 """Commands about planners and their weights: planners, checkpoint, train, features, realism."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -129,7 +129,7 @@ def convert(
 
 def _add_training(planner: str, help: str, of: Any, *named: str) -> None:
     """The command that trains a planner by some settings, of which those `named` are its name."""
-    names = [name for name in of.__dataclass_fields__ if name not in named]
+    names = [item.name for item in fields(of) if item.name not in named]
 
     @train.command(planner, help=help)
     @cli.with_settings(*names, of=of)

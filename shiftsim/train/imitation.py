@@ -7,6 +7,7 @@ values of a network. B scenes, A agents of which the first is the ego, T = 80 st
 
 import copy
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -131,8 +132,7 @@ def plantf_loss(
 
     Args:
         out: What the network says.
-        target: (B, A, 80, 3) change of x [m], y [m] and heading [rad] since the present, in the
-            frame of the ego; 0 where not recorded.
+        target: (B, A, 80, 3) of `samples.targets`.
         valid: (B, A, 80) whether it was recorded. The terms of the ego take all of it.
         units: What errors are measured in, a fifth of it; None for metres.
     """
@@ -214,8 +214,7 @@ def pluto_loss(
 
     Args:
         out: What the network says.
-        target: (B, A, 80, 6) change of x, y [m], cosine and sine of that of the heading, velocity
-            [m/s], in the frame of the ego.
+        target: (B, A, 80, 6) of `samples.motion_targets`.
         valid: (B, A, 80) steps that count.
         projection: (B, R, 8, 2) of `pluto_assignment`.
         signed: (B, H, W) of `road_loss`, or None for no such term.
@@ -230,16 +229,13 @@ def pluto_loss(
     line, mode = pluto_assignment(projection[:count], lines, valid[:, 0])
     chosen, ego = trajectory[scene, line, mode], target[:, 0]
 
-    def error(
-        said: Tensor, recorded: Tensor, counted: Tensor, sizes: Tensor | None = None
-    ) -> Tensor:
+    def error(said: Tensor, recorded: Tensor, counted: Tensor, sizes: Tensor | None) -> Tensor:
         if sizes is not None:
             said, recorded = (v * FINENESS / sizes[:, : v.shape[-1]] for v in (said, recorded))
         each = functional.smooth_l1_loss(said, recorded, reduction="none").sum(dim=-1)
         return _mean_of(each, counted)
 
     own, of_others = (units.size, units.others_size) if units else (None, None)
-
     terms = {
         "reg_loss": error(chosen, ego, valid[:, 0], own),
         "cls_loss": functional.cross_entropy(logits.flatten(1), line * logits.shape[-1] + mode),
@@ -333,11 +329,7 @@ def begin(network: nn.Module, seed: int) -> None:
 
 
 def losses_of(
-    planner: str,
-    network: Any,
-    batch: Batch,
-    random: torch.Generator,
-    units: Units | None = None,
+    planner: str, network: Any, batch: Batch, random: torch.Generator, units: Units | None = None
 ) -> Losses:
     """Of a network that is trained; of PLUTO without the road and without contrast."""
     if planner == "diffusion-planner":
@@ -350,14 +342,9 @@ def losses_of(
     return plantf_loss(out, batch.target, batch.valid, units)
 
 
-class _Scaled(NamedTuple):
+def _scale(mean: Tensor, size: Tensor, module: nn.Module, inputs: Any, output: Tensor) -> Tensor:
     """Hook of a layer: its outputs times sizes, above means."""
-
-    mean: Tensor
-    size: Tensor
-
-    def __call__(self, module: nn.Module, inputs: Any, output: Tensor) -> Tensor:
-        return self.mean + self.size * output
+    return mean + size * output
 
 
 class ImitationLearner(TrainedNetwork):
@@ -377,12 +364,11 @@ class ImitationLearner(TrainedNetwork):
         if planner in LAST_LAYERS and not preset.published:
             self._units = Units.make(device)
             for name, (mean, size) in self._units.layers(planner).items():
-                network.get_submodule(name).register_forward_hook(_Scaled(mean, size))
+                network.get_submodule(name).register_forward_hook(partial(_scale, mean, size))
             network.agent_encoder.ego_state_emb.state_dropout = HIDDEN
+        groups = parameter_groups(network)
         if planner in DECAYS:
             groups = [{"params": list(network.parameters()), "weight_decay": DECAYS[planner]}]
-        else:
-            groups = parameter_groups(network)
         super().__init__(network, groups, total, betas=(0.9, 0.999))
         self.batch, self._preset, self._device, self._seed = preset.batch, preset, device, seed
         self._planner, self._terms = planner, tuple(TERMS[planner])
@@ -390,9 +376,11 @@ class ImitationLearner(TrainedNetwork):
         count = LANES if device == "cpu" else 1
         self._pool = GradientPool(device, count)
         self._trained: list[Tensor] = list(network.parameters())
-        shared = {id(value): value for value in self._trained}  # the rest is copied
-        others = [copy.deepcopy(network, dict(shared)) for _ in range(count - 1)]
-        self._lanes = [network, *others]
+        self._lanes = [network]
+        for _ in range(count - 1):  # parameters are shared, the rest is copied
+            self._lanes.append(
+                copy.deepcopy(network, {id(value): value for value in self._trained})
+            )
         keep_memory()
 
     def learn(self, batch: Batch) -> StepResult:
@@ -400,16 +388,15 @@ class ImitationLearner(TrainedNetwork):
         parts = batch.on(self._device).split(len(self._lanes))
         found = self._pool.sum(self._gradient, self._lanes, parts, range(len(parts)))
         count = len(parts)
-        if self._preset.published:
-            rounds = self._preset.rounds
-            epoch, rate = self.step * rounds // self.total, self._preset.rate
-            if self._planner == "diffusion-planner":
-                rate = diffusion_rate_of_epoch(epoch)
-            else:
-                rate = rate_of_epoch(epoch, rounds, rate=rate)
-        else:
-            highest = min(self._preset.rate, HIGHEST.get(self._planner, self._preset.rate))
+        rounds, rate = self._preset.rounds, self._preset.rate
+        epoch = self.step * rounds // self.total
+        if not self._preset.published:
+            highest = min(rate, HIGHEST.get(self._planner, rate))
             rate = highest * schedule(self.step / self.total, WARM_UP, FLOOR)
+        elif self._planner == "diffusion-planner":
+            rate = diffusion_rate_of_epoch(epoch)
+        else:
+            rate = rate_of_epoch(epoch, rounds, rate=rate)
         apply_gradient(self.optimiser, self._trained, found, count, clip=CLIP, rate=rate)
         self.count_step()
         terms = dict(zip(self._terms, (found.numbers / count).tolist(), strict=True))

@@ -20,7 +20,7 @@ from torch.nn import functional
 
 from shiftsim.kernels import BoolArray, IntArray
 from shiftsim.planners.learned.carl.network import CarlNetwork, Policy
-from shiftsim.train.folder import Weights
+from shiftsim.train.folder import BATCH, RATE, Weights
 from shiftsim.train.states import MIRRORED_ACTION, States, Values, mirror_measurements
 
 # a measurement is divided by these: last action, velocity and acceleration of the centre
@@ -28,8 +28,7 @@ from shiftsim.train.states import MIRRORED_ACTION, States, Values, mirror_measur
 UNITS = np.array([1.0, 1.0, 5.0, 0.5, 1.0, 0.5, 0.1, 0.3, 0.2, 0.5], np.float32)
 _UNITS_IN = "features_extractor.state_linear.0.weight"
 LANES, MICRO = 4, 16  # parts of a batch that are summed for themselves; states computed at once
-BATCH = 64  # states of a step
-RATE, FLOOR, WARM_UP = 1e-3, 0.01, 0.02  # learning rate, its end as a share, share of rising
+FLOOR, WARM_UP = 0.01, 0.02  # end of the learning rate as a share, share of rising
 DECAY, CLIP = 0.01, 5.0  # of the weights; of the norm of the gradient
 AVERAGED = 0.999  # of the running mean of the weights, per step
 SCALES = (0.3, 0.06)  # of errors of acceleration and steering

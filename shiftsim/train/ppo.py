@@ -133,8 +133,7 @@ class Trainer:
         self._settings, self._device = settings, device
         self._pool = learning.GradientPool(device, settings.workers)
         self._optimiser = torch.optim.Adam(self.network.parameters(), lr=RATE, eps=EPSILON)
-        tokens = sorted(token for found in towns.trained.values() for token in found)
-        write_text(settings.out / TRAINED, "\n".join(tokens) + "\n")
+        write_text(settings.out / TRAINED, "\n".join(towns.trained_tokens) + "\n")
         self._envs: Any = None
 
     def __enter__(self) -> "Trainer":

@@ -23,13 +23,12 @@ from shiftsim.data import open_store
 from shiftsim.errors import DataError
 from shiftsim.files import write_text
 from shiftsim.metrics.open_loop import METRICS
-from shiftsim.planners.learned.checkpoint import resolve_device
+from shiftsim.planners.learned.checkpoint import load_weights, resolve_device
 from shiftsim.runs.config import make_config
 from shiftsim.runs.execute import execute
-from shiftsim.runs.filter import read_filter_results
 from shiftsim.runs.prepare import prepare
 from shiftsim.runs.results import Run
-from shiftsim.runs.scenarios import find_split
+from shiftsim.runs.scenarios import open_split
 from shiftsim.train import folder, learning
 from shiftsim.train.checks import check
 from shiftsim.train.driving import (
@@ -44,21 +43,13 @@ from shiftsim.train.driving import (
     run_jobs,
     tested_tokens,
 )
-from shiftsim.train.folder import (
-    BEST,
-    LATEST,
-    ImitationSettings,
-    OnMessage,
-    Preset,
-    Settings,
-    Weights,
-)
+from shiftsim.train.folder import BEST, LATEST, OnMessage, Weights
 from shiftsim.train.imitation import ImitationLearner
 from shiftsim.train.samples import KINDS
 from shiftsim.train.states import States, write_part
 from shiftsim.train.stream import Stream, load_blocks
 
-_WRITE_EVERY, _REPORT_EVERY = 120.0, 10.0  # s
+_WRITE_EVERY = 120.0  # s
 _CURVE_EVERY = 50  # steps
 DRIVEN = 0.06  # of the scenarios that are trained on, in each round
 _BASELINE = "constant-velocity"  # driven beside a network, for comparison
@@ -81,28 +72,23 @@ class Progress:
 class Recipe(ABC):
     """One training in its folder, of whatever planner."""
 
-    planner: str
     learner: learning.TrainedNetwork
 
-    def __init__(
-        self, settings: Any, rounds: int, on_message: OnMessage, *, resume: bool = False
-    ) -> None:
+    def __init__(self, settings: Any, on_message: OnMessage, *, resume: bool = False) -> None:
         """Begin, or go on where it was kept last.
 
-        Raises:
-            ConfigError: The folder holds another training, or there is no such device.
-            DataError: The store is not there.
+        It is a ConfigError if the folder holds another training, or there is no such device.
         """
-        self._settings, self._on_message, self._rounds = settings, on_message, rounds
+        self._settings, self._on_message, self.planner = settings, on_message, settings.planner
+        samples, self._rounds, batch, *_ = settings.recipe
+        self.steps = max(1, samples // self._rounds // batch)  # of a round
         self.device = resolve_device(settings.device)
         store = open_store(settings.store)
-        filtered = read_filter_results(store.path, store.hash)
-        usable = filtered.accepted if filtered else store.tokens
-        tokens = find_split(settings.split, store.path, usable).tokens
-        self.towns: Towns = divide(store, tokens, settings.seed)
+        split, _ = open_split(store, settings.split)
+        self.towns: Towns = divide(store, split.tokens, settings.seed)
         folder.prepare_folder(settings, store.hash, resume=resume)
         self.progress = Progress()
-        self.steps = self._make_learner()
+        self._make_learner(self.steps * self._rounds)
         if (settings.out / folder.STATE).exists():
             state = folder.read_state(settings.out / folder.STATE)
             self.progress = Progress(**state["progress"])
@@ -110,8 +96,8 @@ class Recipe(ABC):
         self._began = monotonic() - self.progress.seconds
 
     @abstractmethod
-    def _make_learner(self) -> int:
-        """Make the learner; the steps of a round."""
+    def _make_learner(self, total: int) -> None:
+        """Make the learner, for so many steps."""
 
     @abstractmethod
     def _collect(self) -> None:
@@ -154,7 +140,7 @@ class Recipe(ABC):
                 if monotonic() - written > _WRITE_EVERY:
                     self._write_state()
                     written = monotonic()
-            if monotonic() - reported > _REPORT_EVERY:
+            if monotonic() - reported > folder.REPORT_EVERY:
                 rate = (progress.done - before) * learner.batch / (monotonic() - reported)
                 reported, before = monotonic(), progress.done
                 self._report(rate)
@@ -202,29 +188,16 @@ class Recipe(ABC):
 class Training(Recipe):
     """Of CaRL's network."""
 
-    planner = "carl"
     learner: learning.Learner
 
-    def __init__(self, settings: Settings, on_message: OnMessage, *, resume: bool = False) -> None:
-        super().__init__(settings, settings.rounds, on_message, resume=resume)
-
-    def _make_learner(self) -> int:
-        settings = self._settings
-        steps = max(1, settings.samples // settings.rounds // learning.BATCH)
-        total = steps * settings.rounds
-        begin = learning.from_official(self._begin()) if settings.checkpoint else None
+    def _make_learner(self, total: int) -> None:
+        settings, begin = self._settings, None
+        if settings.checkpoint:  # which is the network that drives first
+            state = load_weights(settings.checkpoint, "carl").state
+            begin = learning.from_official(state)
+            if not (settings.out / LATEST).exists():
+                folder.write_network(settings.out / LATEST, state)
         self.learner = learning.Learner(self.device, settings.workers, total, settings.seed, begin)
-        return steps
-
-    def _begin(self) -> Weights:
-        """The weights to begin with, which are the network that drives first."""
-        from shiftsim.planners.learned.checkpoint import load_weights
-
-        settings = self._settings
-        state = load_weights(settings.checkpoint, "carl").state
-        if not (settings.out / LATEST).exists():
-            folder.write_network(settings.out / LATEST, state)
-        return state
 
     def run(self) -> None:
         """Do all rounds that are not done yet, and PPO if it is asked for."""
@@ -237,7 +210,6 @@ class Training(Recipe):
 
     def _reinforce(self) -> None:
         """Go on with PPO from the best network, and test what comes out."""
-        from shiftsim.planners.learned.checkpoint import load_weights
         from shiftsim.train.ppo import reinforce
 
         settings = self._settings
@@ -288,15 +260,8 @@ class Training(Recipe):
         return mean_scores(self.towns, count, self.progress.tau, run, by_expert=False)
 
     def _run_jobs(self, checkpoint: str, what: str) -> RunJobs:
-        """What drives jobs with some weights and says how far it is, now and then."""
-        last = [monotonic()]
-
-        def on_progress(done: int, total: int) -> None:
-            if monotonic() - last[0] > _REPORT_EVERY or done == total:
-                last[0] = monotonic()
-                self._on_message(f"{what} {done} of {total} jobs")
-
-        return partial(run_jobs, self._settings, checkpoint, on_progress)
+        """What drives jobs with some weights."""
+        return partial(run_jobs, self._settings, checkpoint, what, self._on_message)
 
 
 class ImitationTraining(Recipe):
@@ -304,19 +269,10 @@ class ImitationTraining(Recipe):
 
     learner: ImitationLearner
 
-    def __init__(
-        self, settings: ImitationSettings, on_message: OnMessage, *, resume: bool = False
-    ) -> None:
-        self.planner = settings.planner
+    def _make_learner(self, total: int) -> None:
+        how = self.planner, self.device, self._settings.recipe, total, self._settings.seed
+        self.learner = ImitationLearner(*how)
         self._left_out = Counter[str]()  # samples that could not be made, by reason
-        super().__init__(settings, settings.recipe.rounds, on_message, resume=resume)
-
-    def _make_learner(self) -> int:
-        preset: Preset = self._settings.recipe
-        steps = max(1, preset.samples // preset.rounds // preset.batch)
-        total, seed = steps * preset.rounds, self._settings.seed
-        self.learner = ImitationLearner(self.planner, self.device, preset, total, seed)
-        return steps
 
     def run(self) -> None:
         """Do all rounds that are not done yet, then see what the best network acts on."""
@@ -338,7 +294,7 @@ class ImitationTraining(Recipe):
         settings, number = self._settings, self.progress.round
         if number == 0 or settings.recipe.published:
             return
-        tokens = np.sort(np.concatenate([*map(np.array, self.towns.trained.values())]))
+        tokens = self.towns.trained_tokens
         drawn = np.random.default_rng([settings.seed, 6, number]).permutation(tokens)
         share = round(DRIVEN * len(tokens))
         self._drive(self._driven[-1], sorted(drawn[: max(share, 1)].tolist()), [self.planner])
@@ -371,17 +327,9 @@ class ImitationTraining(Recipe):
 
     def _results(self) -> Iterator[learning.StepResult]:
         settings, learner = self._settings, self.learner
-        tokens = tuple(sorted(token for town in self.towns.trained.values() for token in town))
-        preset = settings.recipe
-        stream = Stream(
-            settings.store,
-            tokens,
-            settings.seed,
-            preset.batch,
-            self.planner,
-            preset.published,
-            tuple(map(str, self._driven)),
-        )
+        tokens, driven = tuple(self.towns.trained_tokens), tuple(map(str, self._driven))
+        preset, where = settings.recipe, (settings.store, tokens, settings.seed)
+        stream = Stream(*where, preset.batch, self.planner, preset.published, driven)
         self._on_message(f"{self._where} training on {len(tokens)} scenarios")
         block, done = learner.place
         unused = 0

@@ -76,12 +76,7 @@ def write_part(folder: Path, states: Iterable[State]) -> None:
 
 
 class States:
-    """The states of all rounds so far. N states.
-
-    Attributes:
-        measurements: (N, 10).
-        actions: (N, 2) labels.
-    """
+    """The states of all rounds so far, N: `measurements` (N, 10) and labels `actions` (N, 2)."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
         """`folders` are those of `write_part`; pictures are mapped from there."""

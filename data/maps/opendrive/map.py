@@ -197,7 +197,7 @@ class _RoadMapBuilder(MapBuilder[graph.LaneSegment]):
     def are_adjacent(self, left: graph.Lane, right: graph.Lane) -> bool:
         """Whether no lane of another use lies between two lanes of one section."""
         one, other = (lane.segments[0].key.lane for lane in (left, right))
-        return abs(one - other) - (1 if one * other < 0 else 0) == 1
+        return abs(one - other) - (one * other < 0) == 1
 
     def stop_areas(self, lanes: Sequence[shapely.Polygon]) -> list[StopArea]:
         return control.stop_lines(self.od, self.graph, self.shapes, self.controls, lanes)

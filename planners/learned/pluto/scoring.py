@@ -29,13 +29,7 @@ from shiftsim.planners.proposals.places import (
 )
 from shiftsim.planners.proposals.tracker import DT, drive_proposals, fit_speed, reference_at
 from shiftsim.sim.dynamics.bicycle import step_bicycle
-from shiftsim.sim.dynamics.lqr import (
-    NUPLAN,
-    LqrParameters,
-    command,
-    fit_curvature,
-    is_stopping,
-)
+from shiftsim.sim.dynamics.lqr import NUPLAN, LqrParameters, command, fit_curvature, is_stopping
 from shiftsim.world.layers import Polygons, make_polylines, meets_convex, project_on_line
 from shiftsim.world.state import HEADING, NUM_STATE, STEERING_RATE, VX, VY, VehicleParameters, X, Y
 

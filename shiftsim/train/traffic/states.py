@@ -42,8 +42,7 @@ def states_of(
     scenario: Scenario, traffic: LearnedTraffic, random: np.random.Generator, *, drives: bool
 ) -> States:
     """States of one scenario: recorded and pushed aside, or, if it `drives`, of the network."""
-    found = list((_driven if drives else _recorded)(scenario, traffic, random))
-    return join(found)
+    return join(list((_driven if drives else _recorded)(scenario, traffic, random)))
 
 
 def join(parts: list[States]) -> States:
@@ -128,17 +127,11 @@ def _labelled(
 def compute_labels(
     recorded: Tracks, row: int, poses: FloatArray, speeds: FloatArray, closing: FloatArray
 ) -> FloatArray:
-    """(A, 3) labels at a row of the tracks as recorded, of agents that are elsewhere by now.
+    """(A, 3) labels at a row of agents as recorded, which are at `poses` (A, 3) by now.
 
     They are an acceleration [m/s^2], a curvature [rad/m] and the distance to the point that is
-    steered to [m], 0 where the agent stays; NaN where there is none.
-
-    Args:
-        recorded: (B, A, …) the agents as recorded.
-        row: The row that is now.
-        poses: (A, 3) where they are [m], [rad]; NaN where absent.
-        speeds: (A,) [m/s].
-        closing: (A, 2) gap to who leads [m] and speed at which it shrinks [m/s]; inf and 0.
+    steered to [m], 0 where the agent stays; NaN where there is none. `closing` (A, 2) is the gap to
+    who leads [m] and the speed at which it shrinks [m/s]; inf and 0.
     """
     out = np.full((len(poses), 3), np.nan)
     for agent in np.flatnonzero(recorded.valid[row] & ~np.isnan(poses[:, 0])).tolist():
@@ -164,10 +157,7 @@ def _last_in_a_row(valid: BoolArray) -> int:
 def _label(
     line: FloatArray, row: int, pose: FloatArray, speed: float
 ) -> tuple[float, float, float]:
-    """Acceleration, curvature and distance steered to that lead back to a recorded drive.
-
-    It has the positions `line` (V, 2), at `row` of which the agent should be; it is at `pose`.
-    """
+    """A label of an agent at a pose that should be at a row of the positions `line` (V, 2)."""
     x, y, heading = pose.tolist()
     arc = arc_lengths(line, np.array([0, len(line)]))
     here = project_on_polyline(line, arc, 0, len(line), x, y)
