@@ -135,13 +135,9 @@ class MapBuilder(ABC, Generic[S]):
         self._stop_ids = self._new_ids(len(self.stops))
         edges = [*self._lane_specs(), *self._connector_specs()]
         blocks = [*self._roadblocks(), *self._roadblock_connectors()]
-        layers = {
-            "intersections": list(self._intersections()),
-            "stop_polygons": [
-                AreaSpec(i, stop.polygon, stop.kind)
-                for i, stop in zip(self._stop_ids, self.stops, strict=True)
-            ],
-        }
+        layers = {"intersections": list(self._intersections())}
+        stops = zip(self._stop_ids, self.stops, strict=True)
+        layers["stop_polygons"] = [AreaSpec(i, stop.polygon, stop.kind) for i, stop in stops]
         polygons = [edge.polygon for edge in edges]
         for layer, shapes in self.areas(polygons, layers["intersections"]).items():
             layers[layer] = [AreaSpec(next(self._next_id), shape) for shape in shapes]

@@ -63,10 +63,8 @@ def _driver(
         eager = float(rng.uniform(0.35, 0.65))
     driver = Driver(category, path, s, 0.0, round(eager, 3), start)
     if rng.random() < 0.16:
-        driver.wave = (
-            round(float(rng.uniform(0.15, 0.65)), 2),
-            round(float(rng.uniform(6, 15)), 1),
-        )
+        depth, period = float(rng.uniform(0.15, 0.65)), float(rng.uniform(6, 15))
+        driver.wave = round(depth, 2), round(period, 1)
     if rng.random() < _HALTS.get(category, _HALTS_ELSE) and not path.is_parking:
         driver.halt = _halt(path, driver, rng)
     return driver

@@ -110,7 +110,7 @@ def inspect(path: Source, as_json: Json = False) -> None:
     from shiftsim.planners.learned.convert import inspect_checkpoint
 
     found = inspect_checkpoint(path)
-    print_result(found.to_dict(), found.lines(), as_json=as_json)
+    print_result(asdict(found), found.lines(), as_json=as_json)
 
 
 @checkpoint.command()
@@ -124,7 +124,7 @@ def convert(
     from shiftsim.planners.learned.convert import convert_checkpoint
 
     converted = convert_checkpoint(path, out, half=half)
-    print_result(converted.to_dict(), converted.lines(), as_json=as_json)
+    print_result(asdict(converted), converted.lines(), as_json=as_json)
 
 
 def _add_training(planner: str, help: str, of: Any, *named: str) -> None:

@@ -102,8 +102,7 @@ def encode_action(
 def brake_at_stand(action: carl.Action, speed: float) -> carl.Action:
     """The action, which brakes where a vehicle at `speed` [m/s] is to stand or come to a stand.
 
-    Braking at a stand changes nothing, as nobody drives backwards. But a network that is taught
-    a throttle of 0 there errs to either side, and creeps into what it waits for.
+    A network that is taught a throttle of 0 there errs to either side, and creeps.
     """
     if speed < SLOW and action[0] < PARTING:
         action[0] = min(float(action[0]), HOLD)

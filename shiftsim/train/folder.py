@@ -297,17 +297,14 @@ def draw_curves(
     for noise in ("none", "ou-high"):
         look = {"label": f"noise {noise}", "linestyle": dashes(noise), **style.marks(noise)}
         right.plot(at, [100.0 * row[noise] for row in scores], **look)
-    right.set(xlabel="samples [million]", ylim=(0, 100))
-    right.set_ylabel("closed-loop score × 100")
+    right.set(xlabel="samples [million]", ylabel="closed-loop score × 100", ylim=(0, 100))
     right.set_title("on towns left out", fontsize=9)
     right.legend(frameon=False)
     for axes in more:
         for name in errors:
-            line = "-" if planner in name else ":"
             label = name.removeprefix("ADE of ").removesuffix(" [m]")
-            axes.plot(
-                at, [row[name] for row in scores], line, marker="o", color="0.15", label=label
-            )
+            look = {"linestyle": "-" if planner in name else ":", "marker": "o", "color": "0.15"}
+            axes.plot(at, [row[name] for row in scores], label=label, **look)
         axes.set(xlabel="samples [million]", ylabel="open loop: ADE [m]")
         axes.set_ylim(0.0, 1.1 * axes.get_ylim()[1])
         axes.legend(frameon=False)

@@ -89,10 +89,9 @@ def motion(target: Tensor) -> Tensor:
 
 
 class Units(NamedTuple):
-    """What plans and predictions are measured in by step, where it is not metres.
+    """What plans and predictions are measured in by step: in metres the last seconds outweigh all.
 
-    In metres the last seconds outweigh the first one, which is what is driven. Columns are x, y
-    [m], cosine and sine of the heading, velocity [m/s].
+    Columns are x, y [m], cosine and sine of the heading, velocity [m/s].
     """
 
     mean: Tensor  # (80, 6) of the plan
@@ -153,12 +152,9 @@ def plantf_loss(
 
 
 def pluto_assignment(projection: Tensor, lines: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """(B,) reference line and mode that PLUTO has to choose.
+    """(B,) reference line and mode that PLUTO has to choose, by (B, R, 8, 2) of `projections`.
 
-    Args:
-        projection: (B, R, 8, 2) arc length and distance [m] of the ego on every line at 1 to 8 s.
-        lines: (B, R) whether a line has points.
-        valid: (B, 80) steps of the ego that count.
+    `lines` (B, R) say whether a line has points, `valid` (B, 80) which steps of the ego count.
     """
     # their index is a second late, unless all steps count
     at = (valid.sum(dim=-1) // 10).clamp(0, projection.shape[2] - 1)
@@ -172,10 +168,9 @@ def pluto_assignment(projection: Tensor, lines: Tensor, valid: Tensor) -> tuple[
 def road_loss(trajectory: Tensor, signed: Tensor) -> Tensor:
     """How deep the ego is beyond the edge of the road, mean over circles and steps that are.
 
-    Args:
-        trajectory: (B, 80, 4) x, y [m], cosine and sine of the heading.
-        signed: (B, H, W) distance [m] to the edge, positive on the road: column x / 0.2 + W / 2,
-            row -y / 0.2 + H / 2. It is read half a pixel behind and to the left, as the authors do.
+    It drives (B, 80, 4). `signed` (B, H, W) is the distance [m] to the edge, positive on the road:
+    column x / 0.2 + W / 2, row -y / 0.2 + H / 2. It is read half a pixel behind and to the left, as
+    the authors do.
     """
     height, width = signed.shape[-2:]
     ahead = signed.new_tensor(CIRCLES)[:, None]
@@ -216,7 +211,7 @@ def pluto_loss(
         out: What the network says.
         target: (B, A, 80, 6) of `samples.motion_targets`.
         valid: (B, A, 80) steps that count.
-        projection: (B, R, 8, 2) of `pluto_assignment`.
+        projection: (B, R, 8, 2) of `samples.projections`.
         signed: (B, H, W) of `road_loss`, or None for no such term.
         contrast: Arguments of `contrastive_loss`. The batch is then anchors, positives, negatives,
             of which the last third counts in no other term.
@@ -252,10 +247,8 @@ def pluto_loss(
 def diffusion_loss(said: Tensor, clean: Tensor, valid: Tensor) -> Losses:
     """Of Diffusion Planner: how well trajectories are restored to which noise was added.
 
-    Args:
-        said: (B, A, 80, 4) normalised x, y, cosine and sine of the heading, by the network.
-        clean: (B, A, 80, 4) the same as recorded, 0 where not; the ego and its neighbours.
-        valid: (B, A - 1, 80) recorded steps of the neighbours.
+    Both are (B, A, 80, 4) normalised x, y, cosine and sine of the heading, the ego first; `clean`
+    is 0 where not recorded. `valid` (B, A - 1, 80) are recorded steps of the neighbours.
     """
     error = (said - clean).square().sum(dim=-1)
     return _sum(

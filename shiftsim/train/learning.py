@@ -60,11 +60,7 @@ class BatchGradient(NamedTuple):
 
 
 class GradientPool:
-    """Computes gradients of batches on a device, on a CPU in parts on several threads.
-
-    The parts are summed in an order that does not depend on the number of threads, so that the same
-    seed gives the same network.
-    """
+    """Gradients of batches; a CPU sums parts in an order that no number of threads changes."""
 
     def __init__(self, device: str, threads: int) -> None:
         self._device, self._threads = device, threads
@@ -93,10 +89,7 @@ class GradientPool:
         count: int,
         loss_of_rows: Callable[[IntArray], tuple[Tensor, Tensor]],
     ) -> BatchGradient:
-        """Gradient of a batch of so many rows.
-
-        `loss_of_rows` gives the sum of losses over some of them, and of numbers to report.
-        """
+        """Gradient of so many rows; sums of losses over some of them, and of numbers to report."""
 
         def of_rows(rows: IntArray) -> BatchGradient:
             loss, numbers = loss_of_rows(rows)
@@ -239,7 +232,7 @@ class TrainedNetwork:
             self.mean[name].lerp_(value, drift)
 
     def driving(self) -> Weights:
-        """The network with the mean weights, which drives."""
+        """The network with the mean weights, which drives; as files have it."""
         return {**self.network.state_dict(), **self.mean}
 
     def state(self) -> dict[str, Any]:
@@ -265,10 +258,7 @@ class Learner(TrainedNetwork):
     def __init__(
         self, device: str, threads: int, total: int, seed: int, begin: Weights | None = None
     ) -> None:
-        """`total` steps are to be done; the learning rate falls towards their end.
-
-        `begin` are weights to begin with.
-        """
+        """`total` steps are to be done; `begin` are weights to begin with."""
         torch.manual_seed(seed)
         network = CarlNetwork()
         self._rate = RATE * BEGUN if begin else RATE
@@ -305,6 +295,10 @@ class Learner(TrainedNetwork):
         means = (found.numbers / count).tolist()
         names = ("acceleration_error", "steering_error")
         return StepResult(found.loss / count, dict(zip(names, means, strict=True)))
+
+    def driving(self) -> Weights:
+        """The network with the mean weights, without units."""
+        return to_official(super().driving())
 
 
 def schedule(done: float, warm_up: float = WARM_UP, floor: float = FLOOR) -> float:

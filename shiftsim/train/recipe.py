@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -43,7 +44,7 @@ from shiftsim.train.driving import (
     run_jobs,
     tested_tokens,
 )
-from shiftsim.train.folder import BEST, LATEST, OnMessage, Weights
+from shiftsim.train.folder import BEST, LATEST, OnMessage
 from shiftsim.train.imitation import ImitationLearner
 from shiftsim.train.samples import KINDS
 from shiftsim.train.states import States, write_part
@@ -75,10 +76,7 @@ class Recipe(ABC):
     learner: learning.TrainedNetwork
 
     def __init__(self, settings: Any, on_message: OnMessage, *, resume: bool = False) -> None:
-        """Begin, or go on where it was kept last.
-
-        It is a ConfigError if the folder holds another training, or there is no such device.
-        """
+        """Begin, or go on where it was kept last; a ConfigError if the folder holds another one."""
         self._settings, self._on_message, self.planner = settings, on_message, settings.planner
         samples, self._rounds, batch, *_ = settings.recipe
         self.steps = max(1, samples // self._rounds // batch)  # of a round
@@ -108,10 +106,6 @@ class Recipe(ABC):
         """Do step after step, from where the round is."""
 
     @abstractmethod
-    def _official(self) -> Weights:
-        """What drives, as files have it."""
-
-    @abstractmethod
     def _scores(self, network: Path, where: str) -> dict[str, float]:
         """Mean closed-loop scores by noise, in towns that are left out."""
 
@@ -129,8 +123,7 @@ class Recipe(ABC):
         progress, learner = self.progress, self.learner
         reported = written = monotonic()
         before, results = progress.done, list[learning.StepResult]()
-        steps = self._results() if progress.done < self.steps else iter(())
-        for result in steps:
+        for result in islice(self._results(), self.steps - progress.done):
             results.append(result)
             progress.done += 1
             if progress.done % _CURVE_EVERY == 0 or progress.done == self.steps:
@@ -144,8 +137,6 @@ class Recipe(ABC):
                 rate = (progress.done - before) * learner.batch / (monotonic() - reported)
                 reported, before = monotonic(), progress.done
                 self._report(rate)
-            if progress.done == self.steps:
-                break
 
     def _report(self, rate: float) -> None:
         done, total = (n * self.learner.batch for n in (self.learner.step, self.learner.total))
@@ -159,7 +150,7 @@ class Recipe(ABC):
 
     def _test(self) -> None:
         settings, progress = self._settings, self.progress
-        state = self._official()
+        state = self.learner.driving()
         folder.write_network(settings.out / LATEST, state, self.planner)
         found = self._scores(settings.out / LATEST, self._where)
         seconds = monotonic() - self._began
@@ -252,9 +243,6 @@ class Training(Recipe):
             key = (settings.seed, 3, progress.round, progress.done)
             yield learner.learn(states, learning.draw_batch(states, key))
 
-    def _official(self) -> Weights:
-        return learning.to_official(self.learner.driving())
-
     def _scores(self, network: Path, where: str) -> dict[str, float]:
         run, count = self._run_jobs(str(network), f"{where} testing"), self._settings.tests
         return mean_scores(self.towns, count, self.progress.tau, run, by_expert=False)
@@ -287,10 +275,7 @@ class ImitationTraining(Recipe):
             self._on_message(f"{row['check']}: {passed} of {row['cases']} cases")
 
     def _collect(self) -> None:
-        """From the second round on, let the network drive where it is trained; see `Stream.driven`.
-
-        The other samples are made when they are needed.
-        """
+        """From the second round on, let the network drive where it is trained."""
         settings, number = self._settings, self.progress.round
         if number == 0 or settings.recipe.published:
             return
@@ -348,9 +333,6 @@ class ImitationTraining(Recipe):
                     hint="training needs more scenarios with a future of 8 s",
                 )
             block, done = block + 1, 0
-
-    def _official(self) -> Weights:
-        return self.learner.driving()
 
     def _scores(self, network: Path, where: str) -> dict[str, float]:
         tokens = tested_tokens(self.towns, self._settings.tests)

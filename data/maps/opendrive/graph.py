@@ -144,7 +144,6 @@ class _Builder(Topology[LaneKey, LaneSegment]):
 
     def _infer_links(self) -> None:
         """Links between sections of a road that the file forgot: same number, same place."""
-        inferred = 0
         for key in self.segments:
             onward = LaneKey(key.road, key.section + 1, key.lane)
             if onward not in self.segments:
@@ -156,9 +155,7 @@ class _Builder(Topology[LaneKey, LaneSegment]):
                 continue
             if np.abs(self.ends[source][1] - self.ends[target][0]).max() < INFER_GAP:
                 self.join(source, target)
-                inferred += 1
-        if inferred:
-            self.warnings["lane link missing between sections, inferred"] += inferred
+                self.warnings["lane link missing between sections, inferred"] += 1
 
     def _infer_road_links(self) -> None:
         """Links to a linked road that no lane tells of, where lanes touch.

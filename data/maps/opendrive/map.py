@@ -89,8 +89,7 @@ def _prepare(od: records.OpenDrive, warnings: Counter[str]) -> records.OpenDrive
         if max(map(total_turn, road.geometries)) > MAX_TURN:
             warnings["road left out: one geometry turns more than one and a half times"] += 1
             continue
-        wrong = sum(error > 0 for error in errors)
-        if wrong:
+        if wrong := sum(error > 0 for error in errors):
             warnings["paramPoly3 that is not as long as it says, stretched"] += wrong
         fast += [name] * _count_fast(road)
         _note_gaps(road, warnings)
@@ -142,8 +141,7 @@ def _count_fast(road: records.Road) -> int:
 def _note_gaps(road: records.Road, warnings: Counter[str]) -> None:
     gaps, _ = ReferenceLine(road.geometries).joints()
     for low, high in ((GAP_NOTED, GAP_SERIOUS), (GAP_SERIOUS, np.inf)):
-        count = int(((gaps > low) & (gaps <= high)).sum())
-        if count:
+        if count := int(((gaps > low) & (gaps <= high)).sum()):
             warnings[f"gap of more than {low:g} m between geometries"] += count
 
 

@@ -286,13 +286,12 @@ def _sample_section(
         if len(middles) == 0:
             break
         exact = _evaluate_section(road, section, line, middles)
-        bad = np.diff(s) > 2 * _MIN_STEP
         error = np.zeros(len(middles))
         for number, outer in shape.outer.items():
             for points, truth in ((outer, exact.outer), (shape.inner[number], exact.inner)):
                 chord = 0.5 * (points[1:] + points[:-1]) - truth[number]
                 error = np.maximum(error, np.hypot(*chord.T))
-        bad &= error > _TARGET_ERROR
+        bad = (np.diff(s) > 2 * _MIN_STEP) & (error > _TARGET_ERROR)
         if not bad.any():
             break
         s = np.sort(np.concatenate([s, middles[bad]]))
