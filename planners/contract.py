@@ -146,10 +146,7 @@ def _drive(
     calls: int | None = None,
     seconds: list[float] | None = None,
 ) -> Plans | None:
-    """Plans of a scenario, or of its first `calls` steps, in closed loop.
-
-    None when it cannot be driven to the end; then there is a finding.
-    """
+    """Plans of a scenario in closed loop, or of `calls` steps; None, and a finding, if it fails."""
     plans: Plans = []
     step, seen = "reset()", set[str]()
     try:

@@ -72,10 +72,7 @@ class MapBuilder(ABC, Generic[S]):
     stop_signs: Sequence[bool]  # whether a stop sign governs each connector
 
     def __init__(self, graph: LaneGraph[S], shaper: Any, warnings: Counter[str]) -> None:
-        """Counts in `warnings` what is repaired.
-
-        `shaper` has `joined_borders` and `baseline`, as `segments` and `opendrive.shapes.Shapes`.
-        """
+        """`shaper` has `joined_borders` and `baseline`; `warnings` count what is repaired."""
         self.graph, self.shaper, self.warnings = graph, shaper, warnings
         lanes = graph.lanes
         # roadblocks that each connector comes from and leads to

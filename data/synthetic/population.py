@@ -238,10 +238,9 @@ def _pedestrians(
 
 
 def touching(boxes: list[Box], parked: FloatArray, drivers: list[Driver]) -> set[int]:
-    """Numbers of agents to leave out, so that nobody touches anybody.
+    """Numbers of agents to leave out, so that nobody touches anybody, nor cars `parked` (n, 3).
 
-    Agents are numbered from 0 on, drivers first, in the order of their tracks; cars are parked at
-    `parked` (n, 3).
+    Agents are numbered from 0 on, drivers first, in the order of their tracks.
     """
     rows = np.array([(x[0], x[1] - 1, *x[3:6], *SIZES[x[2]][:2]) for x in boxes]).reshape(-1, 7)
     out: set[int] = set()

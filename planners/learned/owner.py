@@ -84,10 +84,7 @@ class InferenceServer:
 
 
 class InferenceClient:
-    """What takes the place of `infer` where an owner has the network.
-
-    Copies of a planner share it, and its connection, which is made when it is needed.
-    """
+    """Takes the place of `infer` where an owner has the network; copies of a planner share it."""
 
     def __init__(self, address: Address, name: str) -> None:
         """Ask the owner at an address for the planner of that name."""

@@ -28,7 +28,6 @@ from shiftsim.train.learning import (
     GradientPool,
     StepResult,
     TrainedNetwork,
-    apply_gradient,
     keep_memory,
     schedule,
 )
@@ -44,7 +43,6 @@ CIRCLES = [PACIFICA.rear_axle_to_center + place * _THIRD for place in (-1.0, 0.0
 CIRCLE_RADIUS = 0.5 * math.hypot(PACIFICA.width, _THIRD) - 0.2
 PIXEL, INSIDE = 0.2, 0.95  # m; share of the raster in which a point counts
 TEMPERATURE = 0.1  # of the contrastive loss
-CLIP = 5.0  # of the norm of all gradients
 WARM_UP, FLOOR = 0.05, 2e-3  # here: share of rising, end of the learning rate as a share
 # layers of Diffusion Planner that begin small, and at zero
 _TIME = ("t_embedder.mlp.0", "t_embedder.mlp.2")
@@ -364,23 +362,21 @@ class ImitationLearner(TrainedNetwork):
             groups = [{"params": list(network.parameters()), "weight_decay": DECAYS[planner]}]
         super().__init__(network, groups, total, betas=(0.9, 0.999))
         self.batch, self._preset, self._device, self._seed = preset.batch, preset, device, seed
-        self._planner, self._terms = planner, tuple(TERMS[planner])
+        self._planner, self.terms = planner, tuple(TERMS[planner])
         self.place = (0, 0)  # of the next batch: the block of the stream, and the batch in it
         count = LANES if device == "cpu" else 1
         self._pool = GradientPool(device, count)
-        self._trained: list[Tensor] = list(network.parameters())
+        self.trained = list(network.parameters())
         self._lanes = [network]
-        for _ in range(count - 1):  # parameters are shared, the rest is copied
-            self._lanes.append(
-                copy.deepcopy(network, {id(value): value for value in self._trained})
-            )
+        for _ in range(count - 1):
+            shared = {id(value): value for value in self.trained}  # the rest is copied
+            self._lanes.append(copy.deepcopy(network, shared))
         keep_memory()
 
     def learn(self, batch: Batch) -> StepResult:
         """Do one step."""
         parts = batch.on(self._device).split(len(self._lanes))
         found = self._pool.sum(self._gradient, self._lanes, parts, range(len(parts)))
-        count = len(parts)
         rounds, rate = self._preset.rounds, self._preset.rate
         epoch = self.step * rounds // self.total
         if not self._preset.published:
@@ -390,10 +386,7 @@ class ImitationLearner(TrainedNetwork):
             rate = diffusion_rate_of_epoch(epoch)
         else:
             rate = rate_of_epoch(epoch, rounds, rate=rate)
-        apply_gradient(self.optimiser, self._trained, found, count, clip=CLIP, rate=rate)
-        self.count_step()
-        terms = dict(zip(self._terms, (found.numbers / count).tolist(), strict=True))
-        return StepResult(found.loss / count, terms)
+        return self.apply(found, len(parts), rate)
 
     def _gradient(self, network: Any, batch: Batch, number: int) -> BatchGradient:
         """Of one part of a batch."""
@@ -402,9 +395,9 @@ class ImitationLearner(TrainedNetwork):
         random = torch.Generator(self._device).manual_seed(drawn)
         losses = losses_of(self._planner, network, batch, random, self._units)
         gradients = torch.autograd.grad(  # of PLUTO some layers serve the contrast only
-            losses["loss"], self._trained, allow_unused=True, materialize_grads=True
+            losses["loss"], self.trained, allow_unused=True, materialize_grads=True
         )
-        numbers = torch.stack([losses[name].detach() for name in self._terms]).cpu()
+        numbers = torch.stack([losses[name].detach() for name in self.terms]).cpu()
         return BatchGradient(list(gradients), float(losses["loss"].detach()), numbers)
 
     def driving(self) -> Weights:

@@ -186,10 +186,7 @@ class _Builder(Topology[LaneKey, LaneSegment]):
             self.warnings[what] += len(touching)
 
     def _beyond(self, key: LaneKey, *, entry: bool) -> tuple[bool, str | None]:
-        """What the file says of the place where travel enters (or leaves) a lane.
-
-        Whether it names a lane there, or the place lies within its road; and the road linked there.
-        """
+        """Whether the file names a lane where travel enters (or leaves) one, and the road there."""
         road, at_start = self.od.roads[key.road], self._is_forward(key) == entry
         lane = road.sections[key.section].lanes[key.lane]
         last = 0 if at_start else len(road.sections) - 1

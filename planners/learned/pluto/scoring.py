@@ -197,10 +197,7 @@ def run_lights(corners: FloatArray, lanes: Polygons, lights: IntArray) -> FloatA
 
 @kernel
 def times_to_collision(places: ProposalStates, obstacles: Obstacles, near: IntArray) -> FloatArray:
-    """(P,) 0 or 1: whether the ego, moved ahead along its heading, stays clear.
-
-    Arguments as for `collisions`.
-    """
+    """(P,) 0 or 1: whether the ego, moved ahead along its heading, stays clear of `near` ones."""
     scores, box, last = np.ones(len(places.states)), np.empty((4, 2)), places.states.shape[1] - 1
     corners, centers = places.corners, obstacles.centers
     for proposal in range(len(scores)):
