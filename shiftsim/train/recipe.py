@@ -30,20 +30,8 @@ from shiftsim.runs.execute import execute
 from shiftsim.runs.prepare import prepare
 from shiftsim.runs.results import Run
 from shiftsim.runs.scenarios import open_split
-from shiftsim.train import folder, learning
+from shiftsim.train import driving, folder, learning
 from shiftsim.train.checks import check
-from shiftsim.train.driving import (
-    TESTED,
-    TOGETHER,
-    TOGETHER_ON_GPU,
-    RunJobs,
-    Towns,
-    collect,
-    divide,
-    mean_scores,
-    run_jobs,
-    tested_tokens,
-)
 from shiftsim.train.folder import BEST, LATEST, OnMessage
 from shiftsim.train.imitation import ImitationLearner
 from shiftsim.train.samples import KINDS
@@ -83,7 +71,7 @@ class Recipe(ABC):
         self.device = resolve_device(settings.device)
         store = open_store(settings.store)
         split, _ = open_split(store, settings.split)
-        self.towns: Towns = divide(store, split.tokens, settings.seed)
+        self.towns: driving.Towns = driving.divide(store, split.tokens, settings.seed)
         folder.prepare_folder(settings, store.hash, resume=resume)
         self.progress = Progress()
         self._make_learner(self.steps * self._rounds)
@@ -217,7 +205,7 @@ class Training(Recipe):
         settings, rows = self._settings, self.progress.taus
         for tau in folder.TAUS:
             run = self._run_jobs(_NO_DRIVER, f"tau {tau:g} s")
-            found = mean_scores(self.towns, settings.tests, tau, run, by_expert=True)
+            found = driving.mean_scores(self.towns, settings.tests, tau, run, by_expert=True)
             rows.append({"tau": tau, **found})
             self._on_message(f"tau {tau:g} s: {_in_words(found)}")
         folder.write_table(settings.out / "tau.parquet", rows)
@@ -232,7 +220,7 @@ class Training(Recipe):
         checkpoint = str(settings.out / LATEST) if drives else _NO_DRIVER
         run = self._run_jobs(checkpoint, f"{self._where} collecting")
         number, tau = progress.round, progress.tau
-        write_part(part, collect(settings, self.towns, number, tau, run, self._on_message))
+        write_part(part, driving.collect(settings, self.towns, number, tau, run, self._on_message))
         self._write_state()
 
     def _results(self) -> Iterator[learning.StepResult]:
@@ -245,11 +233,11 @@ class Training(Recipe):
 
     def _scores(self, network: Path, where: str) -> dict[str, float]:
         run, count = self._run_jobs(str(network), f"{where} testing"), self._settings.tests
-        return mean_scores(self.towns, count, self.progress.tau, run, by_expert=False)
+        return driving.mean_scores(self.towns, count, self.progress.tau, run, by_expert=False)
 
-    def _run_jobs(self, checkpoint: str, what: str) -> RunJobs:
+    def _run_jobs(self, checkpoint: str, what: str) -> driving.RunJobs:
         """What drives jobs with some weights."""
-        return partial(run_jobs, self._settings, checkpoint, what, self._on_message)
+        return partial(driving.run_jobs, self._settings, checkpoint, what, self._on_message)
 
 
 class ImitationTraining(Recipe):
@@ -267,7 +255,7 @@ class ImitationTraining(Recipe):
         super().run()
         settings = self._settings
         planner = KINDS[self.planner].planner(str(settings.out / BEST), device=self.device)
-        tokens = tested_tokens(self.towns, settings.tests)
+        tokens = driving.tested_tokens(self.towns, settings.tests)
         rows = check(planner, map(open_store(settings.store).read, tokens))
         folder.write_table(settings.out / "checks.parquet", rows)
         for row in rows:
@@ -302,10 +290,10 @@ class ImitationTraining(Recipe):
             "store": settings.store,
             "split": str(split),
             "out": str(out),
-            "noise": list(TESTED),
+            "noise": list(driving.TESTED),
             "workers": settings.workers,
             "device": settings.device,
-            "batch_size": TOGETHER if self.device == "cpu" else TOGETHER_ON_GPU,
+            "batch_size": driving.TOGETHER if self.device == "cpu" else driving.TOGETHER_ON_GPU,
             **more,
         }
         return execute(prepare(make_config(values)))
@@ -335,15 +323,15 @@ class ImitationTraining(Recipe):
             block, done = block + 1, 0
 
     def _scores(self, network: Path, where: str) -> dict[str, float]:
-        tokens = tested_tokens(self.towns, self._settings.tests)
+        tokens = driving.tested_tokens(self.towns, self._settings.tests)
         self._on_message(f"{where} testing; samples that could not be made: {self._reasons}")
         run_folder = self._settings.out / "runs" / f"round-{self.progress.round:02d}"
         run = self._drive(run_folder, tokens, [self.planner, _BASELINE], open_loop=True)
         rows = [row for row in run.scores.to_pylist() if row["planner"] == self.planner]
         if not rows:
             raise DataError(f"no scenario could be driven to its end, see {str(run_folder)!r}")
-        sums = {noise: sum(r["cls"] for r in rows if r["noise"] == noise) for noise in TESTED}
-        scores = {noise: found / len(tokens) for noise, found in sums.items()}  # failures score 0
+        by_noise = {n: [r["cls"] for r in rows if r["noise"] == n] for n in driving.TESTED}
+        scores = {n: sum(found) / len(tokens) for n, found in by_noise.items()}  # failures score 0
         return scores | _open_loop_errors(run.metrics.to_pylist())
 
     @property
@@ -375,5 +363,5 @@ def _curve_row(number: int, samples: int, results: list[learning.StepResult]) ->
 
 
 def _in_words(found: dict[str, float]) -> str:
-    scaled = {name: 100.0 * value if name in TESTED else value for name, value in found.items()}
-    return "  ".join(f"{name} {value:.1f}" for name, value in scaled.items())
+    scale = dict.fromkeys(driving.TESTED, 100.0)
+    return "  ".join(f"{name} {scale.get(name, 1.0) * value:.1f}" for name, value in found.items())

@@ -78,7 +78,7 @@ def test_what_comes_out_drives_and_says_how_it_came(trained, toy, tmp_path):
 
 def test_with_weights_to_begin_with_the_network_drives_at_once(small, trained, monkeypatch):
     asked = []
-    monkeypatch.setattr(recipe, "collect", lambda *job: asked.append(job[4].args[1]) or [])
+    monkeypatch.setattr(recipe.driving, "collect", lambda *job: asked.append(job[4].args[1]) or [])
     monkeypatch.setattr(recipe, "write_part", lambda folder, states: None)
     settings = small("more", checkpoint=str(trained[0].out / BEST))
     training = Training(settings, print)
