@@ -40,12 +40,10 @@ class BaseSettings:
     """What every training depends on, and where it is written."""
 
     least: ClassVar[dict[str, int]] = {"seed": 0}  # of numbers
-    elsewhere: ClassVar[tuple[str, ...]] = (
-        "out",
-        "workers",
-    )  # settings on which the result does not depend
+    # settings on which the result does not depend
+    elsewhere: ClassVar[tuple[str, ...]] = ("out", "workers")
 
-    out: Path = field(metadata={"option": Option("Folder for what comes out.")})
+    out: Path = field(metadata={"option": Option("Folder for networks, curves and tables.")})
     store: str = setting("demo", "Store by name, path or URL.")
     split: str = setting("", "Split of the store; all its scenarios if empty.")
     seed: int = setting(0, "Of everything that is random.")
@@ -159,6 +157,7 @@ class FeatureSettings(BaseSettings):
     least: ClassVar = dict.fromkeys(("seed", "workers", "samples"), 0)
     elsewhere: ClassVar = ("out", "workers", "samples")
 
+    out: Path = field(metadata={"option": Option("Folder for the samples.")})
     planner: str = field(
         metadata={
             "option": Option("Whose features: plantf, pluto or diffusion-planner.", ("--for",))
