@@ -107,8 +107,8 @@ def _run_time(seconds: FloatArray) -> Finding:
     return Finding("warning", "run time", text, "results are the same, but no car could drive so")
 
 
-def _error(check: str, message: str) -> Finding:
-    return Finding("error", check, message, _HINTS[check])
+def _error(check: str, message: str, severity: str = "error") -> Finding:
+    return Finding(severity, check, message, _HINTS[check])
 
 
 def _make(factory: Callable[[], Any], findings: list[Finding]) -> Any:
@@ -146,10 +146,7 @@ def _drive(
     calls: int | None = None,
     seconds: list[float] | None = None,
 ) -> Plans | None:
-    """Plans of a scenario, or of its first `calls` steps, in closed loop.
-
-    None when it cannot be driven to the end; then there is a finding.
-    """
+    """Plans of a scenario in closed loop, or of `calls` steps; None, and a finding, if it fails."""
     plans: Plans = []
     step, seen = "reset()", set[str]()
     try:
@@ -191,8 +188,7 @@ def _drive(
 def _check_plan(plan: object, ego: FloatArray, times: IntArray) -> Finding | None:
     """What is wrong with one plan of an ego (11,), at the first of the times [us]."""
     now_us = int(times[0])
-    fault = find_fault(plan, now_us, int(times[1]))
-    if fault is not None:
+    if (fault := find_fault(plan, now_us, int(times[1]))) is not None:
         return Finding("error", fault.check, fault.message, fault.hint)
     if isinstance(plan, Command):
         return _check_command(plan)
@@ -201,7 +197,7 @@ def _check_plan(plan: object, ego: FloatArray, times: IntArray) -> Finding | Non
     found = _check_start(plan.starting_at(now_us), now_us, ego)
     if found is None and (turned := np.abs(plan.states[:, 2]).max()) > FULL_TURN:
         text = f"a heading of the plan is {turned:.1f} rad, more than a full turn"
-        found = replace(_error("heading", text), severity="warning")
+        found = _error("heading", text, "warning")
     if found is None and is_short(plan):
         found = Finding("warning", "length", SHORT, "plan 1 s ahead and more")
     return found or _check_precision(plan.states[:, :2])
@@ -211,7 +207,7 @@ def _check_command(command: Command) -> Finding | None:
     for name, most in STRONGEST.items():
         if abs(value := float(getattr(command, name))) > most:
             text = f"the command has {name} {value:.3g}: no car does more than {most:g}"
-            return replace(_error("units", text), severity="warning")
+            return _error("units", text, "warning")
     return None
 
 
@@ -221,7 +217,7 @@ def _check_precision(places: FloatArray) -> Finding | None:
     if step < COARSE or not np.array_equal(small, places):
         return None
     text = f"all positions of the plan are numbers of 32 bits, which are {step:g} m apart here"
-    return replace(_error("precision", text), severity="warning")
+    return _error("precision", text, "warning")
 
 
 def _check_start(plan: Trajectory, now_us: int, ego: FloatArray) -> Finding | None:
@@ -229,14 +225,13 @@ def _check_start(plan: Trajectory, now_us: int, ego: FloatArray) -> Finding | No
     distance = float(np.hypot(x - ego[0], y - ego[1]))
     if distance > NEAR:
         text = f"the plan is {distance:.1f} m away from the ego now"
-        found = _error("starts at the ego", text)
-        return found if distance > FAR else replace(found, severity="warning")
+        return _error("starts at the ego", text, "error" if distance > FAR else "warning")
     row = int(np.searchsorted(plan.time_us, now_us, side="right")) - 1
     turn = abs(float(wrap_angle(float(plan.states[row, 2] - ego[2]))))
     if turn <= TURNED:
         return None
     text = f"the plan's heading differs from the ego's by {turn:.2f} rad now"
-    return replace(_error("heading", text), severity="warning")
+    return _error("heading", text, "warning")
 
 
 def _check_repeats(

@@ -39,10 +39,7 @@ class Isolated:
     shares_nothing = True  # every scenario gets a planner of its own there
 
     def __init__(self, spec: str, arguments: Mapping[str, Any], python: str = "") -> None:
-        """The planner `spec` (see `load_planner`) in the interpreter `python`, or in ours.
-
-        The process begins when it is needed.
-        """
+        """The planner `spec` (see `load_planner`) in an interpreter, ours if empty; begun later."""
         self.name, self.degraded = spec, ""
         self._given = (spec, dict(arguments), python)
         self._process: Process | None = None

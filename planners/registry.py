@@ -179,9 +179,8 @@ class RunPlanner:
     def on_gpu(self) -> bool:
         """Whether it is one of the table whose network is on a GPU."""
         known = PLANNERS.get(self.source) if isinstance(self.source, str) else None
-        return (
-            bool(known and known.checkpoint) and self.fingerprint["arguments"]["device"] == "cuda"
-        )
+        is_learned = known is not None and known.checkpoint is not None
+        return is_learned and self.fingerprint["arguments"]["device"] == "cuda"
 
     @property
     def can_travel(self) -> bool:
@@ -198,10 +197,9 @@ class RunPlanner:
 
 
 def run_planner(source: Any, arguments: Mapping[str, Any], name: str = "") -> RunPlanner:
-    """A planner given by name, class or instance; it is made here, to see that it works.
+    """A planner given by name, class or instance; it is made here, else it is a ShiftsimError.
 
-    It is called `name` in tables, by default as `planner_name` says. It is a ShiftsimError if it
-    does not exist, or cannot be made.
+    It is called `name` in tables, by default as `planner_name` says.
     """
     name = name or planner_name(source)
     if isinstance(source, str):

@@ -42,7 +42,6 @@ class PlannerEntry:
     arguments: tuple[str, ...] = ()  # names of the arguments it takes
     # what a learned planner loads; it also needs the extra `learned`
     checkpoint: Published | None = None
-    shipped: str = ""  # file of weights of our own, below the package, where they are there
 
 
 OFFICIAL, SHIPPED = "official", "shiftsim"  # words that stand for a checkpoint
@@ -63,7 +62,6 @@ _ENTRIES = (
             "nuplan_51892_1B",
             megabytes=8,
         ),
-        "planners/learned/carl/shiftsim.safetensors",
     ),
     PlannerEntry(
         "constant-velocity",
@@ -106,7 +104,6 @@ _ENTRIES = (
         "imitation with a transformer over agents and map",
         _NETWORK,
         Published("planTF.ckpt", "jchengai/planTF", "planTF.ckpt", megabytes=8),
-        "planners/learned/plantf/shiftsim.safetensors",
     ),
     PlannerEntry(
         "pluto",
@@ -115,7 +112,6 @@ _ENTRIES = (
         "imitation with contrastive learning, and a choice among its plans by rules",
         _NETWORK,
         Published("pluto_1M_aux_cil.ckpt", "jchengai/pluto", "pluto_1M_aux_cil.ckpt", megabytes=17),
-        "planners/learned/pluto/shiftsim.safetensors",
     ),
     PlannerEntry(
         "scripted",
@@ -138,9 +134,8 @@ PUBLISHED = {entry.name: entry.checkpoint for entry in _ENTRIES if entry.checkpo
 
 def shipped_file(planner: str) -> Path | None:
     """Where our own weights of a planner are; None where there are none."""
-    entry = PLANNERS.get(planner)
-    path = PACKAGE / entry.shipped if entry is not None and entry.shipped else None
-    return path if path is not None and path.is_file() else None
+    path = PACKAGE / "planners/learned" / planner / "shiftsim.safetensors"
+    return path if path.is_file() else None
 
 
 def readiness(entry: PlannerEntry) -> str:

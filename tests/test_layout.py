@@ -24,17 +24,17 @@ BUDGETS = {
     "shiftsim/sim/traffic": 2_380,  # goal 2_200
     "metrics": 2_930,
     "shiftsim/runs": 5_985,  # goal 3_300
-    "planners": 4_370,  # goal 4_300
-    "planners/learned": 4_955,  # goal 4_600; attention of all scenes at once on a GPU brings 40
-    "data/maps": 3_720,  # goal 3_000
+    "planners": 4_355,  # goal 4_300
+    "planners/learned": 4_900,  # goal 4_600; attention of all scenes at once on a GPU brings 40
+    "data/maps": 3_620,  # goal 3_000
     "data": 5_010,  # goal 3_900
     "data/nuplan": 2_720,  # goal 2_400
     "data/store": 2_190,  # goal 2_200
-    "data/synthetic": 2_590,  # goal 2_100
+    "data/synthetic": 2_575,  # goal 2_100
     "shiftsim/report": 3_370,  # goal 2_200
     "shiftsim/view": 2_510,  # goal 1_800
     "shiftsim/env": 1_465,
-    "shiftsim/train": 3_550,  # goal 1_600; rasters and rounds on a GPU, faster samples bring 30
+    "shiftsim/train": 3_330,  # goal 1_600; rasters and rounds on a GPU, faster samples bring 30
     "shiftsim/compat": 3_900,  # goal 2_300
     "shiftsim/verify": 1_270,  # goal 1_200
     "shiftsim/cli": 2_760,  # goal 2_300

@@ -123,14 +123,11 @@ class _PieceGraph(Topology[_Node, Part]):
                 raise MapError(what, "leave the lane out, or repair the file")
         super().__init__(warnings)
         self.pieces = [piece for piece in pieces if piece.polygon.area > 0 and piece.length > 0]
-        self._count("lane without area, left out", len(pieces) - len(self.pieces))
+        if without := len(pieces) - len(self.pieces):
+            warnings["lane without area, left out"] += without
         self.index = {piece.id: i for i, piece in enumerate(self.pieces)}
         self.is_connector = self._find_connectors()
         self.left = self._find_neighbors()
-
-    def _count(self, what: str, number: int) -> None:
-        if number:
-            self.warnings[what] += number
 
     def build(self) -> LaneGraph[Part]:
         self._link()
@@ -166,16 +163,13 @@ class _PieceGraph(Topology[_Node, Part]):
 
     def _link(self) -> None:
         """Successors as they are named; predecessors are the same links the other way."""
-        pairs, unknown = [], 0
         for number, piece in enumerate(self.pieces):
             for name in dict.fromkeys(piece.successors):
-                target = self.index.get(name, -1)
-                unknown += target < 0
-                if target >= 0 and target != number:
-                    pairs.append((number, target))
-        self._count("successor that is not in the map, left out", unknown)
-        for source, target in pairs:
-            self.join(_Node(source), _Node(target))
+                target = self.index.get(name)
+                if target is None:
+                    self.warnings["successor that is not in the map, left out"] += 1
+                elif target != number:
+                    self.join(_Node(number), _Node(target))
         self.drop_wide_gaps(lambda node: self.pieces[node.piece].ends)
 
     def _add_nodes(self) -> None:

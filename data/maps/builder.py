@@ -60,7 +60,7 @@ class _Shape(NamedTuple):
 
     left: FloatArray  # (K, 2) left border [m]
     right: FloatArray  # (K', 2) right border [m]
-    line: FloatArray  # (K'', 2) baseline [m]
+    baseline: FloatArray  # (K'', 2) [m]
     polygon: shapely.Polygon  # its area
 
 
@@ -72,10 +72,7 @@ class MapBuilder(ABC, Generic[S]):
     stop_signs: Sequence[bool]  # whether a stop sign governs each connector
 
     def __init__(self, graph: LaneGraph[S], shaper: Any, warnings: Counter[str]) -> None:
-        """Counts in `warnings` what is repaired.
-
-        `shaper` has `joined_borders` and `baseline`, as `segments` and `opendrive.shapes.Shapes`.
-        """
+        """`shaper` has `joined_borders` and `baseline`; `warnings` count what is repaired."""
         self.graph, self.shaper, self.warnings = graph, shaper, warnings
         lanes = graph.lanes
         # roadblocks that each connector comes from and leads to
@@ -135,13 +132,9 @@ class MapBuilder(ABC, Generic[S]):
         self._stop_ids = self._new_ids(len(self.stops))
         edges = [*self._lane_specs(), *self._connector_specs()]
         blocks = [*self._roadblocks(), *self._roadblock_connectors()]
-        layers = {
-            "intersections": list(self._intersections()),
-            "stop_polygons": [
-                AreaSpec(i, stop.polygon, stop.kind)
-                for i, stop in zip(self._stop_ids, self.stops, strict=True)
-            ],
-        }
+        layers = {"intersections": list(self._intersections())}
+        stops = zip(self._stop_ids, self.stops, strict=True)
+        layers["stop_polygons"] = [AreaSpec(i, stop.polygon, stop.kind) for i, stop in stops]
         polygons = [edge.polygon for edge in edges]
         for layer, shapes in self.areas(polygons, layers["intersections"]).items():
             layers[layer] = [AreaSpec(next(self._next_id), shape) for shape in shapes]
@@ -191,7 +184,7 @@ class MapBuilder(ABC, Generic[S]):
 
     def _shape_connector(self, connector: Connector[S]) -> _Shape:
         borders = self.connector_borders(connector)
-        before, after = (self._lanes[i].line for i in (connector.source, connector.target))
+        before, after = (self._lanes[i].baseline for i in (connector.source, connector.target))
         line = self.shaper.baseline(connector.segments, before[-1], after[0])
         area = lane_polygon(*borders)
         return _Shape(*unfold_borders(*borders, area), bend_ends(line, before, after), area)
@@ -210,10 +203,11 @@ class MapBuilder(ABC, Generic[S]):
                 left_lane[number + 1] = self._lane_ids[number]
                 right_lane[number] = self._lane_ids[number + 1]
         for number, (lane, shape) in enumerate(zip(lanes, self._lanes, strict=True)):
-            yield self._edge(
-                shape,
-                lane.segments,
+            yield EdgeSpec(
+                **shape._asdict(),
                 id=self._lane_ids[number],
+                is_connector=False,
+                speed_limit=self._speed_limit(lane.segments),
                 block_id=self._block_ids[lane.block],
                 incoming=incoming[number],
                 outgoing=outgoing[number],
@@ -228,12 +222,12 @@ class MapBuilder(ABC, Generic[S]):
         for number, shape in enumerate(self._connectors):
             connector = self.graph.connectors[number]
             left_id, right_id = self._new_ids(2)
-            stops = self.stops_of(number, self._lanes[connector.source].line, shape.line)
-            yield self._edge(
-                shape,
-                connector.segments,
+            stops = self.stops_of(number, self._lanes[connector.source].baseline, shape.baseline)
+            yield EdgeSpec(
+                **shape._asdict(),
                 id=self._connector_ids[number],
                 is_connector=True,
+                speed_limit=self._speed_limit(connector.segments),
                 block_id=self._pair_ids[self.block_pairs[number]],
                 incoming=[self._lane_ids[connector.source]],
                 outgoing=[self._lane_ids[connector.target]],
@@ -242,15 +236,8 @@ class MapBuilder(ABC, Generic[S]):
                 intersection_id=self._group_ids[self._groups[number]],
                 has_traffic_lights=self.lights[number] is not None,
                 stop_lines=[self._stop_ids[i] for i in stops],
-                turn_type=turn_type(shape.line),
+                turn_type=turn_type(shape.baseline),
             )
-
-    def _edge(self, shape: _Shape, segments: Sequence[S], **rest: Any) -> EdgeSpec:
-        """An edge of a shape; `rest` is what else it has."""
-        lines = {"left": shape.left, "right": shape.right, "baseline": shape.line}
-        limit = self._speed_limit(segments)
-        rest = {"is_connector": False, "speed_limit": limit, **lines, **rest}
-        return EdgeSpec(polygon=shape.polygon, **rest)
 
     def _speed_limit(self, segments: Sequence[S]) -> float | None:
         """The limit on most of a lane (nuPlan rule 507), the lower one on ties [m/s]."""

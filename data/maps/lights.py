@@ -31,16 +31,12 @@ def states_of_cycles(
     cycles: Mapping[str, Cycle], steps: IntArray, step_s: float
 ) -> LightStates | None:
     """States of lights (by name) with fixed cycles, a row per step; None where there is none."""
-    columns = [
-        np.array(cycle.status, np.int64)[
-            np.searchsorted(
-                np.cumsum(cycle.lengths), (steps - cycle.offset) % sum(cycle.lengths), side="right"
-            )
-        ]
-        for cycle in cycles.values()
-    ]
-    if not columns:
+    if not cycles:
         return None
+    columns = []
+    for status, lengths, offset in cycles.values():
+        index = np.searchsorted(np.cumsum(lengths), (steps - offset) % sum(lengths), side="right")
+        columns.append(np.array(status, np.int64)[index])
     time_us = np.rint(steps * step_s * 1e6).astype(np.int64)
     return LightStates(tuple(cycles), time_us, np.stack(columns, axis=1))
 

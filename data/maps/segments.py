@@ -41,12 +41,9 @@ class LanePiece:
         """(K, 2) its centre line [m]."""
         if self.center is not None:
             return self.center
-        shares = [_shares(line) for line in (self.left, self.right)]
-        at = np.unique(np.concatenate(shares))
-        left, right = (
-            shapes.points_at(line, s, at)
-            for line, s in zip((self.left, self.right), shares, strict=True)
-        )
+        borders = [(line, _shares(line)) for line in (self.left, self.right)]
+        at = np.unique(np.concatenate([shares for _, shares in borders]))
+        left, right = (shapes.points_at(line, shares, at) for line, shares in borders)
         return 0.5 * (left + right)
 
     @cached_property

@@ -48,12 +48,9 @@ def random_town(kind: str, name: str, rng: np.random.Generator) -> Town:
 def _turned(streets: Sequence[Street], angle: float) -> list[Street]:
     """Streets turned around the origin [rad]."""
     cos, sin = float(np.cos(angle)), float(np.sin(angle))
-    out = []
-    for street in streets:
-        x, y, heading = street.start
-        start = (x * cos - y * sin, x * sin + y * cos, heading + angle)
-        out.append(replace(street, start=start))
-    return out
+    old = (street.start for street in streets)
+    starts = [(x * cos - y * sin, x * sin + y * cos, heading + angle) for x, y, heading in old]
+    return [replace(street, start=start) for street, start in zip(streets, starts, strict=True)]
 
 
 def _junction(rng: np.random.Generator, *, lit: bool) -> list[Street]:
@@ -123,9 +120,7 @@ def _arms(
     all_main = lit or (lanes == 1 and rng.random() < 0.15)
     out = []
     for place, number in enumerate(numbers):
-        is_main = place in mains
-        num_lanes = lanes
-        has_sign = False
+        is_main, num_lanes, has_sign = place in mains, lanes, False
         if not is_main:
             num_lanes = 2 if lanes > 1 and lit and rng.random() < 0.4 else 1
             has_sign = not all_main and rng.random() < 0.7

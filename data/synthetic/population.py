@@ -63,10 +63,8 @@ def _driver(
         eager = float(rng.uniform(0.35, 0.65))
     driver = Driver(category, path, s, 0.0, round(eager, 3), start)
     if rng.random() < 0.16:
-        driver.wave = (
-            round(float(rng.uniform(0.15, 0.65)), 2),
-            round(float(rng.uniform(6, 15)), 1),
-        )
+        depth, period = float(rng.uniform(0.15, 0.65)), float(rng.uniform(6, 15))
+        driver.wave = round(depth, 2), round(period, 1)
     if rng.random() < _HALTS.get(category, _HALTS_ELSE) and not path.is_parking:
         driver.halt = _halt(path, driver, rng)
     return driver
@@ -240,10 +238,9 @@ def _pedestrians(
 
 
 def touching(boxes: list[Box], parked: FloatArray, drivers: list[Driver]) -> set[int]:
-    """Numbers of agents to leave out, so that nobody touches anybody.
+    """Numbers of agents to leave out, so that nobody touches anybody, nor cars `parked` (n, 3).
 
-    Agents are numbered from 0 on, drivers first, in the order of their tracks; cars are parked at
-    `parked` (n, 3).
+    Agents are numbered from 0 on, drivers first, in the order of their tracks.
     """
     rows = np.array([(x[0], x[1] - 1, *x[3:6], *SIZES[x[2]][:2]) for x in boxes]).reshape(-1, 7)
     out: set[int] = set()

@@ -212,13 +212,12 @@ def _add_lights(store: Path, recording: str, town: Town, offset: FloatArray) -> 
     stored = opened.recording(recording)
     found = stored.read(0, stored.num_rows)
     seconds = (np.arange(stored.num_rows) * ROW_S).tolist()
-    names, columns = [], []
-    for edge, lights, phase in _lit_connectors(road, town, offset):
-        names.append(road.edges.ids[edge])
-        columns.append([int(lights.status(phase, time)) for time in seconds])
-    status = np.array(columns, np.int8).T
+    lit = list(_lit_connectors(road, town, offset))
+    names = tuple(road.edges.ids[edge] for edge, *_ in lit)
+    columns = [[int(lights.status(phase, time)) for time in seconds] for _, lights, phase in lit]
     with StoreWriter(store) as writer:
-        writer.add_recording(replace(found, lights=TrafficLights(tuple(names), status)))
+        lights = TrafficLights(names, np.array(columns, np.int8).T)
+        writer.add_recording(replace(found, lights=lights))
 
 
 def _lit_connectors(

@@ -84,10 +84,7 @@ def _winding(
 
 
 def with_crossings(rng: np.random.Generator, street: Street, share: float) -> Street:
-    """The same street with crossings: at its begin with a chance of `share`, and further on.
-
-    Some are not marked: there people step out between parked cars.
-    """
+    """The same street with crossings, one at its begin with a chance; some are not marked."""
     length = street.length
     places = AT_JUNCTION if rng.random() < share else ()
     if rng.random() < 0.6 and length > 75.0:
@@ -150,10 +147,7 @@ def junction_arms(
     center: tuple[float, float] = (0.0, 0.0),
     junction: int = 101,
 ) -> list[Street]:
-    """Streets put around a junction, each leading away from it at its angle [rad], ascending.
-
-    `rounding` is the radius of the kerbs [m].
-    """
+    """Streets that lead away from a junction at ascending angles [rad]; kerbs `rounding` [m]."""
     out = []
     far = reaches(streets, angles, rounding)
     for street, angle, reach in zip(streets, angles, far, strict=True):

@@ -92,10 +92,7 @@ def load_weights(spec: str, planner: str, *, device: str = "cpu") -> Weights:
 
 
 def checkpoint_fingerprint(spec: str, planner: str) -> str:
-    """What tells these weights from others: SHA-256 of the files, or the deterministic name.
-
-    Several checkpoints of an ensemble give several, separated by commas.
-    """
+    """What tells these weights from others: hashes of the files with commas, or words as given."""
     return ",".join(_fingerprint(part, planner) for part in split_ensemble(spec, planner))
 
 
@@ -378,10 +375,7 @@ def require_torch(who: str) -> None:
 
 
 def resolve_device(name: str) -> str:
-    """The device, `cpu` or `cuda:N`, of such a name, `cuda`, or `auto` (a GPU, else the CPU).
-
-    Raises ConfigError: the name is unknown, or this machine has no such device.
-    """
+    """`cpu` or `cuda:N`, of itself, `cuda` or `auto` (a GPU, else the CPU); else a ConfigError."""
     import torch
 
     kind, _, number = name.partition(":")

@@ -1,7 +1,7 @@
 """What is in a checkpoint file, and the same weights as a safetensors file."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +24,6 @@ class Inspection:
     args: dict[str, Any] | None  # settings beside the weights, or None
     skipped: tuple[str, ...]  # what was left out
     made_from: str  # SHA-256 of the file that this one was converted from, or empty
-
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON values."""
-        return asdict(self)
 
     def lines(self) -> list[str]:
         """As text."""

@@ -27,10 +27,9 @@ def deterministic_state(
 
     `rules` (`a` to `e`, or `keep`) are of tensors which the table of names does not fit.
     """
-    chosen = rules or {}
     out: State = {}
     for name, value in state.items():
-        rule = chosen.get(name) or rule_of(name, value.ndim)
+        rule = (rules or {}).get(name) or rule_of(name, value.ndim)
         if rule == "keep" or value.dtype.kind != "f":
             out[name] = value.copy()
         else:

@@ -3,6 +3,8 @@
 Names and shapes of all tensors are those of the official checkpoints.
 """
 
+from collections import OrderedDict
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -66,22 +68,16 @@ class _HistoryBlock(nn.Module):
         return x + self.mlp(self.norm2(x))
 
 
-class _Downsample(nn.Module):
-    def __init__(self, dim: int) -> None:
-        super().__init__()
-        self.reduction = Conv(dim, 2 * dim, stride=2, bias=False)
-        self.norm = nn.LayerNorm(2 * dim)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.norm(self.reduction(x))
-
-
-class _Level(nn.Module):
-    def __init__(self, index: int) -> None:
-        super().__init__()
-        dim, sizes = _WIDTHS[index], (_HEADS[index], _WINDOWS[index], _LENGTHS[index])
-        self.blocks = nn.Sequential(*(_HistoryBlock(dim, *sizes) for _ in range(2)))
-        self.downsample = _Downsample(dim) if index + 1 < len(_WIDTHS) else nn.Identity()
+def _level(index: int) -> nn.ModuleDict:
+    """Blocks of a level, and what leads to the next one."""
+    dim, sizes = _WIDTHS[index], (_HEADS[index], _WINDOWS[index], _LENGTHS[index])
+    blocks = nn.Sequential(_HistoryBlock(dim, *sizes), _HistoryBlock(dim, *sizes))
+    level = nn.ModuleDict({"blocks": blocks})
+    if index + 1 < len(_WIDTHS):
+        reduction = Conv(dim, 2 * dim, stride=2, bias=False)
+        parts = OrderedDict(reduction=reduction, norm=nn.LayerNorm(2 * dim))
+        level["downsample"] = nn.Sequential(parts)
+    return level
 
 
 class HistoryEncoder(nn.Module):
@@ -90,7 +86,7 @@ class HistoryEncoder(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.embed = nn.ModuleDict({"proj": Conv(HISTORY_CHANNELS, _WIDTHS[0])})
-        self.levels = nn.ModuleList(_Level(index) for index in range(len(_WIDTHS)))
+        self.levels = nn.ModuleList(_level(index) for index in range(len(_WIDTHS)))
         self.norm0, self.norm1, self.norm2 = (nn.LayerNorm(width) for width in _WIDTHS)
         self.lateral_convs = nn.ModuleList(Conv(width, DIM) for width in _WIDTHS)
         self.fpn_conv = Conv(DIM, DIM)
@@ -101,10 +97,10 @@ class HistoryEncoder(nn.Module):
         ends = []  # (A, 2, 128) by level: what the last step of the result depends on
         norms = (self.norm0, self.norm1, self.norm2)
         for level, norm, lateral in zip(self.levels, norms, self.lateral_convs, strict=True):
-            assert isinstance(level, _Level)
-            x = level.blocks(x)
+            assert isinstance(level, nn.ModuleDict)
+            x = level["blocks"](x)
             ends.append(lateral(norm(x[:, -3:]))[:, -2:])
-            x = level.downsample(x)
+            x = level["downsample"](x) if "downsample" in level else x
         merged = ends.pop()
         while ends:
             near, last = merged[:, -2:-1], merged[:, -1:]  # twice as fine, by linear interpolation

@@ -84,10 +84,7 @@ class InferenceServer:
 
 
 class InferenceClient:
-    """What takes the place of `infer` where an owner has the network.
-
-    Copies of a planner share it, and its connection, which is made when it is needed.
-    """
+    """Takes the place of `infer` where an owner has the network; copies of a planner share it."""
 
     def __init__(self, address: Address, name: str) -> None:
         """Ask the owner at an address for the planner of that name."""
@@ -99,12 +96,7 @@ class InferenceClient:
         return InferenceClient, (self.address, self.name)
 
     def __call__(self, features: Sequence[Any]) -> Sequence[Any]:
-        """What the planner's `infer` returns.
-
-        Raises:
-            PlannerError: There is no owner, or it ended twice of this request.
-            ShiftsimError: `infer` failed.
-        """
+        """What `infer` returns or raises; a PlannerError if no owner answers, twice."""
         for left in reversed(range(_TRIES)):
             try:
                 self._connection = self._connection or self._connected()

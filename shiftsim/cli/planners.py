@@ -1,7 +1,7 @@
 """Commands about planners and their weights: planners, checkpoint, train, features, realism."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -110,7 +110,7 @@ def inspect(path: Source, as_json: Json = False) -> None:
     from shiftsim.planners.learned.convert import inspect_checkpoint
 
     found = inspect_checkpoint(path)
-    print_result(found.to_dict(), found.lines(), as_json=as_json)
+    print_result(asdict(found), found.lines(), as_json=as_json)
 
 
 @checkpoint.command()
@@ -124,12 +124,12 @@ def convert(
     from shiftsim.planners.learned.convert import convert_checkpoint
 
     converted = convert_checkpoint(path, out, half=half)
-    print_result(converted.to_dict(), converted.lines(), as_json=as_json)
+    print_result(asdict(converted), converted.lines(), as_json=as_json)
 
 
 def _add_training(planner: str, help: str, of: Any, *named: str) -> None:
     """The command that trains a planner by some settings, of which those `named` are its name."""
-    names = [name for name in of.__dataclass_fields__ if name not in named]
+    names = [item.name for item in fields(of) if item.name not in named]
 
     @train.command(planner, help=help)
     @cli.with_settings(*names, of=of)

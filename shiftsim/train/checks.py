@@ -16,14 +16,7 @@ from shiftsim.geometry.boxes import from_frame
 from shiftsim.sim.planner import Observation, Planner, observe_log, scene_info
 from shiftsim.world.line import Line
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import (
-    PACIFICA,
-    VX,
-    AgentKind,
-    LightStatus,
-    Tracks,
-    Trajectory,
-)
+from shiftsim.world.state import PACIFICA, VX, AgentKind, LightStatus, Tracks, Trajectory
 
 EVERY = 20  # iterations between two cases
 MOVING, STANDING = 3.0, 0.5  # m/s

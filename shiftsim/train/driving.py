@@ -10,6 +10,8 @@ within 0.1 s: a larger `tau` steers harder than the tracker.
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
+from time import monotonic
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,7 +27,7 @@ from shiftsim.runs.workers import map_unordered
 from shiftsim.sim.dynamics.lqr import NUPLAN, raise_for_status, track
 from shiftsim.sim.log import Setting
 from shiftsim.sim.planner import Observation, SceneInfo
-from shiftsim.train.folder import OnMessage, Settings
+from shiftsim.train.folder import REPORT_EVERY, OnMessage, Settings
 from shiftsim.train.states import State, compress_raster
 from shiftsim.world.state import STEERING, VX
 
@@ -81,7 +83,6 @@ class Driven(NamedTuple):
     failed: list[str]  # why a scenario was not
 
 
-OnProgress = Callable[[int, int], None]  # gets how many of how many jobs are done
 RunJobs = Callable[[list[Job]], list[Driven]]  # `run_jobs` for some weights
 
 
@@ -101,8 +102,7 @@ def encode_action(
 def brake_at_stand(action: carl.Action, speed: float) -> carl.Action:
     """The action, which brakes where a vehicle at `speed` [m/s] is to stand or come to a stand.
 
-    Braking at a stand changes nothing, as nobody drives backwards. But a network that is taught
-    a throttle of 0 there errs to either side, and creeps into what it waits for.
+    A network that is taught a throttle of 0 there errs to either side, and creeps.
     """
     if speed < SLOW and action[0] < PARTING:
         action[0] = min(float(action[0]), HOLD)
@@ -128,18 +128,10 @@ class Expert:
         return brake_at_stand(action, float(ego[VX]))
 
 
-class PolicyPlanner(carl.Carl):
-    """The network that is trained, as a planner."""
-
-    def set_last_action(self, action: carl.Action) -> None:
-        """Take the action of somebody else as its own last one."""
-        self._last_action = action
-
-
 class DrivenScenario:
     """One scenario under way."""
 
-    def __init__(self, start: Start, job: Job, scenario: Any, policy: PolicyPlanner) -> None:
+    def __init__(self, start: Start, job: Job, scenario: Any, policy: carl.Carl) -> None:
         self.start, self.job, self.policy = start, job, policy
         setting = Setting(start.noise, start.seed)
         self.episode = Episode(scenario, setting, np.zeros(2, np.float32))
@@ -177,7 +169,7 @@ class DrivenScenario:
 
     def advance(self, action: carl.Action) -> None:
         """Drive one step."""
-        self.policy.set_last_action(action)
+        self.policy.last_action = action  # also where it is somebody else's
         ego = self.episode.log.ego[self.episode.iteration]
         self.episode.advance(carl.command_of(action, ego))
 
@@ -187,7 +179,7 @@ class Driver:
 
     def __init__(self, store: str, checkpoint: str) -> None:
         """`checkpoint` is of the network that drives; any where PDM-Closed does."""
-        self._store, self._policy = open_store(store), PolicyPlanner(checkpoint)
+        self._store, self._policy = open_store(store), carl.Carl(checkpoint)
 
     def __call__(self, job: Job) -> Driven:
         """Drive all scenarios of a job."""
@@ -207,7 +199,7 @@ class Driver:
 
 
 def _step(
-    scenarios: list[DrivenScenario], policy: PolicyPlanner, failed: list[str]
+    scenarios: list[DrivenScenario], policy: carl.Carl, failed: list[str]
 ) -> list[DrivenScenario]:
     """Drive all of them one step; those that can go on."""
     ready = []
@@ -217,12 +209,10 @@ def _step(
             ready.append(one)
         except ShiftsimError as error:  # a scenario in which the expert fails teaches nothing
             failed.append(f"{one.start.token}: {error.message}")
-    asked = [one for one in ready if one.features is not None]
+    asked = {i: one.features for i, one in enumerate(ready) if one.features is not None}
     if asked:
-        for one, action in zip(
-            asked, policy.infer([one.features for one in asked if one.features]), strict=True
-        ):
-            one.action = action
+        for i, action in zip(asked, policy.infer([*asked.values()]), strict=True):
+            ready[i].action = action
     for one in ready:
         if one.action is not None:
             one.advance(one.action)
@@ -235,13 +225,14 @@ class Towns(NamedTuple):
     trained: dict[str, list[str]]
     tested: dict[str, list[str]]
 
+    @property
+    def trained_tokens(self) -> list[str]:
+        """Of all towns to train on, sorted."""
+        return sorted(chain.from_iterable(self.trained.values()))
+
 
 def divide(store: ScenarioStore, tokens: Iterable[str], seed: int) -> Towns:
-    """Towns to train on, and those to test on.
-
-    Raises:
-        DataError: There are too few scenarios.
-    """
+    """Towns to train on, and those to test on; a DataError if there are too few scenarios."""
     wanted = set(tokens)
     rows = [row for row in store.summary().to_pylist() if row["token"] in wanted]
     column = "token"
@@ -264,16 +255,6 @@ def tested_tokens(towns: Towns, count: int) -> list[str]:
     return sorted([found[i] for i in range(longest) for found in lists if i < len(found)][:count])
 
 
-def test_jobs(towns: Towns, count: int, noise: str, tau: float, *, by_expert: bool) -> list[Job]:
-    """Drive scenarios of the towns that are left out, `count` at most, to their end."""
-    tokens = tested_tokens(towns, count)
-    starts = [Start(token, noise, 0, -1 if by_expert else 0) for token in tokens]
-    return [
-        Job(tuple(starts[first : first + TOGETHER]), True, tau)
-        for first in range(0, len(starts), TOGETHER)
-    ]
-
-
 def collecting_jobs(
     towns: Towns, count: int, tau: float, random: np.random.Generator, *, by_expert: bool
 ) -> list[Job]:
@@ -294,22 +275,19 @@ def collecting_jobs(
 
 
 def run_jobs(
-    settings: Settings, checkpoint: str, on_progress: OnProgress, jobs: list[Job]
+    settings: Settings, checkpoint: str, what: str, on_message: OnMessage, jobs: list[Job]
 ) -> list[Driven]:
-    """Drive jobs in worker processes; the results in the order of the jobs.
-
-    Raises:
-        ConfigError: A worker died.
-    """
-    make = partial(Driver, settings.store, checkpoint)
+    """Drive jobs in worker processes: results in the order of the jobs, or a ConfigError."""
+    make, reported = partial(Driver, settings.store, checkpoint), monotonic()
     found: dict[int, Driven] = {}
-    places = {id(job): place for place, job in enumerate(jobs)}
     for outcome in map_unordered(make, jobs, workers=settings.workers):
         if outcome.result is None:
             raise ConfigError(f"{outcome.death}", hint="go on with --resume")
-        found[places[id(outcome.task)]] = outcome.result
-        on_progress(len(found), len(jobs))
-    return [found[place] for place in range(len(jobs))]
+        found[id(outcome.task)] = outcome.result
+        if monotonic() - reported > REPORT_EVERY or len(found) == len(jobs):
+            reported = monotonic()
+            on_message(f"{what} {len(found)} of {len(jobs)} jobs")
+    return [found[id(job)] for job in jobs]
 
 
 def collect(
@@ -339,9 +317,11 @@ def mean_scores(
     towns: Towns, count: int, tau: float, run: RunJobs, *, by_expert: bool
 ) -> dict[str, float]:
     """Mean closed-loop score by noise, on `count` scenarios at most of towns that are left out."""
-    out = {}
+    out, tokens = {}, tested_tokens(towns, count)
     for noise in TESTED:
-        done = run(test_jobs(towns, count, noise, tau, by_expert=by_expert))
+        starts = tuple(Start(token, noise, 0, -1 if by_expert else 0) for token in tokens)
+        first = range(0, len(starts), TOGETHER)
+        done = run([Job(starts[i : i + TOGETHER], True, tau) for i in first])
         scores = [score for driven in done for score in driven.scores]
         if not scores:
             failed = [text for driven in done for text in driven.failed]

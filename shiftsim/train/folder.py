@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field
 from itertools import count
 from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeAlias
 
 from shiftsim.errors import CheckpointError, ConfigError, DataError, MissingExtraError, one_of
 from shiftsim.files import atomic_write, write_text
@@ -28,23 +28,51 @@ INDEX = "index.json"  # of samples in files
 # networks: after the last round, with the best score on the towns that are left out, after PPO
 LATEST, BEST, REINFORCED = "latest.safetensors", "best.safetensors", "ppo.safetensors"
 TAUS = (0.2, 0.3, 0.5)  # s, tried where none is given
+REPORT_EVERY = 10.0  # s
+BATCH, RATE = 64, 1e-3  # of CaRL: states of a step, highest learning rate
 
 OnMessage = Callable[[str], None]  # gets a line that says how far a training is
 Weights: TypeAlias = dict[str, "Tensor"]  # by their names in CaRL's checkpoint
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Settings:
-    """What a training of CaRL's network depends on, and where and how it is done."""
+class BaseSettings:
+    """What every training depends on, and where it is written."""
 
-    out: Path = field(
-        metadata={"option": Option("Folder for networks, curves and what was collected.")}
-    )
+    least: ClassVar[dict[str, int]] = {"seed": 0}  # of numbers
+    # settings on which the result does not depend
+    elsewhere: ClassVar[tuple[str, ...]] = ("out", "workers")
+
+    out: Path = field(metadata={"option": Option("Folder for networks, curves and tables.")})
     store: str = setting("demo", "Store by name, path or URL.")
     split: str = setting("", "Split of the store; all its scenarios if empty.")
+    seed: int = setting(0, "Of everything that is random.")
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no training."""
+        for name, least in self.least.items():
+            if (value := getattr(self, name)) < least:
+                raise ConfigError(f"{name} is {value!r}", hint=f"give {least} or more")
+
+    @property
+    def determining(self) -> dict[str, object]:
+        """What the result depends on; not where it is written, nor by how many processes."""
+        return {name: v for name, v in asdict(self).items() if name not in self.elsewhere}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings(BaseSettings):
+    """What a training of CaRL's network depends on, and where and how it is done."""
+
+    least: ClassVar = {
+        **dict.fromkeys(("rounds", "states", "samples", "tests", "workers"), 1),
+        **dict.fromkeys(("tau", "seed", "ppo_samples"), 0),
+    }
+    elsewhere: ClassVar = ("out", "workers", "ppo_samples")
+    planner: ClassVar = "carl"
+
     checkpoint: str = setting("", "Weights to begin with: a file, or shiftsim. Else from nothing.")
     device: str = setting("cpu", "cpu, cuda, cuda:N or auto.")
-    seed: int = setting(0, "Of everything that is random.")
     workers: int = setting(2, "Processes that drive, threads that train.")
     rounds: int = setting(8, "Of collecting, training and testing.")
     states: int = setting(360_000, "Labelled states to collect in all.")
@@ -55,17 +83,14 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Refuse numbers that make no training."""
-        _require_positive(self, "rounds", "states", "samples", "tests", "workers")
-        if not 0.0 <= self.tau <= 2.0:
+        BaseSettings.__post_init__(self)
+        if not self.tau <= 2.0:
             raise ConfigError(f"tau is {self.tau!r}", hint="give seconds up to 2, or 0 to choose")
-        if self.seed < 0 or self.ppo_samples < 0:
-            raise ConfigError("seed or ppo_samples is negative", hint="give 0 or more")
 
     @property
-    def determining(self) -> dict[str, object]:
-        """What the result depends on; not where it is written, nor by how many processes."""
-        left_out = ("out", "workers", "ppo_samples")
-        return {name: value for name, value in asdict(self).items() if name not in left_out}
+    def recipe(self) -> "Preset":
+        """How much is learnt."""
+        return Preset(self.samples, self.rounds, BATCH, RATE)
 
     def part(self, number: int) -> Path:
         """The states of a round."""
@@ -96,16 +121,14 @@ COSTS = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ImitationSettings:
+class ImitationSettings(BaseSettings):
     """What a training from recordings depends on, and where and how it is done."""
 
+    least: ClassVar = {"rounds": 0, "samples": 0, "batch": 0, "seed": 0, "tests": 1, "workers": 1}
+
     planner: str = "plantf"
-    out: Path = field(metadata={"option": Option("Folder for networks and curves.")})
-    store: str = setting("demo", "Store by name, path or URL.")
-    split: str = setting("", "Split of the store; all its scenarios if empty.")
     preset: str = setting("laptop", "laptop, workstation or paper.", choices=tuple(PRESETS))
     device: str = setting("cpu", "cpu, cuda, cuda:N or auto.")
-    seed: int = setting(0, "Of everything that is random.")
     workers: int = setting(2, "Processes that make samples, and that drive.")
     rounds: int = setting(0, "Of training and testing. [of the preset]")
     samples: int = setting(0, "To train on, each time counted. [of the preset]")
@@ -113,13 +136,9 @@ class ImitationSettings:
     tests: int = setting(40, "Scenarios that each round is tested on.")
 
     def __post_init__(self) -> None:
-        """Refuse numbers that make no training."""
-        _require_positive(self, "tests", "workers")
-        if self.preset not in PRESETS:
-            raise ConfigError(f"preset {self.preset!r} unknown", hint=" or ".join(PRESETS))
-        for name in ("rounds", "samples", "batch", "seed"):
-            if getattr(self, name) < 0:
-                raise ConfigError(f"{name} is negative", hint="give 0 or more")
+        """Refuse numbers that make no training, and other presets."""
+        BaseSettings.__post_init__(self)
+        one_of("preset", self.preset, PRESETS)
 
     @property
     def recipe(self) -> Preset:
@@ -130,77 +149,43 @@ class ImitationSettings:
         rounds, batch = self.rounds or preset.rounds, self.batch or preset.batch
         return preset._replace(rounds=rounds, samples=samples, batch=batch)
 
-    @property
-    def determining(self) -> dict[str, object]:
-        """What the result depends on; not where it is written, nor by how many processes."""
-        left_out = ("out", "workers")
-        return {name: value for name, value in asdict(self).items() if name not in left_out}
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FeatureSettings:
-    """What samples in files depend on, and where and how they are made."""
+class FeatureSettings(BaseSettings):
+    """What samples in files depend on, not how many; and where and how they are made."""
 
-    store: str
+    least: ClassVar = dict.fromkeys(("seed", "workers", "samples"), 0)
+    elsewhere: ClassVar = ("out", "workers", "samples")
+
+    out: Path = field(metadata={"option": Option("Folder for the samples.")})
     planner: str = field(
         metadata={
             "option": Option("Whose features: plantf, pluto or diffusion-planner.", ("--for",))
         }
     )
-    out: Path = field(metadata={"option": Option("Folder for the samples.")})
-    split: str = setting("", "Split of the store; all its scenarios if empty.")
-    seed: int = setting(0, "Of everything that is random.")
     workers: int = setting(2, "Processes that make samples; 0 for none but this one.")
     samples: int = setting(0, "Stop at so many; 0 to take every scenario once.")
 
     def __post_init__(self) -> None:
         """Refuse other planners, and numbers that make no stream."""
-        one_of("--for", self.planner, tuple(COSTS))
-        for name in ("seed", "workers", "samples"):
-            if getattr(self, name) < 0:
-                raise ConfigError(f"{name} is negative", hint="give 0 or more")
-
-    @property
-    def determining(self) -> dict[str, object]:
-        """What a sample depends on; not how many there are."""
-        left_out = ("out", "workers", "samples")
-        return {name: value for name, value in asdict(self).items() if name not in left_out}
+        one_of("--for", self.planner, COSTS)
+        BaseSettings.__post_init__(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TrafficSettings:
+class TrafficSettings(BaseSettings):
     """What a training of traffic depends on, and where it is written."""
 
-    out: Path = field(
-        metadata={"option": Option("Folder for weights, losses and how real they are.")}
-    )
-    store: str = setting("demo", "Store by name, path or URL.")
-    split: str = setting("", "Split of the store; all its scenarios if empty.")
-    seed: int = setting(0, "Of everything that is random.")
+    least: ClassVar = {"seed": 0, "rounds": 1, "scenarios": 1, "epochs": 1, "tests": 1}
+
     rounds: int = setting(5, "Of collecting and training.")
     scenarios: int = setting(150, "That each round collects from.")
     epochs: int = setting(8, "Of each round.")
     tests: int = setting(100, "Scenarios that the result is measured on.")
 
-    def __post_init__(self) -> None:
-        """Refuse numbers that make no training."""
-        _require_positive(self, "rounds", "scenarios", "epochs", "tests")
 
-
-def _require_positive(settings: object, *names: str) -> None:
-    for name in names:
-        if (value := getattr(settings, name)) < 1:
-            raise ConfigError(f"{name} is {value!r}", hint="give a number above 0")
-
-
-def prepare_folder(
-    settings: Settings | ImitationSettings | FeatureSettings, store: str, *, resume: bool
-) -> None:
-    """Make the folder of a training on a store of this hash, or check that it is the same one.
-
-    Raises:
-        ConfigError: There is one already, or another one.
-    """
+def prepare_folder(settings: BaseSettings, store: str, *, resume: bool) -> None:
+    """Make the folder of a training on a store of this hash, or check that it is the same one."""
     place = settings.out / SETTINGS
     now = json.loads(json.dumps(settings.determining)) | {"store_hash": store}
     if not place.exists():
@@ -223,22 +208,14 @@ def prepare_folder(
 
 
 def make_folder(path: Path) -> None:
-    """Make an empty folder.
-
-    Raises:
-        ConfigError: It is there and not empty.
-    """
+    """Make an empty folder; a ConfigError if it is there and not empty."""
     if path.exists() and any(path.iterdir()):
         raise ConfigError(f"{str(path)!r} is not empty", hint="choose another --out")
     path.mkdir(parents=True, exist_ok=True)
 
 
 def read_state(path: Path) -> dict[str, Any]:
-    """What a training needs to go on.
-
-    Raises:
-        CheckpointError: The file is damaged.
-    """
+    """What a training needs to go on; a CheckpointError if the file is damaged."""
     import torch
 
     try:
@@ -319,17 +296,14 @@ def draw_curves(
     for noise in ("none", "ou-high"):
         look = {"label": f"noise {noise}", "linestyle": dashes(noise), **style.marks(noise)}
         right.plot(at, [100.0 * row[noise] for row in scores], **look)
-    right.set(xlabel="samples [million]", ylim=(0, 100))
-    right.set_ylabel("closed-loop score × 100")
+    right.set(xlabel="samples [million]", ylabel="closed-loop score × 100", ylim=(0, 100))
     right.set_title("on towns left out", fontsize=9)
     right.legend(frameon=False)
     for axes in more:
         for name in errors:
-            line = "-" if planner in name else ":"
             label = name.removeprefix("ADE of ").removesuffix(" [m]")
-            axes.plot(
-                at, [row[name] for row in scores], line, marker="o", color="0.15", label=label
-            )
+            look = {"linestyle": "-" if planner in name else ":", "marker": "o", "color": "0.15"}
+            axes.plot(at, [row[name] for row in scores], label=label, **look)
         axes.set(xlabel="samples [million]", ylabel="open loop: ADE [m]")
         axes.set_ylim(0.0, 1.1 * axes.get_ylim()[1])
         axes.legend(frameon=False)
@@ -339,11 +313,11 @@ def draw_curves(
 def write_features(settings: FeatureSettings, on_message: OnMessage) -> dict[str, Any]:
     """Write samples as a stream has them, a file for each of its blocks; returns the index of them.
 
-    Files that are there are not made again, so that it goes on where it was ended.
-
-    Raises:
-        DataError: No sample can be made.
+    Files that are there are not made again, so that it goes on where it was ended. It is a
+    DataError if no sample can be made.
     """
+    from safetensors import safe_open
+
     from shiftsim.data import open_store
     from shiftsim.runs.scenarios import open_split
     from shiftsim.train.stream import Stream, load_blocks
@@ -367,13 +341,15 @@ def write_features(settings: FeatureSettings, on_message: OnMessage) -> dict[str
             blocks = load_blocks(stream, number, settings.workers)
         if blocks is not None:
             _write_block(path, next(blocks))
-        files[path.name], reasons = _read_counts(path)
-        failed.update(reasons)
-        if monotonic() - reported > 10.0:
+        with safe_open(path, "pt") as file:
+            made = json.loads(file.metadata()["made"])
+        files[path.name] = made["samples"]
+        failed.update(made["failed"])
+        if monotonic() - reported > REPORT_EVERY:
             reported = monotonic()
             on_message(f"{total + files[path.name]} samples in {len(files)} files")
-    made = {"samples": total, "failed": dict(failed), "files": files}
-    index = {**settings.determining, "store_hash": store.hash, **made}
+    found = {"samples": total, "failed": dict(failed), "files": files}
+    index = {**settings.determining, "store_hash": store.hash, **found}
     write_text(settings.out / INDEX, json.dumps(index, indent=2) + "\n")
     return index
 
@@ -384,12 +360,3 @@ def _write_block(path: Path, block: "Block") -> None:
     samples = len(block.batches[0].target) if block.batches else 0
     made = {"samples": samples, "failed": block.failed}
     write_tensors(path, tensors, {"made": json.dumps(made)})  # several entries have no order
-
-
-def _read_counts(path: Path) -> tuple[int, dict[str, int]]:
-    """How many samples a file has, and how many of its block could not be made, by reason."""
-    from safetensors import safe_open
-
-    with safe_open(path, "pt") as file:
-        made = json.loads(file.metadata()["made"])
-    return made["samples"], made["failed"]

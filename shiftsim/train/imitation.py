@@ -7,6 +7,7 @@ values of a network. B scenes, A agents of which the first is the ego, T = 80 st
 
 import copy
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,7 +28,6 @@ from shiftsim.train.learning import (
     GradientPool,
     StepResult,
     TrainedNetwork,
-    apply_gradient,
     keep_memory,
     schedule,
 )
@@ -43,7 +43,6 @@ CIRCLES = [PACIFICA.rear_axle_to_center + place * _THIRD for place in (-1.0, 0.0
 CIRCLE_RADIUS = 0.5 * math.hypot(PACIFICA.width, _THIRD) - 0.2
 PIXEL, INSIDE = 0.2, 0.95  # m; share of the raster in which a point counts
 TEMPERATURE = 0.1  # of the contrastive loss
-CLIP = 5.0  # of the norm of all gradients
 WARM_UP, FLOOR = 0.05, 2e-3  # here: share of rising, end of the learning rate as a share
 # layers of Diffusion Planner that begin small, and at zero
 _TIME = ("t_embedder.mlp.0", "t_embedder.mlp.2")
@@ -88,10 +87,9 @@ def motion(target: Tensor) -> Tensor:
 
 
 class Units(NamedTuple):
-    """What plans and predictions are measured in by step, where it is not metres.
+    """What plans and predictions are measured in by step: in metres the last seconds outweigh all.
 
-    In metres the last seconds outweigh the first one, which is what is driven. Columns are x, y
-    [m], cosine and sine of the heading, velocity [m/s].
+    Columns are x, y [m], cosine and sine of the heading, velocity [m/s].
     """
 
     mean: Tensor  # (80, 6) of the plan
@@ -131,8 +129,7 @@ def plantf_loss(
 
     Args:
         out: What the network says.
-        target: (B, A, 80, 3) change of x [m], y [m] and heading [rad] since the present, in the
-            frame of the ego; 0 where not recorded.
+        target: (B, A, 80, 3) of `samples.targets`.
         valid: (B, A, 80) whether it was recorded. The terms of the ego take all of it.
         units: What errors are measured in, a fifth of it; None for metres.
     """
@@ -153,12 +150,9 @@ def plantf_loss(
 
 
 def pluto_assignment(projection: Tensor, lines: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """(B,) reference line and mode that PLUTO has to choose.
+    """(B,) reference line and mode that PLUTO has to choose, by (B, R, 8, 2) of `projections`.
 
-    Args:
-        projection: (B, R, 8, 2) arc length and distance [m] of the ego on every line at 1 to 8 s.
-        lines: (B, R) whether a line has points.
-        valid: (B, 80) steps of the ego that count.
+    `lines` (B, R) say whether a line has points, `valid` (B, 80) which steps of the ego count.
     """
     # their index is a second late, unless all steps count
     at = (valid.sum(dim=-1) // 10).clamp(0, projection.shape[2] - 1)
@@ -172,10 +166,9 @@ def pluto_assignment(projection: Tensor, lines: Tensor, valid: Tensor) -> tuple[
 def road_loss(trajectory: Tensor, signed: Tensor) -> Tensor:
     """How deep the ego is beyond the edge of the road, mean over circles and steps that are.
 
-    Args:
-        trajectory: (B, 80, 4) x, y [m], cosine and sine of the heading.
-        signed: (B, H, W) distance [m] to the edge, positive on the road: column x / 0.2 + W / 2,
-            row -y / 0.2 + H / 2. It is read half a pixel behind and to the left, as the authors do.
+    It drives (B, 80, 4). `signed` (B, H, W) is the distance [m] to the edge, positive on the road:
+    column x / 0.2 + W / 2, row -y / 0.2 + H / 2. It is read half a pixel behind and to the left, as
+    the authors do.
     """
     height, width = signed.shape[-2:]
     ahead = signed.new_tensor(CIRCLES)[:, None]
@@ -214,10 +207,9 @@ def pluto_loss(
 
     Args:
         out: What the network says.
-        target: (B, A, 80, 6) change of x, y [m], cosine and sine of that of the heading, velocity
-            [m/s], in the frame of the ego.
+        target: (B, A, 80, 6) of `samples.motion_targets`.
         valid: (B, A, 80) steps that count.
-        projection: (B, R, 8, 2) of `pluto_assignment`.
+        projection: (B, R, 8, 2) of `samples.projections`.
         signed: (B, H, W) of `road_loss`, or None for no such term.
         contrast: Arguments of `contrastive_loss`. The batch is then anchors, positives, negatives,
             of which the last third counts in no other term.
@@ -230,16 +222,13 @@ def pluto_loss(
     line, mode = pluto_assignment(projection[:count], lines, valid[:, 0])
     chosen, ego = trajectory[scene, line, mode], target[:, 0]
 
-    def error(
-        said: Tensor, recorded: Tensor, counted: Tensor, sizes: Tensor | None = None
-    ) -> Tensor:
+    def error(said: Tensor, recorded: Tensor, counted: Tensor, sizes: Tensor | None) -> Tensor:
         if sizes is not None:
             said, recorded = (v * FINENESS / sizes[:, : v.shape[-1]] for v in (said, recorded))
         each = functional.smooth_l1_loss(said, recorded, reduction="none").sum(dim=-1)
         return _mean_of(each, counted)
 
     own, of_others = (units.size, units.others_size) if units else (None, None)
-
     terms = {
         "reg_loss": error(chosen, ego, valid[:, 0], own),
         "cls_loss": functional.cross_entropy(logits.flatten(1), line * logits.shape[-1] + mode),
@@ -256,10 +245,8 @@ def pluto_loss(
 def diffusion_loss(said: Tensor, clean: Tensor, valid: Tensor) -> Losses:
     """Of Diffusion Planner: how well trajectories are restored to which noise was added.
 
-    Args:
-        said: (B, A, 80, 4) normalised x, y, cosine and sine of the heading, by the network.
-        clean: (B, A, 80, 4) the same as recorded, 0 where not; the ego and its neighbours.
-        valid: (B, A - 1, 80) recorded steps of the neighbours.
+    Both are (B, A, 80, 4) normalised x, y, cosine and sine of the heading, the ego first; `clean`
+    is 0 where not recorded. `valid` (B, A - 1, 80) are recorded steps of the neighbours.
     """
     error = (said - clean).square().sum(dim=-1)
     return _sum(
@@ -333,11 +320,7 @@ def begin(network: nn.Module, seed: int) -> None:
 
 
 def losses_of(
-    planner: str,
-    network: Any,
-    batch: Batch,
-    random: torch.Generator,
-    units: Units | None = None,
+    planner: str, network: Any, batch: Batch, random: torch.Generator, units: Units | None = None
 ) -> Losses:
     """Of a network that is trained; of PLUTO without the road and without contrast."""
     if planner == "diffusion-planner":
@@ -350,14 +333,9 @@ def losses_of(
     return plantf_loss(out, batch.target, batch.valid, units)
 
 
-class _Scaled(NamedTuple):
+def _scale(mean: Tensor, size: Tensor, module: nn.Module, inputs: Any, output: Tensor) -> Tensor:
     """Hook of a layer: its outputs times sizes, above means."""
-
-    mean: Tensor
-    size: Tensor
-
-    def __call__(self, module: nn.Module, inputs: Any, output: Tensor) -> Tensor:
-        return self.mean + self.size * output
+    return mean + size * output
 
 
 class ImitationLearner(TrainedNetwork):
@@ -377,43 +355,38 @@ class ImitationLearner(TrainedNetwork):
         if planner in LAST_LAYERS and not preset.published:
             self._units = Units.make(device)
             for name, (mean, size) in self._units.layers(planner).items():
-                network.get_submodule(name).register_forward_hook(_Scaled(mean, size))
+                network.get_submodule(name).register_forward_hook(partial(_scale, mean, size))
             network.agent_encoder.ego_state_emb.state_dropout = HIDDEN
+        groups = parameter_groups(network)
         if planner in DECAYS:
             groups = [{"params": list(network.parameters()), "weight_decay": DECAYS[planner]}]
-        else:
-            groups = parameter_groups(network)
         super().__init__(network, groups, total, betas=(0.9, 0.999))
         self.batch, self._preset, self._device, self._seed = preset.batch, preset, device, seed
-        self._planner, self._terms = planner, tuple(TERMS[planner])
+        self._planner, self.terms = planner, tuple(TERMS[planner])
         self.place = (0, 0)  # of the next batch: the block of the stream, and the batch in it
         count = LANES if device == "cpu" else 1
         self._pool = GradientPool(device, count)
-        self._trained: list[Tensor] = list(network.parameters())
-        shared = {id(value): value for value in self._trained}  # the rest is copied
-        others = [copy.deepcopy(network, dict(shared)) for _ in range(count - 1)]
-        self._lanes = [network, *others]
+        self.trained = list(network.parameters())
+        self._lanes = [network]
+        for _ in range(count - 1):
+            shared = {id(value): value for value in self.trained}  # the rest is copied
+            self._lanes.append(copy.deepcopy(network, shared))
         keep_memory()
 
     def learn(self, batch: Batch) -> StepResult:
         """Do one step."""
         parts = batch.on(self._device).split(len(self._lanes))
         found = self._pool.sum(self._gradient, self._lanes, parts, range(len(parts)))
-        count = len(parts)
-        if self._preset.published:
-            rounds = self._preset.rounds
-            epoch, rate = self.step * rounds // self.total, self._preset.rate
-            if self._planner == "diffusion-planner":
-                rate = diffusion_rate_of_epoch(epoch)
-            else:
-                rate = rate_of_epoch(epoch, rounds, rate=rate)
-        else:
-            highest = min(self._preset.rate, HIGHEST.get(self._planner, self._preset.rate))
+        rounds, rate = self._preset.rounds, self._preset.rate
+        epoch = self.step * rounds // self.total
+        if not self._preset.published:
+            highest = min(rate, HIGHEST.get(self._planner, rate))
             rate = highest * schedule(self.step / self.total, WARM_UP, FLOOR)
-        apply_gradient(self.optimiser, self._trained, found, count, clip=CLIP, rate=rate)
-        self.count_step()
-        terms = dict(zip(self._terms, (found.numbers / count).tolist(), strict=True))
-        return StepResult(found.loss / count, terms)
+        elif self._planner == "diffusion-planner":
+            rate = diffusion_rate_of_epoch(epoch)
+        else:
+            rate = rate_of_epoch(epoch, rounds, rate=rate)
+        return self.apply(found, len(parts), rate)
 
     def _gradient(self, network: Any, batch: Batch, number: int) -> BatchGradient:
         """Of one part of a batch."""
@@ -422,9 +395,9 @@ class ImitationLearner(TrainedNetwork):
         random = torch.Generator(self._device).manual_seed(drawn)
         losses = losses_of(self._planner, network, batch, random, self._units)
         gradients = torch.autograd.grad(  # of PLUTO some layers serve the contrast only
-            losses["loss"], self._trained, allow_unused=True, materialize_grads=True
+            losses["loss"], self.trained, allow_unused=True, materialize_grads=True
         )
-        numbers = torch.stack([losses[name].detach() for name in self._terms]).cpu()
+        numbers = torch.stack([losses[name].detach() for name in self.terms]).cpu()
         return BatchGradient(list(gradients), float(losses["loss"].detach()), numbers)
 
     def driving(self) -> Weights:

@@ -20,7 +20,7 @@ from torch.nn import functional
 
 from shiftsim.kernels import BoolArray, IntArray
 from shiftsim.planners.learned.carl.network import CarlNetwork, Policy
-from shiftsim.train.folder import Weights
+from shiftsim.train.folder import BATCH, RATE, TERMS, Weights
 from shiftsim.train.states import MIRRORED_ACTION, States, Values, mirror_measurements
 
 # a measurement is divided by these: last action, velocity and acceleration of the centre
@@ -28,8 +28,7 @@ from shiftsim.train.states import MIRRORED_ACTION, States, Values, mirror_measur
 UNITS = np.array([1.0, 1.0, 5.0, 0.5, 1.0, 0.5, 0.1, 0.3, 0.2, 0.5], np.float32)
 _UNITS_IN = "features_extractor.state_linear.0.weight"
 LANES, MICRO = 4, 16  # parts of a batch that are summed for themselves; states computed at once
-BATCH = 64  # states of a step
-RATE, FLOOR, WARM_UP = 1e-3, 0.01, 0.02  # learning rate, its end as a share, share of rising
+FLOOR, WARM_UP = 0.01, 0.02  # end of the learning rate as a share, share of rising
 DECAY, CLIP = 0.01, 5.0  # of the weights; of the norm of the gradient
 AVERAGED = 0.999  # of the running mean of the weights, per step
 SCALES = (0.3, 0.06)  # of errors of acceleration and steering
@@ -61,11 +60,7 @@ class BatchGradient(NamedTuple):
 
 
 class GradientPool:
-    """Computes gradients of batches on a device, on a CPU in parts on several threads.
-
-    The parts are summed in an order that does not depend on the number of threads, so that the same
-    seed gives the same network.
-    """
+    """Gradients of batches; a CPU sums parts in an order that no number of threads changes."""
 
     def __init__(self, device: str, threads: int) -> None:
         self._device, self._threads = device, threads
@@ -94,10 +89,7 @@ class GradientPool:
         count: int,
         loss_of_rows: Callable[[IntArray], tuple[Tensor, Tensor]],
     ) -> BatchGradient:
-        """Gradient of a batch of so many rows.
-
-        `loss_of_rows` gives the sum of losses over some of them, and of numbers to report.
-        """
+        """Gradient of so many rows; sums of losses over some of them, and of numbers to report."""
 
         def of_rows(rows: IntArray) -> BatchGradient:
             loss, numbers = loss_of_rows(rows)
@@ -116,10 +108,7 @@ class GradientPool:
 
 
 def keep_memory() -> None:
-    """Have the C library of Linux keep what tensors no longer use, for the next ones.
-
-    Else a third of the time of a step goes into pages that the kernel clears anew.
-    """
+    """Have Linux's C library keep what tensors leave: clearing pages takes a third of a step."""
     if sys.platform == "linux":
         for option, value in ((-4, 0), (-1, 2**30), (-2, 2**26)):  # mmap_max, trim, top_pad
             with contextlib.suppress(AttributeError):  # a C library without
@@ -212,14 +201,11 @@ class TrainedNetwork:
     """A network, its optimiser, and the running mean of its weights, which is what drives."""
 
     batch: int  # samples of a step
+    terms: tuple[str, ...]  # what is reported of one
+    trained: list[Tensor]  # parameters
 
     def __init__(
-        self,
-        network: nn.Module,
-        groups: list[dict[str, Any]],
-        total: int,
-        *,
-        betas: tuple[float, float],
+        self, network: nn.Module, groups: list[dict[str, Any]], total: int, *, betas: Any
     ) -> None:
         """`total` steps are to be done; `groups` of parameters are those of the optimiser."""
         self.network, self.total, self.step = network, total, 0
@@ -232,15 +218,18 @@ class TrainedNetwork:
         values = self.network.state_dict().items()
         return {name: value for name, value in values if value.is_floating_point()}
 
-    def count_step(self) -> None:
-        """Take the weights after one more step into the mean."""
+    def apply(self, found: BatchGradient, count: int, rate: float) -> StepResult:
+        """One step down the mean of so many gradients; its weights go into the mean, too."""
+        apply_gradient(self.optimiser, self.trained, found, count, clip=CLIP, rate=rate)
         self.step += 1
         drift = 1.0 - min(AVERAGED, (1.0 + self.step) / (10.0 + self.step))
         for name, value in self._averaged.items():
             self.mean[name].lerp_(value, drift)
+        means = (found.numbers / count).tolist()
+        return StepResult(found.loss / count, dict(zip(self.terms, means, strict=True)))
 
     def driving(self) -> Weights:
-        """The network with the mean weights, which drives."""
+        """The network with the mean weights, which drives; as files have it."""
         return {**self.network.state_dict(), **self.mean}
 
     def state(self) -> dict[str, Any]:
@@ -261,25 +250,22 @@ class TrainedNetwork:
 class Learner(TrainedNetwork):
     """CaRL's network, trained by imitation."""
 
-    batch = BATCH
+    batch, terms = BATCH, tuple(TERMS["carl"])
 
     def __init__(
         self, device: str, threads: int, total: int, seed: int, begin: Weights | None = None
     ) -> None:
-        """`total` steps are to be done; the learning rate falls towards their end.
-
-        `begin` are weights to begin with.
-        """
+        """`total` steps are to be done; `begin` are weights to begin with."""
         torch.manual_seed(seed)
         network = CarlNetwork()
         self._rate = RATE * BEGUN if begin else RATE
         if begin:
             network.load_state_dict(begin)
         network.to(device)
-        trained = network.named_parameters()
-        self._trained: list[Tensor] = [v for n, v in trained if not n.startswith("value_head")]
-        plain = [value for value in self._trained if value.dim() not in (2, 4)]
-        decayed = [value for value in self._trained if value.dim() in (2, 4)]
+        named = network.named_parameters()
+        self.trained = [value for name, value in named if not name.startswith("value_head")]
+        plain = [value for value in self.trained if value.dim() not in (2, 4)]
+        decayed = [value for value in self.trained if value.dim() in (2, 4)]
         groups = [
             {"params": decayed, "weight_decay": DECAY},
             {"params": plain, "weight_decay": 0.0},
@@ -299,13 +285,12 @@ class Learner(TrainedNetwork):
         def read(rows: IntArray) -> NDArray[np.uint8]:
             return states.rasters(batch.indices[rows], batch.mirrored[rows].tolist())
 
-        found = self._pool.compute(self._trained, count, loss_of_rows)
-        rate = self._rate * schedule(self.step / self.total)
-        apply_gradient(self.optimiser, self._trained, found, count, clip=CLIP, rate=rate)
-        self.count_step()
-        means = (found.numbers / count).tolist()
-        names = ("acceleration_error", "steering_error")
-        return StepResult(found.loss / count, dict(zip(names, means, strict=True)))
+        found = self._pool.compute(self.trained, count, loss_of_rows)
+        return self.apply(found, count, self._rate * schedule(self.step / self.total))
+
+    def driving(self) -> Weights:
+        """The network with the mean weights, without units."""
+        return to_official(super().driving())
 
 
 def schedule(done: float, warm_up: float = WARM_UP, floor: float = FLOOR) -> float:

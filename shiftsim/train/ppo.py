@@ -133,8 +133,7 @@ class Trainer:
         self._settings, self._device = settings, device
         self._pool = learning.GradientPool(device, settings.workers)
         self._optimiser = torch.optim.Adam(self.network.parameters(), lr=RATE, eps=EPSILON)
-        tokens = sorted(token for found in towns.trained.values() for token in found)
-        write_text(settings.out / TRAINED, "\n".join(tokens) + "\n")
+        write_text(settings.out / TRAINED, "\n".join(towns.trained_tokens) + "\n")
         self._envs: Any = None
 
     def __enter__(self) -> "Trainer":
@@ -160,8 +159,7 @@ class Trainer:
             order = random.permutation(len(buffer.pictures))
             for first in range(0, len(order), MINIBATCH):
                 rows = order[first : first + MINIBATCH]
-                critic_only = self.update / self.total < ALONE
-                mean_loss, count = self._learn(buffer, rows, critic_only=critic_only)
+                mean_loss, count = self._learn(buffer, rows)
                 loss, clipped = loss + mean_loss * len(rows), clipped + count
         self.update += 1
         return {"loss": loss / EPOCHS / len(order), "clipped": clipped / EPOCHS / len(order)}
@@ -201,10 +199,8 @@ class Trainer:
         read = features.detach() if critic_only else features
         return self.network.policy(features), self.network.value(read, critic)[:, 0]
 
-    def _learn(
-        self, buffer: RolloutBuffer, order: IntArray, *, critic_only: bool
-    ) -> tuple[float, float]:
-        arrays = buffer._asdict()
+    def _learn(self, buffer: RolloutBuffer, order: IntArray) -> tuple[float, float]:
+        critic_only, arrays = self.update / self.total < ALONE, buffer._asdict()
         pictures = arrays.pop("pictures")
         chosen = {name: torch.from_numpy(values[order]) for name, values in arrays.items()}
         chosen["measurements"] /= torch.from_numpy(learning.UNITS)
@@ -221,13 +217,10 @@ class Trainer:
         def read(rows: IntArray) -> NDArray[np.uint8]:
             return np.stack([read_raster(pictures[index]) for index in order[rows]])
 
-        parameters: list[Tensor] = list(self.network.parameters())
-        count = len(order)
-        found = self._pool.compute(parameters, count, loss_of_rows)
-        rate = RATE * (1.0 - self.update / self.total)
-        learning.apply_gradient(
-            self._optimiser, parameters, found, count, clip=CLIP_NORM, rate=rate
-        )
+        trained: list[Tensor] = list(self.network.parameters())
+        count, rate = len(order), RATE * (1.0 - self.update / self.total)
+        found = self._pool.compute(trained, count, loss_of_rows)
+        learning.apply_gradient(self._optimiser, trained, found, count, clip=CLIP_NORM, rate=rate)
         return found.loss / count, float(found.numbers[0])
 
     def state(self) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -23,42 +24,21 @@ from shiftsim.data import open_store
 from shiftsim.errors import DataError
 from shiftsim.files import write_text
 from shiftsim.metrics.open_loop import METRICS
-from shiftsim.planners.learned.checkpoint import resolve_device
+from shiftsim.planners.learned.checkpoint import load_weights, resolve_device
 from shiftsim.runs.config import make_config
 from shiftsim.runs.execute import execute
-from shiftsim.runs.filter import read_filter_results
 from shiftsim.runs.prepare import prepare
 from shiftsim.runs.results import Run
-from shiftsim.runs.scenarios import find_split
-from shiftsim.train import folder, learning
+from shiftsim.runs.scenarios import open_split
+from shiftsim.train import driving, folder, learning
 from shiftsim.train.checks import check
-from shiftsim.train.driving import (
-    TESTED,
-    TOGETHER,
-    TOGETHER_ON_GPU,
-    RunJobs,
-    Towns,
-    collect,
-    divide,
-    mean_scores,
-    run_jobs,
-    tested_tokens,
-)
-from shiftsim.train.folder import (
-    BEST,
-    LATEST,
-    ImitationSettings,
-    OnMessage,
-    Preset,
-    Settings,
-    Weights,
-)
+from shiftsim.train.folder import BEST, LATEST, OnMessage
 from shiftsim.train.imitation import ImitationLearner
 from shiftsim.train.samples import KINDS
 from shiftsim.train.states import States, write_part
 from shiftsim.train.stream import Stream, load_blocks
 
-_WRITE_EVERY, _REPORT_EVERY = 120.0, 10.0  # s
+_WRITE_EVERY = 120.0  # s
 _CURVE_EVERY = 50  # steps
 DRIVEN = 0.06  # of the scenarios that are trained on, in each round
 _BASELINE = "constant-velocity"  # driven beside a network, for comparison
@@ -81,28 +61,20 @@ class Progress:
 class Recipe(ABC):
     """One training in its folder, of whatever planner."""
 
-    planner: str
     learner: learning.TrainedNetwork
 
-    def __init__(
-        self, settings: Any, rounds: int, on_message: OnMessage, *, resume: bool = False
-    ) -> None:
-        """Begin, or go on where it was kept last.
-
-        Raises:
-            ConfigError: The folder holds another training, or there is no such device.
-            DataError: The store is not there.
-        """
-        self._settings, self._on_message, self._rounds = settings, on_message, rounds
+    def __init__(self, settings: Any, on_message: OnMessage, *, resume: bool = False) -> None:
+        """Begin, or go on where it was kept last; a ConfigError if the folder holds another one."""
+        self._settings, self._on_message, self.planner = settings, on_message, settings.planner
+        samples, self._rounds, batch, *_ = settings.recipe
+        self.steps = max(1, samples // self._rounds // batch)  # of a round
         self.device = resolve_device(settings.device)
         store = open_store(settings.store)
-        filtered = read_filter_results(store.path, store.hash)
-        usable = filtered.accepted if filtered else store.tokens
-        tokens = find_split(settings.split, store.path, usable).tokens
-        self.towns: Towns = divide(store, tokens, settings.seed)
+        split, _ = open_split(store, settings.split)
+        self.towns: driving.Towns = driving.divide(store, split.tokens, settings.seed)
         folder.prepare_folder(settings, store.hash, resume=resume)
         self.progress = Progress()
-        self.steps = self._make_learner()
+        self._make_learner(self.steps * self._rounds)
         if (settings.out / folder.STATE).exists():
             state = folder.read_state(settings.out / folder.STATE)
             self.progress = Progress(**state["progress"])
@@ -110,8 +82,8 @@ class Recipe(ABC):
         self._began = monotonic() - self.progress.seconds
 
     @abstractmethod
-    def _make_learner(self) -> int:
-        """Make the learner; the steps of a round."""
+    def _make_learner(self, total: int) -> None:
+        """Make the learner, for so many steps."""
 
     @abstractmethod
     def _collect(self) -> None:
@@ -120,10 +92,6 @@ class Recipe(ABC):
     @abstractmethod
     def _results(self) -> Iterator[learning.StepResult]:
         """Do step after step, from where the round is."""
-
-    @abstractmethod
-    def _official(self) -> Weights:
-        """What drives, as files have it."""
 
     @abstractmethod
     def _scores(self, network: Path, where: str) -> dict[str, float]:
@@ -143,8 +111,7 @@ class Recipe(ABC):
         progress, learner = self.progress, self.learner
         reported = written = monotonic()
         before, results = progress.done, list[learning.StepResult]()
-        steps = self._results() if progress.done < self.steps else iter(())
-        for result in steps:
+        for result in islice(self._results(), self.steps - progress.done):
             results.append(result)
             progress.done += 1
             if progress.done % _CURVE_EVERY == 0 or progress.done == self.steps:
@@ -154,12 +121,10 @@ class Recipe(ABC):
                 if monotonic() - written > _WRITE_EVERY:
                     self._write_state()
                     written = monotonic()
-            if monotonic() - reported > _REPORT_EVERY:
+            if monotonic() - reported > folder.REPORT_EVERY:
                 rate = (progress.done - before) * learner.batch / (monotonic() - reported)
                 reported, before = monotonic(), progress.done
                 self._report(rate)
-            if progress.done == self.steps:
-                break
 
     def _report(self, rate: float) -> None:
         done, total = (n * self.learner.batch for n in (self.learner.step, self.learner.total))
@@ -173,7 +138,7 @@ class Recipe(ABC):
 
     def _test(self) -> None:
         settings, progress = self._settings, self.progress
-        state = self._official()
+        state = self.learner.driving()
         folder.write_network(settings.out / LATEST, state, self.planner)
         found = self._scores(settings.out / LATEST, self._where)
         seconds = monotonic() - self._began
@@ -202,29 +167,16 @@ class Recipe(ABC):
 class Training(Recipe):
     """Of CaRL's network."""
 
-    planner = "carl"
     learner: learning.Learner
 
-    def __init__(self, settings: Settings, on_message: OnMessage, *, resume: bool = False) -> None:
-        super().__init__(settings, settings.rounds, on_message, resume=resume)
-
-    def _make_learner(self) -> int:
-        settings = self._settings
-        steps = max(1, settings.samples // settings.rounds // learning.BATCH)
-        total = steps * settings.rounds
-        begin = learning.from_official(self._begin()) if settings.checkpoint else None
+    def _make_learner(self, total: int) -> None:
+        settings, begin = self._settings, None
+        if settings.checkpoint:  # which is the network that drives first
+            state = load_weights(settings.checkpoint, "carl").state
+            begin = learning.from_official(state)
+            if not (settings.out / LATEST).exists():
+                folder.write_network(settings.out / LATEST, state)
         self.learner = learning.Learner(self.device, settings.workers, total, settings.seed, begin)
-        return steps
-
-    def _begin(self) -> Weights:
-        """The weights to begin with, which are the network that drives first."""
-        from shiftsim.planners.learned.checkpoint import load_weights
-
-        settings = self._settings
-        state = load_weights(settings.checkpoint, "carl").state
-        if not (settings.out / LATEST).exists():
-            folder.write_network(settings.out / LATEST, state)
-        return state
 
     def run(self) -> None:
         """Do all rounds that are not done yet, and PPO if it is asked for."""
@@ -237,7 +189,6 @@ class Training(Recipe):
 
     def _reinforce(self) -> None:
         """Go on with PPO from the best network, and test what comes out."""
-        from shiftsim.planners.learned.checkpoint import load_weights
         from shiftsim.train.ppo import reinforce
 
         settings = self._settings
@@ -254,7 +205,7 @@ class Training(Recipe):
         settings, rows = self._settings, self.progress.taus
         for tau in folder.TAUS:
             run = self._run_jobs(_NO_DRIVER, f"tau {tau:g} s")
-            found = mean_scores(self.towns, settings.tests, tau, run, by_expert=True)
+            found = driving.mean_scores(self.towns, settings.tests, tau, run, by_expert=True)
             rows.append({"tau": tau, **found})
             self._on_message(f"tau {tau:g} s: {_in_words(found)}")
         folder.write_table(settings.out / "tau.parquet", rows)
@@ -269,7 +220,7 @@ class Training(Recipe):
         checkpoint = str(settings.out / LATEST) if drives else _NO_DRIVER
         run = self._run_jobs(checkpoint, f"{self._where} collecting")
         number, tau = progress.round, progress.tau
-        write_part(part, collect(settings, self.towns, number, tau, run, self._on_message))
+        write_part(part, driving.collect(settings, self.towns, number, tau, run, self._on_message))
         self._write_state()
 
     def _results(self) -> Iterator[learning.StepResult]:
@@ -280,23 +231,13 @@ class Training(Recipe):
             key = (settings.seed, 3, progress.round, progress.done)
             yield learner.learn(states, learning.draw_batch(states, key))
 
-    def _official(self) -> Weights:
-        return learning.to_official(self.learner.driving())
-
     def _scores(self, network: Path, where: str) -> dict[str, float]:
         run, count = self._run_jobs(str(network), f"{where} testing"), self._settings.tests
-        return mean_scores(self.towns, count, self.progress.tau, run, by_expert=False)
+        return driving.mean_scores(self.towns, count, self.progress.tau, run, by_expert=False)
 
-    def _run_jobs(self, checkpoint: str, what: str) -> RunJobs:
-        """What drives jobs with some weights and says how far it is, now and then."""
-        last = [monotonic()]
-
-        def on_progress(done: int, total: int) -> None:
-            if monotonic() - last[0] > _REPORT_EVERY or done == total:
-                last[0] = monotonic()
-                self._on_message(f"{what} {done} of {total} jobs")
-
-        return partial(run_jobs, self._settings, checkpoint, on_progress)
+    def _run_jobs(self, checkpoint: str, what: str) -> driving.RunJobs:
+        """What drives jobs with some weights."""
+        return partial(driving.run_jobs, self._settings, checkpoint, what, self._on_message)
 
 
 class ImitationTraining(Recipe):
@@ -304,26 +245,17 @@ class ImitationTraining(Recipe):
 
     learner: ImitationLearner
 
-    def __init__(
-        self, settings: ImitationSettings, on_message: OnMessage, *, resume: bool = False
-    ) -> None:
-        self.planner = settings.planner
+    def _make_learner(self, total: int) -> None:
+        how = self.planner, self.device, self._settings.recipe, total, self._settings.seed
+        self.learner = ImitationLearner(*how)
         self._left_out = Counter[str]()  # samples that could not be made, by reason
-        super().__init__(settings, settings.recipe.rounds, on_message, resume=resume)
-
-    def _make_learner(self) -> int:
-        preset: Preset = self._settings.recipe
-        steps = max(1, preset.samples // preset.rounds // preset.batch)
-        total, seed = steps * preset.rounds, self._settings.seed
-        self.learner = ImitationLearner(self.planner, self.device, preset, total, seed)
-        return steps
 
     def run(self) -> None:
         """Do all rounds that are not done yet, then see what the best network acts on."""
         super().run()
         settings = self._settings
         planner = KINDS[self.planner].planner(str(settings.out / BEST), device=self.device)
-        tokens = tested_tokens(self.towns, settings.tests)
+        tokens = driving.tested_tokens(self.towns, settings.tests)
         rows = check(planner, map(open_store(settings.store).read, tokens))
         folder.write_table(settings.out / "checks.parquet", rows)
         for row in rows:
@@ -331,14 +263,11 @@ class ImitationTraining(Recipe):
             self._on_message(f"{row['check']}: {passed} of {row['cases']} cases")
 
     def _collect(self) -> None:
-        """From the second round on, let the network drive where it is trained; see `Stream.driven`.
-
-        The other samples are made when they are needed.
-        """
+        """From the second round on, let the network drive where it is trained."""
         settings, number = self._settings, self.progress.round
         if number == 0 or settings.recipe.published:
             return
-        tokens = np.sort(np.concatenate([*map(np.array, self.towns.trained.values())]))
+        tokens = self.towns.trained_tokens
         drawn = np.random.default_rng([settings.seed, 6, number]).permutation(tokens)
         share = round(DRIVEN * len(tokens))
         self._drive(self._driven[-1], sorted(drawn[: max(share, 1)].tolist()), [self.planner])
@@ -361,27 +290,19 @@ class ImitationTraining(Recipe):
             "store": settings.store,
             "split": str(split),
             "out": str(out),
-            "noise": list(TESTED),
+            "noise": list(driving.TESTED),
             "workers": settings.workers,
             "device": settings.device,
-            "batch_size": TOGETHER if self.device == "cpu" else TOGETHER_ON_GPU,
+            "batch_size": driving.TOGETHER if self.device == "cpu" else driving.TOGETHER_ON_GPU,
             **more,
         }
         return execute(prepare(make_config(values)))
 
     def _results(self) -> Iterator[learning.StepResult]:
         settings, learner = self._settings, self.learner
-        tokens = tuple(sorted(token for town in self.towns.trained.values() for token in town))
-        preset = settings.recipe
-        stream = Stream(
-            settings.store,
-            tokens,
-            settings.seed,
-            preset.batch,
-            self.planner,
-            preset.published,
-            tuple(map(str, self._driven)),
-        )
+        tokens, driven = tuple(self.towns.trained_tokens), tuple(map(str, self._driven))
+        preset, where = settings.recipe, (settings.store, tokens, settings.seed)
+        stream = Stream(*where, preset.batch, self.planner, preset.published, driven)
         self._on_message(f"{self._where} training on {len(tokens)} scenarios")
         block, done = learner.place
         unused = 0
@@ -401,19 +322,16 @@ class ImitationTraining(Recipe):
                 )
             block, done = block + 1, 0
 
-    def _official(self) -> Weights:
-        return self.learner.driving()
-
     def _scores(self, network: Path, where: str) -> dict[str, float]:
-        tokens = tested_tokens(self.towns, self._settings.tests)
+        tokens = driving.tested_tokens(self.towns, self._settings.tests)
         self._on_message(f"{where} testing; samples that could not be made: {self._reasons}")
         run_folder = self._settings.out / "runs" / f"round-{self.progress.round:02d}"
         run = self._drive(run_folder, tokens, [self.planner, _BASELINE], open_loop=True)
         rows = [row for row in run.scores.to_pylist() if row["planner"] == self.planner]
         if not rows:
             raise DataError(f"no scenario could be driven to its end, see {str(run_folder)!r}")
-        sums = {noise: sum(r["cls"] for r in rows if r["noise"] == noise) for noise in TESTED}
-        scores = {noise: found / len(tokens) for noise, found in sums.items()}  # failures score 0
+        by_noise = {n: [r["cls"] for r in rows if r["noise"] == n] for n in driving.TESTED}
+        scores = {n: sum(found) / len(tokens) for n, found in by_noise.items()}  # failures score 0
         return scores | _open_loop_errors(run.metrics.to_pylist())
 
     @property
@@ -445,5 +363,5 @@ def _curve_row(number: int, samples: int, results: list[learning.StepResult]) ->
 
 
 def _in_words(found: dict[str, float]) -> str:
-    scaled = {name: 100.0 * value if name in TESTED else value for name, value in found.items()}
-    return "  ".join(f"{name} {value:.1f}" for name, value in scaled.items())
+    scale = dict.fromkeys(driving.TESTED, 100.0)
+    return "  ".join(f"{name} {scale.get(name, 1.0) * value:.1f}" for name, value in found.items())

@@ -49,10 +49,7 @@ def read_raster(content: Any) -> Raster:
 
 
 def mirror_measurements(measurements: Values) -> Values:
-    """(…, 10) measurements of the ego in the mirror.
-
-    The acceleration of the centre holds the yaw acceleration, with its sign.
-    """
+    """(…, 10) measurements in the mirror; the acceleration of the centre holds that of the yaw."""
     out = measurements * _MIRRORED
     turning = PACIFICA.rear_axle_to_center * measurements[..., _YAW_ACCEL]
     out[..., _AX] -= np.float32(2.0) * turning.astype(np.float32)
@@ -76,12 +73,7 @@ def write_part(folder: Path, states: Iterable[State]) -> None:
 
 
 class States:
-    """The states of all rounds so far. N states.
-
-    Attributes:
-        measurements: (N, 10).
-        actions: (N, 2) labels.
-    """
+    """The states of all rounds so far, N: `measurements` (N, 10) and labels `actions` (N, 2)."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
         """`folders` are those of `write_part`; pictures are mapped from there."""
@@ -116,10 +108,7 @@ class States:
 
 
 def importance(measurements: Values, actions: Values, urgent: BoolArray) -> FloatArray:
-    """(N,) how often a state is drawn, in relation: braking, turning and correcting more.
-
-    Most of all where the network did not brake in time.
-    """
+    """(N,) how often a state is drawn: braking, turning, correcting, and braking too late most."""
     steering = measurements[:, _STEERING] / MAX_STEERING
     weights = np.ones(len(actions))
     weights += actions[:, 0] < BRAKING

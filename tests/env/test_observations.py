@@ -46,7 +46,7 @@ def test_the_raster_is_what_carl_sees_at_inference(source_of):
     seen, env = look(scenario, source_of, "raster", [action] * 7)
     planner = Carl("deterministic:drive")
     planner.reset(scene_info(scenario))
-    planner._last_action = action
+    planner.last_action = action
     features = planner.features(env.episode.observe())
     np.testing.assert_array_equal(seen["raster"], features.pictures)
     np.testing.assert_array_equal(seen["measurements"], features.measurements)

@@ -18,7 +18,7 @@ from shiftsim.planners.learned.checkpoint import network_module  # noqa: E402
 from shiftsim.planners.learned.deterministic import keyed_normals, network_weights  # noqa: E402
 from shiftsim.planners.learned.features import agent_features  # noqa: E402
 from shiftsim.sim.planner import History  # noqa: E402
-from shiftsim.train import imitation, samples  # noqa: E402
+from shiftsim.train import imitation, learning, samples  # noqa: E402
 from shiftsim.world.state import Tracks, center_poses  # noqa: E402
 
 SHARED = places.REPOSITORY.parent / "shared" / "reference" / "training"
@@ -226,7 +226,7 @@ def test_a_step_of_the_optimiser(dropped: Any) -> None:
     out = network(inputs_of("plantf", given))
     valid = tensor(given["agent.valid_mask"][..., FUTURE])
     imitation.plantf_loss(out, tensor(given["agent.target"]), valid)["loss"].backward()
-    norm = torch.nn.utils.clip_grad_norm_(network.parameters(), imitation.CLIP)
+    norm = torch.nn.utils.clip_grad_norm_(network.parameters(), learning.CLIP)
     assert norm.item() == pytest.approx(float(stored["f64/step/grad_norm_before_clip"]), rel=1e-6)
     optimiser = torch.optim.AdamW(
         imitation.parameter_groups(network), lr=imitation.rate_of_epoch(0)

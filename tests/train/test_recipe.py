@@ -13,8 +13,9 @@ import pytest
 import shiftsim
 from shiftsim.data.store.reading import open_store
 from shiftsim.errors import CheckpointError, ConfigError
+from shiftsim.planners.learned.carl.planner import Carl
 from shiftsim.train import recipe
-from shiftsim.train.driving import Driver, Job, PolicyPlanner, Start, divide
+from shiftsim.train.driving import Driver, Job, Start, divide
 from shiftsim.train.folder import BEST, LATEST, STATE, Settings
 from shiftsim.train.recipe import Training
 
@@ -77,7 +78,7 @@ def test_what_comes_out_drives_and_says_how_it_came(trained, toy, tmp_path):
 
 def test_with_weights_to_begin_with_the_network_drives_at_once(small, trained, monkeypatch):
     asked = []
-    monkeypatch.setattr(recipe, "collect", lambda *job: asked.append(job[4].args[1]) or [])
+    monkeypatch.setattr(recipe.driving, "collect", lambda *job: asked.append(job[4].args[1]) or [])
     monkeypatch.setattr(recipe, "write_part", lambda folder, states: None)
     settings = small("more", checkpoint=str(trained[0].out / BEST))
     training = Training(settings, print)
@@ -96,7 +97,7 @@ def test_what_comes_before_an_infraction_of_the_network_is_urgent(toy, monkeypat
 
     tokens = open_store(toy).tokens
     driver = Driver(str(toy), "deterministic:base")
-    monkeypatch.setattr(PolicyPlanner, "infer", veering)
+    monkeypatch.setattr(Carl, "infer", veering)
     assert 0 < sum(urgent(0)) <= 2 * 15
     assert not any(urgent(-1))
 

@@ -166,7 +166,7 @@ def rings_of(
         for road in roads
         for thing in road.objects
         if is_wanted(thing)
-        for ring in object_rings(shapes.line(road.id), thing)
+        for ring in object_rings(shapes.lines[road.id], thing)
         if len(ring) >= least and np.isfinite(ring).all()
     ]
 
@@ -201,12 +201,8 @@ def crosswalk_polygons(od: records.OpenDrive, shapes: Shapes) -> list[shapely.Po
 
 
 def _is_crosswalk_signal(signal: records.Signal) -> bool:
-    return (
-        not signal.reference
-        and not signal.dynamic
-        and (signal.type == "293" or "crosswalk" in signal.name.lower())
-        and signal.width is not None
-    )
+    is_static = not signal.reference and not signal.dynamic and signal.width is not None
+    return is_static and (signal.type == "293" or "crosswalk" in signal.name.lower())
 
 
 def _signal_ring(road: str, signal: records.Signal, shapes: Shapes) -> FloatArray:
@@ -214,7 +210,7 @@ def _signal_ring(road: str, signal: records.Signal, shapes: Shapes) -> FloatArra
     half_width = (signal.width or 0.0) / 2
     half_depth = (signal.value if signal.value and signal.value > 0 else 4.0) / 2
     s = signal.s + half_depth * np.array([-1.0, -1.0, 1.0, 1.0])
-    return shapes.line(road).evaluate(s).offset(signal.t + half_width * np.array([-1, 1, 1, -1]))
+    return shapes.lines[road].evaluate(s).offset(signal.t + half_width * np.array([-1, 1, 1, -1]))
 
 
 def parking_spaces(od: records.OpenDrive, shapes: Shapes) -> list[shapely.Polygon]:

@@ -40,12 +40,8 @@ def signal_control(signal: Signal) -> str | None:
 
 def connector_controls(od: OpenDrive, graph: Graph) -> list[frozenset[str]]:
     """What governs each connector: signals on its own roads, or before it on its lane."""
-    known = {
-        signal.id: signal
-        for road in od.roads.values()
-        for signal in road.signals
-        if not signal.reference
-    }
+    signals = [signal for road in od.roads.values() for signal in road.signals]
+    known = {signal.id: signal for signal in signals if not signal.reference}
     controls = []
     for connector in graph.connectors:
         last = graph.lanes[connector.source].segments[-1]
@@ -105,7 +101,7 @@ def _drawn_lines(od: OpenDrive, shapes: Shapes) -> list[shapely.Geometry]:
             is_finite = np.isfinite([signal.s, signal.t]).all()
             if signal.type == "294" and not signal.reference and is_finite:
                 half = (signal.width or 3.0) / 2
-                ends = shapes.line(road.id).evaluate(np.full(2, signal.s))
+                ends = shapes.lines[road.id].evaluate(np.full(2, signal.s))
                 drawn.append(shapely.LineString(ends.offset(signal.t + np.array([-half, half]))))
     return drawn
 

@@ -163,13 +163,8 @@ def _read_outline(element: Any, reader: Reader) -> Outline | None:
 
 def _read_repeat(element: Any, reader: Reader) -> Repeat:
     t_start = reader.finite(element, "tStart")
-    return Repeat(
-        reader.finite(element, "s"),
-        reader.finite(element, "length"),
-        reader.finite(element, "distance"),
-        t_start,
-        reader.finite(element, "tEnd", t_start),
-    )
+    s, length, distance = (reader.finite(element, name) for name in ("s", "length", "distance"))
+    return Repeat(s, length, distance, t_start, reader.finite(element, "tEnd", t_start))
 
 
 def _read_validity(element: Any, reader: Reader) -> tuple[tuple[int, int], ...]:

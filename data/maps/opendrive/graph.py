@@ -144,7 +144,6 @@ class _Builder(Topology[LaneKey, LaneSegment]):
 
     def _infer_links(self) -> None:
         """Links between sections of a road that the file forgot: same number, same place."""
-        inferred = 0
         for key in self.segments:
             onward = LaneKey(key.road, key.section + 1, key.lane)
             if onward not in self.segments:
@@ -156,9 +155,7 @@ class _Builder(Topology[LaneKey, LaneSegment]):
                 continue
             if np.abs(self.ends[source][1] - self.ends[target][0]).max() < INFER_GAP:
                 self.join(source, target)
-                inferred += 1
-        if inferred:
-            self.warnings["lane link missing between sections, inferred"] += inferred
+                self.warnings["lane link missing between sections, inferred"] += 1
 
     def _infer_road_links(self) -> None:
         """Links to a linked road that no lane tells of, where lanes touch.
@@ -189,10 +186,7 @@ class _Builder(Topology[LaneKey, LaneSegment]):
             self.warnings[what] += len(touching)
 
     def _beyond(self, key: LaneKey, *, entry: bool) -> tuple[bool, str | None]:
-        """What the file says of the place where travel enters (or leaves) a lane.
-
-        Whether it names a lane there, or the place lies within its road; and the road linked there.
-        """
+        """Whether the file names a lane where travel enters (or leaves) one, and the road there."""
         road, at_start = self.od.roads[key.road], self._is_forward(key) == entry
         lane = road.sections[key.section].lanes[key.lane]
         last = 0 if at_start else len(road.sections) - 1

@@ -89,8 +89,7 @@ def _prepare(od: records.OpenDrive, warnings: Counter[str]) -> records.OpenDrive
         if max(map(total_turn, road.geometries)) > MAX_TURN:
             warnings["road left out: one geometry turns more than one and a half times"] += 1
             continue
-        wrong = sum(error > 0 for error in errors)
-        if wrong:
+        if wrong := sum(error > 0 for error in errors):
             warnings["paramPoly3 that is not as long as it says, stretched"] += wrong
         fast += [name] * _count_fast(road)
         _note_gaps(road, warnings)
@@ -142,8 +141,7 @@ def _count_fast(road: records.Road) -> int:
 def _note_gaps(road: records.Road, warnings: Counter[str]) -> None:
     gaps, _ = ReferenceLine(road.geometries).joints()
     for low, high in ((GAP_NOTED, GAP_SERIOUS), (GAP_SERIOUS, np.inf)):
-        count = int(((gaps > low) & (gaps <= high)).sum())
-        if count:
+        if count := int(((gaps > low) & (gaps <= high)).sum()):
             warnings[f"gap of more than {low:g} m between geometries"] += count
 
 
@@ -197,7 +195,7 @@ class _RoadMapBuilder(MapBuilder[graph.LaneSegment]):
     def are_adjacent(self, left: graph.Lane, right: graph.Lane) -> bool:
         """Whether no lane of another use lies between two lanes of one section."""
         one, other = (lane.segments[0].key.lane for lane in (left, right))
-        return abs(one - other) - (1 if one * other < 0 else 0) == 1
+        return abs(one - other) - (one * other < 0) == 1
 
     def stop_areas(self, lanes: Sequence[shapely.Polygon]) -> list[StopArea]:
         return control.stop_lines(self.od, self.graph, self.shapes, self.controls, lanes)

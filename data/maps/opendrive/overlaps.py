@@ -239,10 +239,7 @@ def _pieces_between(pieces: list[LaneSegment], begin: float, end: float) -> list
 def subtract_overlaps(
     polygons: Sequence[shapely.Polygon], lengths: Sequence[float], stacked: set[tuple[int, int]]
 ) -> tuple[list[shapely.Polygon], int]:
-    """Polygons without the overlaps, which go to the shorter of two; and how many there were.
-
-    Pairs (i, j), i < j, in `stacked` may overlap.
-    """
+    """Polygons without overlaps, which go to the shorter of two unless `stacked`; how many."""
     out = list(polygons)
     pairs = [pair for pair in overlapping(polygons) if pair not in stacked]
     for i, j in pairs:

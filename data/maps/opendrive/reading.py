@@ -28,6 +28,7 @@ _COEFFICIENTS = {
     records.PARAM_POLY3: _PARAM_CUBIC,
 }
 _TOP_LEVEL = ("header", "road", "junction", "include")
+_SIGNALS = ("signal", "signalReference")
 
 
 def read_opendrive(path: Path) -> OpenDrive:
@@ -128,11 +129,9 @@ def _read_header(element: Any, reader: elements.Reader) -> tuple[Any, str | None
 def _read_road(element: Any, name: str, reader: elements.Reader) -> Road | None:
     """One road, or None where it has no usable reference line."""
     junction = element.get("junction", "-1")
-    lanes = element.find("lanes")
-    offsets = [] if lanes is None else lanes.findall("laneOffset")
-    geometries = _read_plan_view(element.find("planView"), reader)
+    geometries = _read_plan_view(element.findall("planView/geometry"), reader)
     stated = reader.number(element, "length", np.nan)
-    found = [] if lanes is None else list(lanes.iter("laneSection"))
+    found = element.findall("lanes//laneSection")
     ends = [*(reader.finite(e, "s") for e in found[1:]), stated]
     sections = [_read_section(e, end, reader) for e, end in zip(found, ends, strict=False)]
     if element.get("rule") is None:
@@ -150,33 +149,30 @@ def _read_road(element: Any, name: str, reader: elements.Reader) -> Road | None:
         return None
     if any(a.s > b.s for a, b in pairwise(sections)):
         reader.warn("records out of order")
-    link = element.find("link")
-    objects, signals = element.find("objects"), element.find("signals")
-    placed = [] if signals is None else signals.iter("signal", "signalReference")
+    placed = [e for e in element.iterfind("signals//*[@s]") if e.tag in _SIGNALS]
     return Road(
         id=name,
         length=min(stated, end),
         junction=None if junction == "-1" else junction,
         left_hand=element.get("rule") == "LHT",
         geometries=geometries,
-        offsets=reader.cubics(offsets, "s", stated),
+        offsets=reader.cubics(element.findall("lanes/laneOffset"), "s", stated),
         elevation=reader.cubics(element.findall("elevationProfile/elevation"), "s", stated),
         sections=tuple(sorted(sections, key=lambda section: section.s)),
-        predecessor=_read_link(link, "predecessor"),
-        successor=_read_link(link, "successor"),
+        predecessor=_read_link(element.find("link/predecessor")),
+        successor=_read_link(element.find("link/successor")),
         types=_read_types(element.findall("type"), reader),
-        objects=tuple(
-            elements.read_object(e, reader)
-            for e in (() if objects is None else objects.findall("object"))
-        ),
-        signals=tuple(elements.read_signal(e, reader) for e in placed if e.get("s") is not None),
+        objects=tuple(elements.read_object(e, reader) for e in element.iterfind("objects/object")),
+        signals=tuple(elements.read_signal(e, reader) for e in placed),
     )
 
 
-def _read_plan_view(element: Any, reader: elements.Reader) -> tuple[records.Geometry, ...] | None:
+def _read_plan_view(
+    found: list[Any], reader: elements.Reader
+) -> tuple[records.Geometry, ...] | None:
     geometries: list[records.Geometry] = []
     tiny: list[records.Geometry] = []
-    for child in () if element is None else element.findall("geometry"):
+    for child in found:
         shape: Any = next((e for e in child if e.tag in records.SHAPES), None)
         kind = records.LINE if shape is None else shape.tag
         length, s = (reader.number(child, k, may_be_any=True) for k in ("length", "s"))
@@ -225,8 +221,7 @@ def _note_directions(sections: list[Any], reader: elements.Reader) -> None:
             reader.told[(word == "forward") == (number < 0)] += 1
 
 
-def _read_link(link: Any, name: str) -> records.RoadLink | None:
-    found = None if link is None else link.find(name)
+def _read_link(found: Any) -> records.RoadLink | None:
     if found is None or found.get("elementId") is None:
         return None
     return records.RoadLink(
@@ -287,7 +282,6 @@ def _read_section(element: Any, end: float, reader: elements.Reader) -> records.
 
 
 def _read_lane(element: Any, number: int, length: float, reader: elements.Reader) -> records.Lane:
-    link = element.find("link")
     widths, borders = element.findall("width"), element.findall("border")
     kind = element.get("type", "")
     if not widths and not borders:
@@ -297,8 +291,8 @@ def _read_lane(element: Any, number: int, length: float, reader: elements.Reader
         type=kind or "none",
         widths=reader.cubics(widths, "sOffset", length),
         borders=reader.cubics(borders, "sOffset", length),
-        predecessors=_lane_ids(link, "predecessor", reader),
-        successors=_lane_ids(link, "successor", reader),
+        predecessors=_lane_ids(element.findall("link/predecessor"), reader),
+        successors=_lane_ids(element.findall("link/successor"), reader),
         speeds=tuple(
             sorted((_read_speed(e, reader) for e in element.findall("speed")), key=lambda r: r.s)
         ),
@@ -313,9 +307,8 @@ def _read_lane(element: Any, number: int, length: float, reader: elements.Reader
     return lane
 
 
-def _lane_ids(link: Any, name: str, reader: elements.Reader) -> tuple[int, ...]:
-    found = [] if link is None else [reader.integer(e, "id") for e in link.findall(name)]
-    return tuple(i for i in found if i is not None)
+def _lane_ids(found: list[Any], reader: elements.Reader) -> tuple[int, ...]:
+    return tuple(i for e in found if (i := reader.integer(e, "id")) is not None)
 
 
 def _read_junction(element: Any, name: str, reader: elements.Reader) -> records.Junction:
@@ -341,14 +334,8 @@ def xml_elements(
     if `data` are no XML, have another root, or a document type: entities and external references
     are refused.
     """
-    parser = etree.XMLParser(
-        remove_comments=True,
-        remove_pis=True,
-        resolve_entities=False,
-        load_dtd=False,
-        no_network=True,
-        huge_tree=False,
-    )
+    safe = {"resolve_entities": False, "load_dtd": False, "no_network": True, "huge_tree": False}
+    parser = etree.XMLParser(remove_comments=True, remove_pis=True, **safe)
     try:
         found = etree.fromstring(data, parser)
     except etree.XMLSyntaxError as error:

@@ -42,7 +42,7 @@ class Shapes:
 
     def __init__(self, od: OpenDrive, graph: Graph) -> None:
         self._od = od
-        self._lines = {road.id: ReferenceLine(road.geometries) for road in od.roads.values()}
+        self.lines = {road.id: ReferenceLine(road.geometries) for road in od.roads.values()}
         self._stops: dict[tuple[str, int], set[float]] = defaultdict(set)
         self._sections: dict[tuple[str, int], tuple[FloatArray, SectionBorders]] = {}
         chains = [lane.segments for lane in graph.lanes]
@@ -50,15 +50,11 @@ class Shapes:
         for piece in chain(*chains, graph.dropped):
             self._stops[piece.key.road, piece.key.section].update((piece.begin, piece.end))
 
-    def line(self, road: str) -> ReferenceLine:
-        """Reference line of a road."""
-        return self._lines[road]
-
     def section(self, road: str, section: int) -> tuple[FloatArray, SectionBorders]:
         """Places along a section (K,), and there points (K, 2) of the borders of its lanes [m]."""
         key = road, section
         if key not in self._sections:
-            place = self._od.roads[road], section, self._lines[road]
+            place = self._od.roads[road], section, self.lines[road]
             self._sections[key] = _sample_section(*place, self._stops.get(key, set()))
         return self._sections[key]
 
@@ -85,7 +81,7 @@ class Shapes:
     def _middles(self, key: LaneKey, s: FloatArray) -> FloatArray:
         borders = section_borders(self._od.roads[key.road], key.section, s, repair=True, look_up=s)
         middle = 0.5 * (borders.inner[key.lane] + borders.outer[key.lane])
-        return self._lines[key.road].evaluate(s).offset(middle)
+        return self.lines[key.road].evaluate(s).offset(middle)
 
     def baseline(
         self,
@@ -173,10 +169,7 @@ def unfold(line: FloatArray) -> FloatArray:
 
 
 def corners(line: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Vertices of a line (K, 2) between its first and last, and by how much it turns there [rad].
-
-    Vertices that coincide with the one before are left out.
-    """
+    """Vertices within a line (K, 2) that are apart, and by how much it turns there [rad]."""
     steps = np.diff(line, axis=0)
     moving = np.flatnonzero(np.hypot(*steps.T) > 1e-6)
     headings = np.arctan2(steps[moving, 1], steps[moving, 0])
@@ -201,10 +194,7 @@ def divide(dense: FloatArray) -> FloatArray:
 
 
 def bend_ends(line: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
-    """A line (K, 2) whose ends leave and arrive in the directions of the lines before and after.
-
-    Only where they differ enough to be a kink; the line moves aside by some centimetres.
-    """
+    """A line (K, 2) that leaves and arrives in the directions of its neighbours, without kinks."""
     bent = _bend_start(line, before[-1] - before[-2])
     return _bend_start(bent[::-1], after[0] - after[1])[::-1]
 
@@ -296,13 +286,12 @@ def _sample_section(
         if len(middles) == 0:
             break
         exact = _evaluate_section(road, section, line, middles)
-        bad = np.diff(s) > 2 * _MIN_STEP
         error = np.zeros(len(middles))
         for number, outer in shape.outer.items():
             for points, truth in ((outer, exact.outer), (shape.inner[number], exact.inner)):
                 chord = 0.5 * (points[1:] + points[:-1]) - truth[number]
                 error = np.maximum(error, np.hypot(*chord.T))
-        bad &= error > _TARGET_ERROR
+        bad = (np.diff(s) > 2 * _MIN_STEP) & (error > _TARGET_ERROR)
         if not bad.any():
             break
         s = np.sort(np.concatenate([s, middles[bad]]))

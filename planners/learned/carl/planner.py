@@ -61,7 +61,7 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         self._roads = _roads_of(scene.map)
         self._on_route: BoolArray | None = None
         self._pictures = np.zeros((len(view.CHANNELS), view.SIZE, view.SIZE), np.uint8)
-        self._last_action = np.zeros(2, np.float32)
+        self.last_action = np.zeros(2, np.float32)
         self._lights = LightLookup(scene.map, state.LightStatus.ABSENT)
         self._route_flaw = self._blindness = self.degraded = ""
         self.route: list[int] = []
@@ -81,7 +81,7 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
         pictures.fill(0)
         self.found = draw(pictures, roads, ego, tracks, -1, on_route, status)
         self._blindness = self._why_blind(scene.map, status)
-        return CarlFeatures(pictures, measure(ego, self._last_action))
+        return CarlFeatures(pictures, measure(ego, self.last_action))
 
     def infer(self, scenes: Sequence[CarlFeatures]) -> list[Action]:
         """Actions (2,) in [-1, 1]: acceleration and steering."""
@@ -95,7 +95,7 @@ class Carl(LearnedPlanner[CarlFeatures, Action]):
 
     def decode(self, output: Action, observation: Observation) -> state.Command:
         """The command, for the motion model without a tracker."""
-        self._last_action = output
+        self.last_action = output
         self.degraded = self._route_flaw or self._blindness
         return command_of(output, observation.history.ego[-1])
 
@@ -140,7 +140,11 @@ def draw(
     frame = view.picture_frame(center)
     found: IntArray = view.find_areas(roads, frame)
     view.draw_roads(pictures, roads, frame, found, on_route, status)
-    view.draw_objects(pictures, frame, _boxes(tracks, row))
+    present = np.flatnonzero(tracks.valid[row])
+    columns = (tracks.poses, tracks.sizes, tracks.velocities)
+    poses, sizes, velocities = (column[row][present] for column in columns)
+    boxes = view.Boxes(poses, sizes, velocities, tracks.kinds[present])
+    view.draw_objects(pictures, frame, boxes)
     value = level(float(np.hypot(velocity[0], velocity[1])), MAX_SPEED)
     box = (*center.tolist(), state.PACIFICA.length, state.PACIFICA.width)
     view.draw_box(pictures[view.EGO], frame, *box, value)
@@ -163,11 +167,3 @@ def command_of(action: Action, ego: FloatArray) -> state.Command:
         # nuPlan rule 361: it comes to a stop, rather than that it drives backwards
         acceleration = -float(ego[state.VX]) - REVERSE_GAIN * float(ego[state.AX])
     return state.Command(min(max(acceleration, -MAX_BRAKING), MAX_ACCELERATION), steering_rate)
-
-
-def _boxes(tracks: state.Tracks, row: int) -> view.Boxes:
-    """The objects of one moment."""
-    present = np.flatnonzero(tracks.valid[row])
-    parts = (tracks.poses, tracks.sizes, tracks.velocities)
-    poses, sizes, velocities = (part[row][present] for part in parts)
-    return view.Boxes(poses, sizes, velocities, tracks.kinds[present])

@@ -94,15 +94,12 @@ def draw_roads(
     filled = np.zeros(len(roads.areas.bounds), np.bool_)
     drawn = np.zeros(len(roads.lines.ptr), np.bool_)
     for area in found:
-        for channel in (DRIVABLE, ROUTE):
-            shape = roads.drivable[area] if channel == DRIVABLE else area
-            if channel == ROUTE and (area >= roads.num_blocks or not on_route[area]):
-                continue
-            if channel == DRIVABLE and (shape == NONE or filled[shape]):
-                continue
-            if channel == DRIVABLE:
-                filled[shape] = True
-            _fill_shell(rasters[channel], roads.areas, shape, frame)
+        shape = roads.drivable[area]
+        if shape != NONE and not filled[shape]:
+            filled[shape] = True
+            _fill_shell(rasters[DRIVABLE], roads.areas, shape, frame)
+        if area < roads.num_blocks and on_route[area]:
+            _fill_shell(rasters[ROUTE], roads.areas, area, frame)
     for connectors in (False, True):  # lanes first
         for area in found:
             if area >= roads.num_blocks or (area >= roads.num_roadblocks) != connectors:

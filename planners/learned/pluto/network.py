@@ -76,7 +76,7 @@ def _head(hidden: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(OrderedDict(mlp=head(DIM, hidden, outputs)))
 
 
-def _motion(x: Tensor, heads: Sequence[nn.Module]) -> Tensor:
+def _motion(x: Tensor, heads: Iterable[nn.Module]) -> Tensor:
     """(..., steps, 2 H) from x (..., 128): each of H heads has two of the channels."""
     return torch.cat([part(x).unflatten(-1, (STEPS, 2)) for part in heads], dim=-1)
 
@@ -110,19 +110,6 @@ class StaticObjectsEncoder(nn.Module):
         """(B, S, 128) from sizes (B, S, 2); zero where not valid (B, S)."""
         tokens: Tensor = self.obj_encoder(shape) + self.type_emb(category)
         return tokens * valid[..., None]
-
-
-class AgentPredictor(nn.Module):
-    """Motion of the agents from their tokens."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        heads = (_head(2 * DIM, 2 * STEPS) for _ in range(3))
-        self.loc_predictor, self.yaw_predictor, self.vel_predictor = heads
-
-    def forward(self, tokens: Tensor) -> Tensor:
-        """(B, A, 128) to (B, A, 80, 6)."""
-        return _motion(tokens, (self.loc_predictor, self.yaw_predictor, self.vel_predictor))
 
 
 class DecoderBlock(nn.Module):
@@ -240,7 +227,8 @@ class PlutoNetwork(nn.Module):
         self.static_objects_encoder = StaticObjectsEncoder()
         self.encoder_blocks = nn.ModuleList(layers.EncoderBlock(HEADS) for _ in range(DEPTH))
         self.norm = nn.LayerNorm(DIM)
-        self.agent_predictor = AgentPredictor()
+        names = ("loc_predictor", "yaw_predictor", "vel_predictor")
+        self.agent_predictor = nn.ModuleDict({name: _head(2 * DIM, 2 * STEPS) for name in names})
         self.planning_decoder = PlanningDecoder()
         self.hidden_proj = layers.perceptron(DIM, DIM, DIM)  # of the contrastive loss only
         self.ref_free_decoder = _head(2 * DIM, 4 * STEPS)
@@ -252,8 +240,8 @@ class PlutoNetwork(nn.Module):
         sides = [left - middle, right - middle]
         points = torch.cat([*inputs.along_lines(middle), *sides], dim=-1)
         objects = inputs.object_shape, inputs.object_category, inputs.object_valid
-        agents, polygons = self.agent_encoder(inputs), self.map_encoder(points, inputs)
-        tokens = torch.cat([agents, polygons, self.static_objects_encoder(*objects)], dim=1)
+        encoded = [self.agent_encoder(inputs), self.map_encoder(points, inputs)]
+        tokens = torch.cat([*encoded, self.static_objects_encoder(*objects)], dim=1)
         poses = scenes.pack(torch.cat([inputs.poses, inputs.object_pose], dim=1))
         angle = (poses[:, 2:] + torch.pi) % (2.0 * torch.pi) - torch.pi
         x = scenes.pack(tokens) + self.pos_emb(torch.cat([poses[:, :2], angle], dim=-1))
@@ -261,7 +249,8 @@ class PlutoNetwork(nn.Module):
             x = block(x, scenes)
         x = self.norm(x)
         egos = scenes.firsts(x)
-        prediction = self.agent_predictor(scenes.unpack(x)[:, 1 : inputs.valid.shape[1]])
+        agents = scenes.unpack(x)[:, 1 : inputs.valid.shape[1]]
+        prediction = _motion(agents, self.agent_predictor.values())
         free = self.ref_free_decoder(egos).view(len(egos), STEPS, 4)
         trajectory, probability = self.planning_decoder(inputs, x, scenes, egos)
         return Outputs(trajectory, probability, prediction, free, egos)

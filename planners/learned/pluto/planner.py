@@ -160,10 +160,7 @@ class Pluto(LearnedPlanner[SceneInputs, Output]):
     def rate(
         self, observation: Observation, poses: FloatArray, learned: FloatArray, agents: world.Agents
     ) -> Choice:
-        """The choice among proposals (P, 81, 3) of the last step, which was of this observation.
-
-        `learned` (P,) are their scores by the network.
-        """
+        """The choice among proposals (P, 81, 3) of this step, with scores (P,) by the network."""
         scene, surroundings, route = self._scene, self.surroundings, self.route
         assert route is not None
         ego = observation.history.ego[-1].copy()

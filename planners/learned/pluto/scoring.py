@@ -29,13 +29,7 @@ from shiftsim.planners.proposals.places import (
 )
 from shiftsim.planners.proposals.tracker import DT, drive_proposals, fit_speed, reference_at
 from shiftsim.sim.dynamics.bicycle import step_bicycle
-from shiftsim.sim.dynamics.lqr import (
-    NUPLAN,
-    LqrParameters,
-    command,
-    fit_curvature,
-    is_stopping,
-)
+from shiftsim.sim.dynamics.lqr import NUPLAN, LqrParameters, command, fit_curvature, is_stopping
 from shiftsim.world.layers import Polygons, make_polylines, meets_convex, project_on_line
 from shiftsim.world.state import HEADING, NUM_STATE, STEERING_RATE, VX, VY, VehicleParameters, X, Y
 
@@ -203,10 +197,7 @@ def run_lights(corners: FloatArray, lanes: Polygons, lights: IntArray) -> FloatA
 
 @kernel
 def times_to_collision(places: ProposalStates, obstacles: Obstacles, near: IntArray) -> FloatArray:
-    """(P,) 0 or 1: whether the ego, moved ahead along its heading, stays clear.
-
-    Arguments as for `collisions`.
-    """
+    """(P,) 0 or 1: whether the ego, moved ahead along its heading, stays clear of `near` ones."""
     scores, box, last = np.ones(len(places.states)), np.empty((4, 2)), places.states.shape[1] - 1
     corners, centers = places.corners, obstacles.centers
     for proposal in range(len(scores)):

@@ -56,12 +56,9 @@ def compare(
     models: Mapping[str, Callable[[], Traffic]],
     seconds: float = SECONDS,
 ) -> list[dict[str, Any]]:
-    """A row for each model, and one for the recording, over scenarios that are long enough.
+    """A row for each model and the recording; a DataError if no scenario is long enough.
 
     All agents are driven from the first iteration on, beside the recorded ego, for `seconds`.
-
-    Raises:
-        DataError: No scenario is long enough.
     """
     found = {name: Realism() for name in ("recording", *models)}
     steps, longest = round(seconds * _PER_SECOND), 0

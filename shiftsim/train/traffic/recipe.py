@@ -5,7 +5,7 @@ drives all agents beside the recorded ego, and where that leads is labelled with
 round trains on the states of all rounds so far, and the last network is measured in towns left out.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from shiftsim.data import open_store
-from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.files import atomic_write
 from shiftsim.runs.scenarios import find_split
 from shiftsim.sim.traffic import Traffic, make_traffic
@@ -35,11 +34,8 @@ ASIDE = 0.3  # m beside the point steered to that weigh as much as 1 m/s^2
 def train_traffic(settings: TrafficSettings, on_message: OnMessage) -> Path:
     """Train, write weights, losses and the table of realism, and return the file of the weights.
 
-    The same settings on the same machine give the same weights.
-
-    Raises:
-        ConfigError: The folder is not empty.
-        DataError: The store is not there, or has too few scenarios.
+    The same settings on the same machine give the same weights. It is a ConfigError if the folder
+    is not empty, a DataError if the store is not there, or has too few scenarios.
     """
     out, seed = settings.out, settings.seed
     store = open_store(settings.store)
@@ -53,8 +49,11 @@ def train_traffic(settings: TrafficSettings, on_message: OnMessage) -> Path:
     file = out / WEIGHTS
     for number in range(settings.rounds):
         write_weights(file, weights_of(network))
+        traffic = LearnedTraffic(file)  # which drives from the second round on
         chosen = np.random.default_rng([seed, 3, number]).permutation(trained)
-        parts.append(_collected(store, chosen[: settings.scenarios].tolist(), file, seed, number))
+        for place, token in enumerate(chosen[: settings.scenarios].tolist()):
+            random = np.random.default_rng([seed, number, place])
+            parts.append(states_of(store.read(token), traffic, random, drives=number > 0))
         found = learn(network, join(parts), settings.epochs, seed + number)
         losses += [
             {"round": number + 1, "epoch": epoch + 1, "loss": loss}
@@ -72,17 +71,6 @@ def train_traffic(settings: TrafficSettings, on_message: OnMessage) -> Path:
     rows = compare((store.read(token) for token in order), models)
     write_table(out / TABLE, rows)
     return file
-
-
-def _collected(
-    store: ScenarioStore, tokens: Iterable[str], file: Path, seed: int, number: int
-) -> States:
-    """States of a round; from the second one on the network drives."""
-    traffic, found = LearnedTraffic(file), list[States]()
-    for place, token in enumerate(tokens):
-        random = np.random.default_rng([seed, number, place])
-        found.append(states_of(store.read(token), traffic, random, drives=number > 0))
-    return join(found)
 
 
 def write_weights(path: Path, weights: Weights) -> None:

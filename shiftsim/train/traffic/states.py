@@ -42,8 +42,8 @@ def states_of(
     scenario: Scenario, traffic: LearnedTraffic, random: np.random.Generator, *, drives: bool
 ) -> States:
     """States of one scenario: recorded and pushed aside, or, if it `drives`, of the network."""
-    found = list((_driven if drives else _recorded)(scenario, traffic, random))
-    return join(found)
+    collector = _Collector(scenario, traffic, random)
+    return join(list(collector.driven() if drives else collector.pushed()))
 
 
 def join(parts: list[States]) -> States:
@@ -53,35 +53,51 @@ def join(parts: list[States]) -> States:
     return States(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
-def _recorded(
-    scenario: Scenario, traffic: LearnedTraffic, random: np.random.Generator
-) -> Iterator[States]:
-    rows, start = rollout_rows(scenario)
-    recorded = scenario.tracks.rows(rows)
-    for iteration in range(int(random.integers(EVERY)), scenario.num_iterations - 1, EVERY):
-        tracks, row = recorded.copy(), start + iteration
-        if random.random() < 0.5:
-            _push(tracks, row, random)
-        traffic.start(scenario, tracks, start)
-        yield _labelled(scenario, traffic, recorded, tracks, iteration, row, random)
+class _Collector:
+    def __init__(
+        self, scenario: Scenario, traffic: LearnedTraffic, random: np.random.Generator
+    ) -> None:
+        self.scenario, self.traffic, self.random = scenario, traffic, random
+        rows, self.start = rollout_rows(scenario)
+        self.recorded, self.ego = scenario.tracks.rows(rows), scenario.ego[scenario.iteration_rows]
+        self.last = scenario.num_iterations - 1
 
+    def pushed(self) -> Iterator[States]:
+        """As recorded, half of them pushed aside."""
+        for iteration in range(int(self.random.integers(EVERY)), self.last, EVERY):
+            tracks = self.recorded.copy()
+            if self.random.random() < 0.5:
+                _push(tracks, self.start + iteration, self.random)
+            self.traffic.start(self.scenario, tracks, self.start)
+            yield self._labelled(tracks, iteration)
 
-def _driven(
-    scenario: Scenario, traffic: LearnedTraffic, random: np.random.Generator
-) -> Iterator[States]:
-    rows, start = rollout_rows(scenario)
-    recorded = scenario.tracks.rows(rows)
-    begin = int(random.integers(max(scenario.num_iterations - SEGMENT - 1, 1)))
-    ego = scenario.ego[scenario.iteration_rows]
-    while begin < scenario.num_iterations - 1:
-        tracks = recorded.copy()
-        traffic.start(scenario, tracks, start)
-        for iteration in range(begin, min(begin + SEGMENT, scenario.num_iterations - 1)):
-            row = start + iteration
-            if (iteration - begin) % EVERY == EVERY - 1:
-                yield _labelled(scenario, traffic, recorded, tracks, iteration, row, random)
-            traffic.step(iteration, ego[iteration], tracks, row + 1)
-        begin += SEGMENT
+    def driven(self) -> Iterator[States]:
+        """Where the network brings the agents."""
+        first = int(self.random.integers(max(self.last - SEGMENT, 1)))
+        for begin in range(first, self.last, SEGMENT):
+            tracks = self.recorded.copy()
+            self.traffic.start(self.scenario, tracks, self.start)
+            for iteration in range(begin, min(begin + SEGMENT, self.last)):
+                if (iteration - begin) % EVERY == EVERY - 1:
+                    yield self._labelled(tracks, iteration)
+                row = self.start + iteration + 1
+                self.traffic.step(iteration, self.ego[iteration], tracks, row)
+
+    def _labelled(self, tracks: Tracks, iteration: int) -> States:
+        """The agents of one iteration with their labels."""
+        row = self.start + iteration
+        features = self.traffic.observe(iteration, self.ego[iteration], tracks, row)
+        own = self.traffic.own
+        speeds = features[:, 0] * 10.0
+        gap = (1.0 - features[:, _LEADER + 1]) * REACH
+        leads = features[:, _LEADER] > 0.0
+        shrinking = np.where(leads, features[:, _LEADER + 2] * 5.0, 0.0)
+        closing = np.column_stack([np.where(leads, gap, np.inf), shrinking])
+        poses = tracks.poses[row, own]
+        labels = compute_labels(self.recorded.select(own), row, poses, speeds, closing)
+        rests = (np.abs(speeds) < 0.2) & (np.abs(labels[:, 0]) < 0.1)
+        chosen = ~np.isnan(labels[:, 0]) & (~rests | (self.random.random(len(own)) < STANDING))
+        return States(features[chosen].astype(np.float32), labels[chosen].astype(np.float32))
 
 
 def _push(tracks: Tracks, row: int, random: np.random.Generator) -> None:
@@ -100,45 +116,14 @@ def _push(tracks: Tracks, row: int, random: np.random.Generator) -> None:
         tracks.velocities[at, :, 1] += faster * np.sin(heading)
 
 
-def _labelled(
-    scenario: Scenario,
-    traffic: LearnedTraffic,
-    recorded: Tracks,
-    tracks: Tracks,
-    iteration: int,
-    row: int,
-    random: np.random.Generator,
-) -> States:
-    """The agents of one row with their labels."""
-    ego = scenario.ego[scenario.iteration_rows[iteration]]
-    features, own = traffic.observe(iteration, ego, tracks, row), traffic.own
-    speeds = features[:, 0] * 10.0
-    gap = (1.0 - features[:, _LEADER + 1]) * REACH
-    closing = np.stack(
-        [np.where(features[:, _LEADER] > 0.0, gap, np.inf), features[:, _LEADER + 2] * 5.0], axis=1
-    )
-    closing[features[:, _LEADER] == 0.0, 1] = 0.0
-    poses = tracks.poses[row, own]
-    labels = compute_labels(recorded.select(own), row, poses, speeds, closing)
-    rests = (np.abs(speeds) < 0.2) & (np.abs(labels[:, 0]) < 0.1)
-    chosen = ~np.isnan(labels[:, 0]) & (~rests | (random.random(len(own)) < STANDING))
-    return States(features[chosen].astype(np.float32), labels[chosen].astype(np.float32))
-
-
 def compute_labels(
     recorded: Tracks, row: int, poses: FloatArray, speeds: FloatArray, closing: FloatArray
 ) -> FloatArray:
-    """(A, 3) labels at a row of the tracks as recorded, of agents that are elsewhere by now.
+    """(A, 3) labels at a row of agents as recorded, which are at `poses` (A, 3) by now.
 
     They are an acceleration [m/s^2], a curvature [rad/m] and the distance to the point that is
-    steered to [m], 0 where the agent stays; NaN where there is none.
-
-    Args:
-        recorded: (B, A, …) the agents as recorded.
-        row: The row that is now.
-        poses: (A, 3) where they are [m], [rad]; NaN where absent.
-        speeds: (A,) [m/s].
-        closing: (A, 2) gap to who leads [m] and speed at which it shrinks [m/s]; inf and 0.
+    steered to [m], 0 where the agent stays; NaN where there is none. `closing` (A, 2) is the gap to
+    who leads [m] and the speed at which it shrinks [m/s]; inf and 0.
     """
     out = np.full((len(poses), 3), np.nan)
     for agent in np.flatnonzero(recorded.valid[row] & ~np.isnan(poses[:, 0])).tolist():
@@ -164,10 +149,7 @@ def _last_in_a_row(valid: BoolArray) -> int:
 def _label(
     line: FloatArray, row: int, pose: FloatArray, speed: float
 ) -> tuple[float, float, float]:
-    """Acceleration, curvature and distance steered to that lead back to a recorded drive.
-
-    It has the positions `line` (V, 2), at `row` of which the agent should be; it is at `pose`.
-    """
+    """A label of an agent at a pose that should be at a row of the positions `line` (V, 2)."""
     x, y, heading = pose.tolist()
     arc = arc_lengths(line, np.array([0, len(line)]))
     here = project_on_polyline(line, arc, 0, len(line), x, y)
