@@ -64,11 +64,7 @@ class Options:
 def make_tables(
     groups: Sequence[Group], published: Published | None = None, options: Options | None = None
 ) -> list[Table]:
-    """The tables of a report, in the order of `TABLES`; without `options` everything is shown.
-
-    Beside published figures stands no planner with weights of our own that nobody asked for; it is
-    a ConfigError if nothing is left beside them.
-    """
+    """The tables of a report; beside published figures no weights that nobody asked for."""
     chosen = options or Options()
     left_out = [group for group in groups if chosen.with_published and _has_default_weights(group)]
     weights = {f"{group.name}, {group.weights}" for group in left_out}
@@ -134,11 +130,7 @@ def _makers(
 
 
 class Comparison:
-    """Planners compared scenario by scenario, in pairs; printed as text.
-
-    Attributes:
-        tables: The tables, of clean rollouts and of those under noise.
-    """
+    """Tables of planners compared scenario by scenario, in pairs; printed as text."""
 
     def __init__(self, tables: Sequence[Table]) -> None:
         self.tables = tuple(tables)
@@ -236,11 +228,7 @@ def write_report(
 def report_html(
     runs: Sequence[Run], tables: Sequence[Table], images: Mapping[str, str], *more: str
 ) -> str:
-    """Tables, pictures (titles by address) and citation as sections that any page can hold.
-
-    The ranking and the first picture stand above the contents, which also link `more` ids of the
-    page. The first picture is that of robustness where there is noise.
-    """
+    """Sections for any page: ranking and first picture, contents (with `more` ids), the others."""
     sections = {table.name: (table.title, render(table, "html")) for table in tables}
     for number, (address, title) in enumerate(images.items()):
         words, name = html.escape(title), f"figure-{number + 1}"

@@ -21,11 +21,7 @@ _SIGNIFICANT = 0.05  # p-value below which a difference is called so
 
 
 def ranking(groups: Sequence[Group]) -> Table | None:
-    """Planners by their score without noise, beside that under the noise of the lowest mean.
-
-    The first noise takes the place of none where that was not run. Only complete groups are ranked;
-    None where there are none. The findings are those of the largest set of scenarios.
-    """
+    """Complete groups by score without noise, beside that under the hardest; None without any."""
     places = list(dict.fromkeys(map(_place, groups)))
     known = [group for group in groups if group.is_complete]
     known.sort(key=lambda group: (places.index(_place(group)), -_score(group)))
@@ -192,11 +188,7 @@ def scenario_types(groups: Sequence[Group]) -> list[Table]:
 
 
 def edited_scores(groups: Sequence[Group]) -> list[Table]:
-    """Scores of edited scenarios by kind and difficulty; one table per set that was edited.
-
-    Beside them stand those of the same recorded scenarios without the edit, each as often as it was
-    edited. Scenarios of interPlan's codes have interPlan's score, and no such column.
-    """
+    """Scores of edited scenarios by kind and difficulty, beside the recorded; a table per set."""
     out = []
     for data, mine in by_set(group for group in groups if group.data.edits):
         kinds, difficulties = np.array([graded(name) for name in data.types], str).T
@@ -255,10 +247,7 @@ def _driven_as(group: Group) -> tuple[object, ...]:
 
 
 def drift_matrix(groups: Sequence[Group]) -> Table | None:
-    """Planners by traffic under what they see and when their plans arrive; None without such runs.
-
-    Beside each score stands its change from that of the same planner without any drift.
-    """
+    """Scores by planner, traffic and what drifts, and their changes; None without such runs."""
     drifts = [group for group in groups if _senses(group)]
     modes = list(dict.fromkeys(group.traffic for group in drifts))
     records, findings = list[Record](), list[str]()

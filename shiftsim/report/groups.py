@@ -361,11 +361,7 @@ def _matching(table: pa.Table, planner: str, noise: str) -> BoolArray:
 
 
 def _by_duration(data: DataSet) -> list[tuple[DataSet, BoolArray]]:
-    """The scenarios of each class of duration, as a set of its own, and (N,) which they are.
-
-    Scores of short scenarios are others (`docs/open_data.md`). One of unknown duration belongs
-    to each part, so that no part of an incomplete set looks complete.
-    """
+    """A set per class of duration, and (N,) its scenarios; each has those of unknown duration."""
     if not set(data.classes) - {FULL_DURATION}:
         return [(data, np.ones(len(data.tokens), np.bool_))]
     masks = {name: np.isin(data.durations, (name, "")) for name in data.classes}

@@ -72,10 +72,7 @@ def in_format(draw: Callable[_Call, _Made]) -> Callable[_Call, _Made]:
 def new_figure(
     layout: Literal["constrained", "compressed"] | None = "constrained", **settings: Any
 ) -> Any:
-    """An empty figure of matplotlib that can be measured; a MissingExtraError without matplotlib.
-
-    Ids in SVG files are always the same; PDF files hold their fonts as TrueType, as papers ask for.
-    """
+    """An empty figure that can be measured; a MissingExtraError without matplotlib."""
     _matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -164,10 +161,7 @@ def dashes(noise: str) -> Literal["-", "--"]:
 
 
 def planner_styles(planners: Iterable[str]) -> dict[str, Style]:
-    """A style per planner; those without one of their own get one by their order.
-
-    A name may end in a remark, as in `idm (reactive)`; the first of these has the planner's style.
-    """
+    """A style per planner, its own (also with a remark, as in `idm (reactive)`) or the next one."""
     out: dict[str, Style] = {}
     others = cycle(_OTHERS)
     for name in dict.fromkeys(planners):

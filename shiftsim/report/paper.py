@@ -70,11 +70,7 @@ class _Column(NamedTuple):
 def semantic_shift(
     groups: Sequence[Group], published: Published | None = None, *, with_published: bool = False
 ) -> list[Table]:
-    """Clean scores of all scenarios, per city and per metric: one table per set of scenarios.
-
-    The paper's sites give cities their short names and order. `with_published` shows its scores as
-    well, in the same table where the cities are the same.
-    """
+    """Clean scores of all scenarios, per city and per metric; a table per set of scenarios."""
     sets = by_set(group for group in groups if group.noise == "none")
     others = [one for one in sets if one[0].known != VAL14]
     val14 = [one for one in sets if one[0].known == VAL14]

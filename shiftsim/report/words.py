@@ -142,11 +142,7 @@ def worst_moment(found: Iterable[Violation]) -> Violation | None:
 
 
 def worst_of(rows: Iterable[Mapping[str, Any]], count: int) -> list[tuple[Mapping[str, Any], int]]:
-    """The worst scenarios, each by its worst rollout, by score and by the severity of its cause.
-
-    At most one per recording and cause; with each, how many other scenarios are like it. Rows hold
-    a task, `cls`, `cause`, its `severity`, and `log`, the recording.
-    """
+    """The worst scenarios, one per recording and cause, and how many others are like each."""
     by_token: dict[str, Mapping[str, Any]] = {}
     for row in sorted(
         rows, key=lambda r: (r["cls"], r["severity"], r["noise"] != "none", task_of(r))

@@ -213,11 +213,7 @@ def make_config(values: Mapping[str, Any], *, where: str = "run") -> RunConfig:
 
 
 def split_label(planner: str) -> tuple[str, str]:
-    """Label and source of a planner in settings: `LABEL=SOURCE`, or a source, its own label.
-
-    The label is what tasks, tables and pictures call the planner. It holds neither `:` nor a slash.
-    It is a ConfigError if label or source is empty.
-    """
+    """Label (without `:` and slashes) and source of `LABEL=SOURCE`, or a source, its own label."""
     label, equals, source = planner.partition("=")
     if not equals or any(c in label for c in ":/\\"):
         return planner, planner
@@ -227,11 +223,7 @@ def split_label(planner: str) -> tuple[str, str]:
 
 
 def parse_argument(text: str, planners: tuple[str, ...]) -> tuple[str, str, Value]:
-    """Label, name and value of one `key=value`, or `label.key=value` with several planners.
-
-    The value is read as a TOML value; anything that is none is taken as a string. It is a
-    ConfigError if it has another form, or does not say which planner is meant.
-    """
+    """Label, name and value, of TOML or text, of `key=value`, or `label.key=value` of several."""
     planners = tuple(split_label(planner)[0] for planner in planners)
     key, equals, raw = text.partition("=")
     if not equals or not key:

@@ -97,12 +97,7 @@ class Difference:
 def diff_runs(
     first: Run, second: Run, *, limit: int = 10, tolerance: float = TOLERANCE
 ) -> Difference:
-    """Compare two runs, and look into a number of changes, the largest of the score first.
-
-    Rollouts part where a quantity differs by more than the tolerance [m, rad, …]. Planners are
-    paired by name; two runs of one planner each are compared whatever their names. It is a
-    ConfigError if they have no rollout in common.
-    """
+    """Compare two runs by planner, or two of one each; look into the `limit` largest changes."""
     planners = [run.manifest["config"]["planners"] for run in (first, second)]
     single = len(planners[0]) == len(planners[1]) == 1
     names = dict(zip(*planners, strict=True)) if single else {n: n for n in planners[0]}

@@ -50,11 +50,7 @@ class EditSet:
         return digest_of([self.profile, sorted(edit.digest for edit in self.edits)])
 
     def expand(self, store: ScenarioStore, tokens: Iterable[str]) -> "dict[str, Edited]":
-        """The edited scenarios, by id, of those of a store that are given.
-
-        Raises ConfigError: an edit names a scenario that the store does not have, one id occurs
-        twice, or nothing is edited.
-        """
+        """The edited scenarios, by id, of those of a store that are given; one at least."""
         chosen, out = set(tokens), dict[str, Edited]()
         columns = (store.summary()[name].to_pylist() for name in ("token", "type"))
         types = dict(zip(*columns, strict=True))
@@ -91,11 +87,7 @@ class EditSet:
         }
 
     def require_traffic(self, traffic: str) -> None:
-        """Refuse traffic that cannot drive what an edit asks for, with a ConfigError.
-
-        Replayed traffic has nothing that a spawned vehicle could do, reactive traffic replays no
-        vehicle, and interPlan's scenarios are for reactive traffic only.
-        """
+        """Refuse traffic that cannot drive what an edit asks for, with a ConfigError."""
         for edit in self.edits:
             where = f"edits {self.name!r}, edit {edit.name!r}"
             if edit.start is not None and edit.start.traffic not in (NONREACTIVE, traffic):
@@ -205,10 +197,7 @@ def edit_words(manifest: Mapping[str, Any], token: str) -> list[str]:
 
 
 def make_edits(table: Mapping[str, Any], name: str) -> EditSet:
-    """Edits from the table of a file; `name` is for messages, and theirs where they have none.
-
-    Raises ConfigError: something in it is unknown, missing or contradictory.
-    """
+    """Edits from the table of a file, or a ConfigError; `name` is theirs where they have none."""
     where = f"edits {name!r}"
     for key in table:
         if key not in _STORED:

@@ -130,11 +130,7 @@ def _do_tasks(plan: RunPlan, writer: RunWriter, on_progress: OnProgress) -> None
 
 
 def remaining(batches: Iterable[Batch], ended: Mapping[Task, str], *, retry: bool) -> list[Batch]:
-    """What is left to do of a run, by the status of the tasks that have ended.
-
-    A batch that is not finished is done as a whole again: its results may depend on one another in
-    the last digits. `retry` does those that failed again, too.
-    """
+    """Batches that are left, each as a whole: its results may depend on one another."""
     out: list[Batch] = []
     for batch in batches:
         failed = tuple(task for task in batch if ended.get(task) in (FAILED, TIMEOUT))

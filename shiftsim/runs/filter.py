@@ -125,10 +125,7 @@ def _read(store: Path) -> FilterResults:
 
 
 def read_filter_results(store: str | Path, store_hash: str) -> FilterResults | None:
-    """The results for a store, whose content has a hash; None where it was not filtered.
-
-    Raises DataError: the file is damaged, or of another content of the store.
-    """
+    """The results for a store of a hash, or a DataError; None where it was not filtered."""
     path = Path(store)
     if not (path / RESULTS).is_file():
         return None
@@ -202,13 +199,7 @@ def filter_store(
     workers: int = 0,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> FilterResults:
-    """Find the verdict on every scenario of a store, and write them into it.
-
-    A filter that was interrupted goes on where it stopped. Verdicts that were found with the same
-    settings on the same scenarios are kept. The file has the same bytes for any number of workers,
-    of which 0 chooses from the cores. `on_progress` is told scenarios done and in all. It is a
-    DataError if the store is missing or damaged.
-    """
+    """Find the verdicts on all scenarios, but those found before, and write them into the store."""
     path, config = Path(store), config or FilterConfig()
     opened = open_store(path)
     conditions = _conditions(config, opened.hash, opened.reviews.route_hash)

@@ -51,12 +51,7 @@ class RunWriter:
     """The folder of a run under way; what has `ended` so far includes an earlier attempt."""
 
     def __init__(self, path: Path, manifest: dict[str, Any], *, resume: bool = False) -> None:
-        """Begin a run, or `resume` one: keep what is finished.
-
-        The manifest is written as `running`, unless a complete run is there, which stays as it is
-        until this one has finished as well. It is a ConfigError if another process works on the
-        folder.
-        """
+        """Begin a run, or `resume` one; a complete one stays until this one has finished."""
         self.path = path
         path.mkdir(parents=True, exist_ok=True)
         self.rollouts = safe_join(path, files.FOLDER)
@@ -121,11 +116,7 @@ class RunWriter:
         reasons: Mapping[Task, str] = MappingProxyType({}),
         default: str = "the run was interrupted",
     ) -> Run:
-        """Write tables and manifest, whose `counts` are filled in.
-
-        `expected` are all tasks of a complete run; `reasons`, or the `default`, say why one has no
-        result.
-        """
+        """Write tables and manifest; `reasons`, or the `default`, say why a task has no result."""
         counts = {"expected": 0, **dict.fromkeys(STATUSES, 0)}
         locations = self._write_rollouts()
         tasks = iter(sorted(expected))
@@ -165,11 +156,7 @@ class RunWriter:
         self._journal.close()
 
     def _write_rollouts(self) -> dict[Task, RolloutLocation]:
-        """Put the rollouts of a run that ends into files, those of a scenario together.
-
-        A file from an earlier attempt stays as it is, unless some of its rollouts have been made
-        again: then the others move. Returns where they are.
-        """
+        """Put rollouts into files by scenario; one that others have left is written anew."""
         order = sorted(self.ended, key=lambda task: (task.token, task))
         records = [(task, self.ended[task]) for task in order]
         locations = {

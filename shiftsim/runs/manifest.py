@@ -44,10 +44,7 @@ def make_manifest(
     fingerprint: dict[str, Any],
     argv: Sequence[str],
 ) -> dict[str, Any]:
-    """What a run folder says about how its results were made; state and counts come later.
-
-    The run fingerprint, `determining` in the file, is everything that scores depend on.
-    """
+    """What a run folder says of how it was made; state and counts come later."""
     return {
         "format": FORMAT_VERSION,
         "run": folder.name,
@@ -107,11 +104,7 @@ def _git_state() -> str:
 
 
 def state_of(folder: Path) -> State:
-    """How far the run in a folder is, or a DataError if the folder holds something else.
-
-    That is `new` when there is nothing to lose, `unfinished` when it was interrupted or killed,
-    `failed` when it ended with failed or missing tasks, else `complete`.
-    """
+    """How far the run in a folder is; `failed` has ended with failed tasks, `new` loses nothing."""
     if not folder.exists() or (folder.is_dir() and not _has_content(folder)):
         return "new"
     manifest = read_manifest(folder)
@@ -125,19 +118,13 @@ def state_of(folder: Path) -> State:
 
 
 def _has_content(folder: Path) -> bool:
-    """Whether there is more than what a process leaves that was killed before it had begun.
-
-    These are halves of files, whose names begin with a dot, and a journal without entries.
-    """
+    """Whether there is more than what a process leaves that was killed before it had begun."""
     names = {path.name for path in folder.iterdir() if not path.name.startswith(".")}
     return names != {JOURNAL} or has_entries(folder / JOURNAL) if names else False
 
 
 def check_target(folder: Path, fingerprint: dict[str, Any], *, shard: str = "") -> State:
-    """How far the run in a folder is, to which another one is to be written: the same, or none yet.
-
-    Raises ConfigError: the folder holds something else; the message says what differs.
-    """
+    """How far the run in a folder is; a ConfigError where that is another one or something else."""
     try:
         state = state_of(folder)
     except (DataError, KeyError) as error:

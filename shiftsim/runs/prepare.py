@@ -78,11 +78,7 @@ def prepare(
     noises: Sequence[Drift] = (),
     edits: "EditSet | None" = None,
 ) -> RunPlan:
-    """Resolve every name and check everything that a run needs.
-
-    Classes or instances of planners, drifts, and edits take the place of the names in the settings.
-    It is a ShiftsimError if something is unknown, missing or contradictory.
-    """
+    """Resolve every name, but those of objects that are given, and check what a run needs."""
     models = list(noises) or make_drifts(*(getattr(config, name) for name in DRIFT))
     values: dict[str, Any] = {one.name: one.default for one in fields(config) if one.name in DRIFT}
     values["noise"] = tuple(model.name for model in models)  # of all that drifts
@@ -300,11 +296,7 @@ def _workers(
 
 
 def _batches(grouped: Mapping[str, int], tasks: list[Task]) -> list[Batch]:
-    """The tasks, those of planners whose scenarios are driven in lock step by their batch size.
-
-    The groups depend on the whole run only, not on workers, shards or what is finished already. The
-    first is a single task: other workers wait until it has compiled the planner's kernels.
-    """
+    """The tasks in batches, which depend on the whole run only; a planner's first is one task."""
     batches: list[Batch] = [(task,) for task in tasks if task.planner not in grouped]
     for name, size in sorted(grouped.items()):
         of_planner = tuple(task for task in tasks if task.planner == name)

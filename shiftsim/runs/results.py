@@ -40,10 +40,7 @@ class Run:
     labels: Mapping[str, str] = field(default_factory=dict, repr=False)
 
     def labelled(self, labels: Mapping[str, str]) -> Self:
-        """The same run with planners called otherwise, new names by own ones; the disk stays.
-
-        Raises ConfigError: the run has no such planner, or two would have one name.
-        """
+        """The same run with planners called otherwise, new names by own ones; or a ConfigError."""
         config, determining = self.manifest["config"], self.manifest["determining"]
         for name in labels:
             one_of(f"run {self.path.name!r}: planner", name, config["planners"])
@@ -105,10 +102,7 @@ class Run:
         }
 
     def rollout(self, task: Task, scenario: Scenario) -> SimulationLog:
-        """One stored rollout; its scenario is that of the store the run was made with.
-
-        Raises DataError: it was not stored, cannot be read, or the scenario is another one.
-        """
+        """One stored rollout; the scenario is that of the run's store, else it is a DataError."""
         rows, is_partial = self.rollout_rows(task), "elsewhere" in self.manifest
         return complete_rollout(rows, scenario, task, is_partial=is_partial)
 
@@ -154,10 +148,7 @@ def open_run(path: str | Path) -> Run:
 
 
 def label_runs(runs: Sequence[Run], labels: Iterable[str]) -> list[Run]:
-    """Runs with planners called otherwise: `NAME=LABEL`, or `RUN/NAME=LABEL` in one of them.
-
-    Raises ConfigError: no run has such a planner, or two of one would have one name.
-    """
+    """Runs with planners called otherwise: `NAME=LABEL`, or `RUN/NAME=LABEL` in one of them."""
     wanted: list[dict[str, str]] = [{} for _ in runs]
     named = [
         (run.path.name, name, new)

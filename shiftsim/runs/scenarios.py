@@ -30,11 +30,7 @@ _DEMO_SPLIT = "demo-mini"  # of the generated store, where no split is named
 
 
 def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
-    """The store that a run was made with, or its bundle, which then has the hash of that store.
-
-    `store` says where the store has moved. Edits of the run are in its manifest. It is a DataError
-    if the store is not there, or another one.
-    """
+    """The store of a run, or its bundle with that store's hash; `store` is where it has moved."""
     found = _recorded(run, store)
     if edits := run.manifest.get("edits"):
         from shiftsim.runs.edited import EditedStore, make_edits
@@ -78,11 +74,7 @@ def is_bundled(run: Run) -> bool:
 
 
 def bundle_run(run: Run, store: str | None = None) -> ScenarioStore:
-    """Copy the scenarios of a run, with recordings and maps, into its folder; the copy's store.
-
-    `store` says where the store has moved; it is a DataError if it is not there, or another one. Of
-    a run that holds them already they are checked.
-    """
+    """Copy the scenarios of a run into its folder, unless they are there; the copy's store."""
     from shiftsim.data.store.writing import StoreWriter, window_row
 
     target, partial = (safe_join(run.path, name) for name in (BUNDLE, f".{BUNDLE}.tmp"))
@@ -154,10 +146,7 @@ class Selection(NamedTuple):
 def select_scenarios(
     config: RunConfig, store: ScenarioStore, given: "EditSet | None" = None
 ) -> Selection:
-    """The scenarios of a run; edits that are `given` take the place of those in the settings.
-
-    Raises ShiftsimError: a split or edits are unknown or wrong, or scenarios are missing.
-    """
+    """The scenarios of a run; edits that are `given` take the place of those in the settings."""
     edits = given or (open_edits(config.edits, store) if config.edits else None)
     whole, fingerprint = len(store.tokens), {"store": store.hash}
     default = "" if config.split or config.all_scenarios else default_split(store, edits)
@@ -197,10 +186,7 @@ def select_scenarios(
 
 
 def default_split(store: ScenarioStore, edits: "EditSet | None" = None) -> str:
-    """The split that is meant where none is named; empty for the whole store.
-
-    Of the generated demo it is the one that every page shows, unless edits name other scenarios.
-    """
+    """The split where none is named: of the demo that of every page; empty for the whole store."""
     path = Path(store.path) / "splits" / f"{_DEMO_SPLIT}.toml"
     if store.generator.get("name") != DEFAULT_STORE or not path.is_file():
         return ""
@@ -211,11 +197,7 @@ def default_split(store: ScenarioStore, edits: "EditSet | None" = None) -> str:
 
 
 def open_split(store: ScenarioStore, name: str, *, whole: bool = False) -> "tuple[Split, str]":
-    """The split of a name, and the hash of the filter's results, empty where they did not choose.
-
-    Of a store without a name of a split it is what filter and review accept, or the `whole` store.
-    It is a ShiftsimError if there is no such split, or the filter accepts nothing.
-    """
+    """The split of a name, or all that filter and review accept; the filter's hash if it chose."""
     from shiftsim.runs.filter import read_filter_results
 
     usable, digest = tuple(store.tokens), ""
@@ -263,12 +245,7 @@ def token_hash(tokens: Iterable[str]) -> str:
 
 
 def find_split(name: str, store: Path, tokens: tuple[str, ...]) -> Split:
-    """The split of a name; `tokens` are all scenarios of the store in a folder.
-
-    The name is that of a file (`.toml`, or `.txt` with one token per line), one below `splits/` of
-    the store, or the store's own (or nothing) for all its scenarios; anything else is a
-    ConfigError.
-    """
+    """The split in a file, below `splits/` of the store, or of its own name: all its `tokens`."""
     if name in ("", store.name):
         return Split(store.name, tokens)
     path = Path(name)
@@ -287,11 +264,7 @@ def find_split(name: str, store: Path, tokens: tuple[str, ...]) -> Split:
 
 
 def read_split(path: Path) -> Split:
-    """A split from a file: TOML with `tokens`, or text with one token per line.
-
-    Raises ConfigError: the file cannot be read, names no tokens or a token twice, or its `count` or
-    `hash` says otherwise.
-    """
+    """A split from TOML with `tokens`, or text with one token per line; or a ConfigError."""
     table: dict[str, object] = {}
     if path.suffix == ".toml":
         table = read_toml(path)
@@ -336,11 +309,7 @@ def choose_scenarios(
     per_type: int | None = None,
     limit: int | None = None,
 ) -> tuple[str, ...]:
-    """Tokens of some scenarios of a store, sorted: the first ones up to the limits.
-
-    The rows hold `token`, `type` and `city` of every scenario, `usable` the tokens to choose from,
-    and `wanted` values by column, none for any; one that no scenario has is a ConfigError.
-    """
+    """Tokens of usable scenarios with the `wanted` values by column, sorted, up to the limits."""
     table = sorted(rows, key=itemgetter("token"))
     for column, values in wanted.items():
         known = sorted({row[column] for row in table})
@@ -359,11 +328,7 @@ def choose_scenarios(
 
 
 def write_split(path: Path, tokens: tuple[str, ...]) -> Split:
-    """Write a split that `read_split` reads: TOML with count and hash, or text for `.txt`.
-
-    It is named after the file. Raises ConfigError: there are no tokens, the file ends otherwise, or
-    it cannot be written.
-    """
+    """Write a split that `read_split` reads: TOML with count and hash, or text for `.txt`."""
     split = Split(path.stem, tokens)
     if not tokens:
         raise ConfigError(f"split {split.name!r} would be empty", hint="ask for less")

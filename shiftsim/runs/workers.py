@@ -242,10 +242,7 @@ def map_on_cluster(
     limit: float = 0.0,
     in_batches: bool = False,
 ) -> Generator[Outcome[T, R], None, None]:
-    """As `map_unordered`, on the cluster whose scheduler is at an address.
-
-    Raises MissingExtraError: dask.distributed is not installed. ConfigError: no scheduler is there.
-    """
+    """As `map_unordered`, on the dask cluster of a scheduler; a ConfigError if none is there."""
     distributed: Any = import_extra("distributed", "cluster")
     try:
         client = distributed.Client(scheduler, timeout=_CONNECT, set_as_default=False)

@@ -48,11 +48,7 @@ def wrap(planner: Any, **arguments: Any) -> "NuplanPlanner":
 
 
 def from_spec(spec: str) -> Callable[..., "NuplanPlanner"]:
-    """What makes the planner `nuplan:package.module:Class`.
-
-    Raises ConfigError: there is no such class, or it is none of nuPlan planners. MissingExtraError:
-    it needs more of nuPlan's devkit than the shims have.
-    """
+    """What makes the planner `nuplan:package.module:Class`; a ShiftsimError if it is none."""
     if spec.count(":") != 2:
         raise ConfigError(
             f"planner {spec!r} is not of the form nuplan:package.module:Class",
@@ -67,10 +63,7 @@ def from_spec(spec: str) -> Callable[..., "NuplanPlanner"]:
 
 
 def factory(kind: Any) -> Callable[..., "NuplanPlanner"]:
-    """What makes wrapped planners of a class; it takes the arguments of the class's constructor.
-
-    Raises ConfigError: it is no class of nuPlan planners, or asks for what shiftsim does not have.
-    """
+    """What makes wrapped planners of a class, by its arguments; a ConfigError if it is none."""
     if not inspect.isclass(kind):
         raise ConfigError(
             f"{getattr(kind, '__name__', kind)!r} is not a class",

@@ -68,11 +68,7 @@ def export_results(
     workers: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> ResultsExport:
-    """Write the results of a run as nuPlan's own simulation would have written them.
-
-    Settings and errors are those of `shiftsim.Run.export_results`; without simulation logs nuBoard
-    shows tables only.
-    """
+    """Write a run as nuPlan's own simulation would have; see `shiftsim.Run.export_results`."""
     out, tasks, rows = Path(out), tasks_with_rollouts(run), run.tasks.to_pylist()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"{str(out)!r} is there and not empty", hint="name another folder")

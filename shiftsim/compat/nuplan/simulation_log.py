@@ -337,10 +337,7 @@ def _grouped(pieces: Iterable[T], lengths: IntArray) -> Iterator[list[T]]:
 
 
 def _planned(log: SimulationLog) -> tuple[IntArray, FloatArray, IntArray]:
-    """Times and ego states of all plans one after the other, and the length of each.
-
-    A plan begins with the state of the ego. Where there is none, the ego stands.
-    """
+    """Times and ego states of all plans, and their lengths; where there is none, the ego stands."""
     poses, is_bare = log.plans.copy(), np.isnan(log.plans[:, 1, 0])
     poses[is_bare, :2] = log.ego[is_bare, None, :3]
     known = np.isfinite(poses[..., 0])

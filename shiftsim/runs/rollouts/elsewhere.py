@@ -74,10 +74,7 @@ class Source:
         return sorted({entry.task.token for entry in self.entries})
 
     def in_store(self, store: ScenarioStore) -> "Source":
-        """The rollouts whose scenarios a store has.
-
-        Raises DataError: it lacks all of them, or one where the source is to be scored as a whole.
-        """
+        """The rollouts whose scenarios a store has: all of them, or some of what may be in part."""
         known = [entry for entry in self.entries if entry.task.token in store]
         lost = [entry.task.token for entry in self.entries if entry.task.token not in store]
         if lost and (self.is_whole or not known):
@@ -169,11 +166,7 @@ def _as_table(given: Any, scenario: Scenario) -> pa.Table:
 
 
 def read_source(path: Path, tracks: str = "") -> Source:
-    """The rollouts of a table of poses, or of the tables in a folder.
-
-    `tracks` is the path of a table of boxes; empty or `RECORDED` without one. It is a DataError if
-    a file cannot be read, or a column is missing or holds something else.
-    """
+    """Rollouts in tables of poses, a file or a folder; `tracks` is one of boxes, or `RECORDED`."""
     files = tuple(sorted([*path.glob("*.parquet"), *path.glob("*.csv")])) or (path,)
     table = pa.concat_tables(map(_read_table, files), promote_options="default")
     if tracks == RECORDED and TRACKS.names[0] in table.column_names:

@@ -83,11 +83,7 @@ def rollout_rows(
     with_kinds: bool = False,
     with_seen: bool = False,
 ) -> pa.RecordBatch:
-    """Columns of `STATES`, of `TRACKS` where tracks are not the recorded ones, and of `SEEN`.
-
-    Noise that `complete_rollout` can make again from the task is left out: null. Kinds are needed
-    of tracks that the scenario has not.
-    """
+    """Columns of `STATES`, and of `TRACKS` and `SEEN` where asked; without noise it is null."""
     columns = [pa.array(log.time_us)]
     for values in (log.ego, log.commands):
         columns += map(pa.array, np.ascontiguousarray(values.T))
@@ -132,12 +128,7 @@ def _lists(lengths: np.ndarray, items: np.ndarray | pa.Array) -> pa.Array:
 def complete_rollout(
     rows: pa.RecordBatch, scenario: Scenario, task: Task, *, is_partial: bool = False
 ) -> SimulationLog:
-    """The stored rollout of a task, completed by its noise and what its scenario holds already.
-
-    The rows have columns of `STATES`, and of `TRACKS` where they are not those of the log. Where
-    they may end before the scenario, the expert ends with them. Raises DataError: the scenario is
-    not the one that was driven, or the rows are damaged.
-    """
+    """The stored rollout of a task, completed by its noise and scenario; or a DataError."""
     time_us = rows["time_us"].to_numpy()
     if is_partial:
         shown = scenario.iteration_rows[: len(time_us) + 1]
@@ -228,11 +219,7 @@ def stored_plans(rows: pa.RecordBatch) -> np.ndarray:
 def stored_tracks(
     rows: pa.RecordBatch, tokens: Sequence[str], prefix: str = "track_"
 ) -> dict[str, np.ndarray]:
-    """Fields `valid`, `poses`, `velocities`, `sizes` of N stored tracks, by their `tokens`.
-
-    Columns are those of `TRACKS`, or of what was seen with its prefix. Raises ValueError: they are
-    damaged, or of other tracks.
-    """
+    """Fields `valid`, `poses`, `velocities`, `sizes` of N stored tracks, or a ValueError."""
     names = rows[f"{prefix}tokens"]
     lengths = np.diff(names.offsets.to_numpy())
     found = pc.index_in(names.flatten(), pa.array(tokens, pa.string()))
@@ -355,11 +342,7 @@ class RolloutReader:
 def write_rollouts(
     folder: Path, rollouts: Iterable[tuple[Task, pa.RecordBatch]]
 ) -> dict[Task, RolloutLocation]:
-    """Write rollouts into new files of a folder, and say where they are.
-
-    They have columns of `STATES`, and of `TRACKS` and `SEEN` in all or in none. Columns that name a
-    task already are written anew.
-    """
+    """Write rollouts, of the same columns, into new files of a folder, and say where they are."""
     rollouts, locations = iter(rollouts), dict[Task, RolloutLocation]()
     for first in rollouts:
         path, of_file = new_file(folder), chain([first], islice(rollouts, _FILE - 1))

@@ -303,10 +303,7 @@ def _fill(ego: FloatArray, times: IntArray, driven: Driven, samples: _Samples) -
 def _others(
     driven: Driven, boxes: Boxes, shift: int, log: SimulationLog
 ) -> tuple[Tracks, list[str]]:
-    """The given boxes at the samples of a log, which has the recorded ones; what was done to them.
-
-    A box between two times is there if it is at both.
-    """
+    """The given boxes at the samples of a log, and what was done; between two times if at both."""
     times, given, remarks = log.time_us, boxes.tracks, list[str]()
     lost = np.ones(len(times), np.bool_)
     tracks = Tracks.empty(len(times))
