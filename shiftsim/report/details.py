@@ -13,7 +13,8 @@ from shiftsim.report import statistics
 from shiftsim.report.groups import COLUMNS, Group, by_set, distinct_sets, planner_identities
 from shiftsim.report.statistics import FEW_CLUSTERS, Comparison, score_interval
 from shiftsim.report.tables import Cell, Interval, Number, Record, Row, Table
-from shiftsim.report.words import REASONS, noise_order
+from shiftsim.report.words import REASONS
+from shiftsim.sim.perception import drift_order
 
 ALL_KINDS = "all"
 _BORNE = 5.0  # points of the score that a planner may lose to what it is said to bear
@@ -25,7 +26,7 @@ def ranking(groups: Sequence[Group]) -> Table | None:
     places = list(dict.fromkeys(map(_place, groups)))
     known = [group for group in groups if group.is_complete]
     known.sort(key=lambda group: (places.index(_place(group)), -_score(group)))
-    noises = noise_order(group.noise for group in known)
+    noises = drift_order(group.noise for group in known)
     means = {name: np.mean([*map(_score, _under(known, name))]) for name in noises}
     first, hardest = next(iter(noises), ""), min(noises[1:], key=means.__getitem__, default="")
     heads = ["without noise" if name == "none" else f"under {name}" for name in (first, hardest)]
@@ -255,7 +256,7 @@ def drift_matrix(groups: Sequence[Group]) -> Table | None:
         for planner in dict.fromkeys(group.planner for group in mine):
             own = [group for group in mine if group.planner == planner]
             by_mode = {mode: {g.noise: g for g in own if g.traffic == mode} for mode in modes}
-            for noise in noise_order(noise for found in by_mode.values() for noise in found):
+            for noise in drift_order(noise for found in by_mode.values() for noise in found):
                 record: Record = {"set": data.label, "planner": planner, "drift": noise}
                 for mode, found in by_mode.items():
                     record[mode] = found[noise].estimate() if noise in found else None
@@ -288,7 +289,7 @@ def _change(before: Group | None, after: Group | None) -> Number | None:
 def _borne(planner: str, mode: str, groups: Mapping[str, Group]) -> str:
     """How late the plans of a planner may be before its score falls; empty where it is unknown."""
     scores = {noise: _score(group) for noise, group in groups.items() if group.is_complete}
-    late = [name for name in noise_order(scores) if name[8:].isdecimal()]
+    late = [name for name in drift_order(scores) if name[8:].isdecimal()]
     if not scores.get("none", 0.0) > _BORNE or not late:  # there is nothing that could fall
         return ""
     falls = [name for name in late if scores[name] < scores["none"] - _BORNE]

@@ -24,8 +24,8 @@ from shiftsim.report.groups import COLUMNS, DataSet, Group, by_set
 from shiftsim.report.palette import DEFAULT_FORM, SMALL, TEXT, FigureFormat, Style, dashes
 from shiftsim.report.statistics import rank_correlation, score_interval
 from shiftsim.report.tables import Interval, Number
-from shiftsim.report.words import LONG, noise_order
-from shiftsim.sim.perception import LEVELS
+from shiftsim.report.words import LONG
+from shiftsim.sim.perception import LEVELS, drift_order
 
 _NOISES = {"awgn": "white noise (AWGN)", "ou": "correlated noise (OU)"}
 _BOXES = {"perception": "errors", "miss": "misses", "dropout": "drop-outs"}
@@ -247,7 +247,7 @@ def _levels(kind: str, groups: Sequence[Group]) -> list[_Place]:
 
     levels = (f"{kind}-{level}" for level in LEVELS)
     if kind == "latency":
-        levels = (n for n in noise_order(g.noise for g in groups) if n[8:].isdecimal())
+        levels = (n for n in drift_order(g.noise for g in groups) if n[8:].isdecimal())
     return [*map(place, ("none", *levels))]
 
 

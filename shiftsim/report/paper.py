@@ -8,8 +8,9 @@ from typing import NamedTuple
 from shiftsim.report.groups import COLUMNS, DataSet, Group, by_set, distinct_sets
 from shiftsim.report.statistics import FEW_CLUSTERS, score_interval
 from shiftsim.report.tables import Cell, Number, Row, Table
-from shiftsim.report.words import LONG, NAMES, noise_order
+from shiftsim.report.words import LONG, NAMES
 from shiftsim.sim.noise import NOISE_NAMES
+from shiftsim.sim.perception import drift_order
 
 VAL14 = "val14"
 INTERVALS = (
@@ -193,7 +194,7 @@ def noise_robustness(groups: Sequence[Group], published: Published | None = None
     found = {group.noise for group in groups}
     if found <= {"none"}:
         return None
-    noises = noise_order([*found, *(NOISE_NAMES if published else ())])
+    noises = drift_order([*found, *(NOISE_NAMES if published else ())])
     scores: dict[tuple[str, ...], dict[str, Cell]] = {}
     for data, mine in by_set(groups):
         for group in mine:

@@ -115,32 +115,26 @@ def _without_result(run: Run) -> Iterator[tuple[Task, str]]:
             yield Task(*key), error
 
 
-class Rescorer:
-    """Scores one stored rollout of a run after the other."""
+def _rescorer(path: Path, store: str, config: RunConfig) -> Callable[[Entry], TaskResult]:
+    """What scores one stored rollout of a run after the other."""
+    run = open_run(path)
+    about = run.manifest
+    edits = make_edits(about["edits"], path.name) if about.get("edits") else None
+    scenarios, open_loop = ScenarioReader(store, edits), dict[Task, list[dict[str, Any]]]()
+    for row in run.metrics.to_pylist() if config.open_loop else ():
+        if row["metric"] in OPEN_LOOP:  # no threshold changes it
+            task = Task(*(row.pop(name) for name in Task._fields))
+            open_loop.setdefault(task, []).append(row | {"thresholds": config.thresholds})
 
-    def __init__(self, run: Path, store: str, config: RunConfig) -> None:
-        self.config, self._run = config, open_run(run)
-        edits = self._run.manifest.get("edits")
-        edit_set = make_edits(edits, self._run.path.name) if edits else None
-        self._scenarios = ScenarioReader(store, edit_set)
-        self._open_loop: dict[Task, list[dict[str, Any]]] = {}  # no threshold changes it
-        for row in self._run.metrics.to_pylist() if config.open_loop else ():
-            if row["metric"] in OPEN_LOOP:
-                task = Task(*(row.pop(name) for name in Task._fields))
-                self._open_loop.setdefault(task, []).append(row)
+    def score(entry: Entry) -> TaskResult:
+        scenario = scenarios.read(entry.task.token)
+        log = run.rollout(entry.task, scenario)
+        undefined = about.get("elsewhere", {}).get("undefined", ())
+        scores, metrics = score_rollout(scenario, log, config, undefined)
+        metrics += open_loop.get(entry.task, [])
+        return TaskResult(entry.task, OK, scenario.scenario_type, scores=scores, metrics=metrics)
 
-    def __call__(self, entry: Entry) -> TaskResult:
-        """The result of a task."""
-        return attempt(entry.task, partial(self._score, entry.task))
-
-    def _score(self, task: Task) -> TaskResult:
-        scenario = self._scenarios.read(task.token)
-        log = self._run.rollout(task, scenario)
-        undefined = self._run.manifest.get("elsewhere", {}).get("undefined", ())
-        scores, metrics = score_rollout(scenario, log, self.config, undefined)
-        profile = {"thresholds": self.config.thresholds}
-        metrics += [row | profile for row in self._open_loop.get(task, [])]
-        return TaskResult(task, OK, scenario.scenario_type, scores=scores, metrics=metrics)
+    return score
 
 
 def tasks_with_rollouts(run: Run) -> list[Task]:
@@ -190,7 +184,6 @@ def rescore(
     target = Path(out) if out else RUNS / run_name(config, run.manifest["split"], fingerprint)
     check_target(target, fingerprint)
     done = tasks_with_rollouts(run)
-    statuses = dict(zip(run.rollout_places, run.tasks["status"].to_pylist(), strict=True))
     manifest = make_manifest(
         target,
         config=config,
@@ -205,11 +198,18 @@ def rescore(
         for result in stored_results(run.path):
             if result.status != OK:  # it stays so
                 writer.add(replace(result, seconds={}))
-        make = partial(Rescorer, run.path.resolve(), found.source, config)
+        make = partial(_rescorer, run.path.resolve(), found.source, config)
         for result in _scored(make, [Entry(task) for task in done], workers, on_progress):
             writer.add(replace(result, location=run.rollout_places[result.task]))
         manifest |= {"state": "finished", "ended": now(), "rescored_from": run.path.name}
-        return writer.finish(manifest, statuses, dict(_without_result(run)))
+        return writer.finish(manifest, run.rollout_places, dict(_without_result(run)))
+
+
+def _attempting(
+    make: Callable[[], Callable[[Entry], TaskResult]],
+) -> Callable[[Entry], TaskResult]:
+    score = make()
+    return lambda entry: attempt(entry.task, partial(score, entry))
 
 
 def _scored(
@@ -221,7 +221,7 @@ def _scored(
     """The results of rollouts, which so many processes share, to be put on disk as they come."""
     progress = Progress(0, len(entries), 0)
     outcomes = map_unordered(
-        make,
+        partial(_attempting, make),
         entries,
         workers=min(workers or default_workers(), len(entries)),
         alone=1,
@@ -235,24 +235,17 @@ def _scored(
             on_progress(replace(progress, news=[result]))
 
 
-class ElsewhereScorer:
-    """Scores one rollout after the other that was driven elsewhere."""
+def _elsewhere_scorer(
+    store: str, config: RunConfig, undefined: Sequence[str], given: dict[str, Any]
+) -> Callable[[Entry], TaskResult]:
+    """What scores rollouts that were driven elsewhere; arguments of `rollout_of` are given."""
+    scenarios = ScenarioReader(store)
 
-    def __init__(self, store: str, config: RunConfig, undefined: Sequence[str], **given: Any):
-        """`given` are arguments of `rollout_of`."""
-        self.config, self._undefined, self._given = config, undefined, given
-        self._scenarios = ScenarioReader(store)
-
-    def __call__(self, entry: Entry) -> TaskResult:
-        """The result of a rollout."""
-        return attempt(entry.task, partial(self._score, entry))
-
-    def _score(self, entry: Entry) -> TaskResult:
-        scenario, driven = self._scenarios.read(entry.task.token), entry.read()
-        log, remarks = rollout_of(driven, scenario, **self._given)
-        scores, metrics = score_rollout(scenario, log, self.config, self._undefined)
-        is_recorded = driven.boxes is None and not self._undefined
-        rows = rollout_rows(log, with_tracks=not is_recorded, with_kinds=not is_recorded)
+    def score(entry: Entry) -> TaskResult:
+        scenario, driven = scenarios.read(entry.task.token), entry.read()
+        log, remarks = rollout_of(driven, scenario, **given)
+        scores, metrics = score_rollout(scenario, log, config, undefined)
+        has_others = driven.boxes is not None or bool(undefined)
         return TaskResult(
             entry.task,
             OK,
@@ -260,9 +253,11 @@ class ElsewhereScorer:
             seconds=planner_times(log) if "planning_seconds" in driven.fields else {},
             scores=scores,
             metrics=metrics,
-            rollout=encode_rows(rows),
+            rollout=encode_rows(rollout_rows(log, with_tracks=has_others, with_kinds=has_others)),
             remarks=remarks,
         )
+
+    return score
 
 
 def score_elsewhere(
@@ -319,7 +314,7 @@ def score_elsewhere(
     undefined = () if recorded or source.has_boxes else NEED_BOXES
     remarks, failed = Counter[str](), list[TaskResult]()
     with closing(RunWriter(target, manifest)) as writer:
-        make = partial(ElsewhereScorer, found.source, config, undefined, **given)
+        make = partial(_elsewhere_scorer, found.source, config, undefined, given)
         for result in _scored(make, source.entries, workers, on_progress):
             writer.add(result)
             remarks.update(result.remarks)

@@ -15,7 +15,7 @@ import numpy as np
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.edits.apply import NONREACTIVE, apply_edit
 from shiftsim.edits.spec import PROFILES, Edit, digest_of, edited_id, make_edit
-from shiftsim.errors import ConfigError, DataError, beginning, nearest
+from shiftsim.errors import ConfigError, DataError, beginning, one_of
 from shiftsim.files import read_toml
 from shiftsim.kernels import FloatArray
 from shiftsim.metrics.interplan import driven_lanes
@@ -28,7 +28,6 @@ from shiftsim.world.state import Tracks
 FOLDER = "edits"  # below that of a store
 _FORMAT = 1
 _TOP = ("format", "name", "profile", "edit")
-_STORED = (*_TOP, "made")  # as a manifest holds them
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,18 +198,11 @@ def edit_words(manifest: Mapping[str, Any], token: str) -> list[str]:
 def make_edits(table: Mapping[str, Any], name: str) -> EditSet:
     """Edits from the table of a file, or a ConfigError; `name` is theirs where they have none."""
     where = f"edits {name!r}"
-    for key in table:
-        if key not in _STORED:
-            near = nearest(key, _TOP)
-            hint = f"did you mean {near!r}? " if near else ""
-            raise ConfigError(
-                f"{where}: key {key!r} unknown", f"{hint}available: {', '.join(_TOP)}"
-            )
+    for key in {*table} - {"made"}:  # a manifest says what was made
+        one_of(f"{where}: key", key, _TOP)
     if table.get("format", _FORMAT) != _FORMAT:
         raise ConfigError(f"{where}: format {table['format']!r} is not {_FORMAT}")
-    profile = table.get("profile", PROFILES[0])
-    if profile not in PROFILES:
-        raise ConfigError(f"{where}: profile {profile!r} is not one of {', '.join(PROFILES)}")
+    profile = one_of(f"{where}: profile", table.get("profile", PROFILES[0]), PROFILES)
     listed = table.get("edit", [])
     if not isinstance(listed, list) or not listed:
         raise ConfigError(f"{where} holds no edits", hint="write one or more [[edit]] tables")
@@ -229,13 +221,8 @@ def read_edits(name: str, store: Path | None = None) -> EditSet:
     path = Path(name)
     if path.suffix != ".toml":
         folder = (store or Path()) / FOLDER
-        path = folder / f"{name}.toml"
-        if not path.is_file():
-            known = sorted(found.stem for found in folder.glob("*.toml"))
-            raise ConfigError(
-                f"edits {name!r} unknown",
-                hint=f"available: {', '.join(known) or 'none'}, or the path of a .toml file",
-            )
+        known = [found.stem for found in folder.glob("*.toml")] or ["none"]
+        path = folder / f"{one_of('edits', name, known, ', or the path of a .toml file')}.toml"
     return make_edits(read_toml(path), path.stem)
 
 

@@ -38,13 +38,8 @@ class Progress:
     def __add__(self, other: "Progress") -> "Progress":
         names = {**self.seconds, **other.seconds}
         seconds = {n: self.seconds.get(n, 0.0) + other.seconds.get(n, 0.0) for n in names}
-        return Progress(
-            self.done + other.done,
-            self.total + other.total,
-            self.failed + other.failed,
-            seconds,
-            other.news,
-        )
+        counts = self.done + other.done, self.total + other.total, self.failed + other.failed
+        return Progress(*counts, seconds, other.news)
 
 
 OnProgress: TypeAlias = Callable[[Progress], None]

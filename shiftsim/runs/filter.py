@@ -138,20 +138,16 @@ def read_filter_results(store: str | Path, store_hash: str) -> FilterResults | N
     return found
 
 
-class Playback:
-    """Finds the verdict on one scenario after the other."""
+def _judge(store: Path, config: FilterConfig) -> Callable[[str], dict[str, Any]]:
+    """What finds the verdict on one scenario after the other, also where it cannot be driven."""
+    scenarios = ScenarioReader(str(store))
 
-    def __init__(self, store: Path, config: FilterConfig) -> None:
-        self.config = config
-        self._scenarios = ScenarioReader(str(store))
-
-    def __call__(self, token: str) -> dict[str, Any]:
-        """The row of the verdict, also where the scenario cannot be driven."""
-        found = attempt(
-            Task("log-playback", "none", 0, token),
-            lambda: judge_scenario(self._scenarios.read(token), self.config),
-        )
+    def row(token: str) -> dict[str, Any]:
+        task = Task("log-playback", "none", 0, token)
+        found = attempt(task, lambda: judge_scenario(scenarios.read(token), config))
         return _failed(token, found.error) if isinstance(found, TaskResult) else found
+
+    return row
 
 
 def judge_scenario(scenario: Scenario, config: FilterConfig) -> dict[str, Any]:
@@ -218,7 +214,7 @@ def filter_store(
         done = {row["token"]: row for row in rows if row["verdict"] != FAILED}
         waiting = [token for token in opened.tokens if token not in done]
         on_progress(len(done), len(opened))
-        make = partial(Playback, path.resolve(), config)
+        make = partial(_judge, path.resolve(), config)
         with closing(map_unordered(make, waiting, workers=number, alone=1)) as outcomes:
             for outcome in outcomes:
                 row = outcome.result or _failed(outcome.task, outcome.death)

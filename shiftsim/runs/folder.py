@@ -8,7 +8,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -121,7 +121,11 @@ class RunWriter:
         locations = self._write_rollouts()
         tasks = iter(sorted(expected))
         with ExitStack() as stack:
-            tables = {name: stack.enter_context(self._table(name)) for name in TABLES}
+            tables = {}
+            for name, schema in TABLES.items():
+                path = stack.enter_context(atomic_write(self.path / f"{name}.parquet"))
+                table = pq.ParquetWriter(path, schema, **_WRITE_OPTIONS)
+                tables[name] = stack.enter_context(table)
             while chunk := list(islice(tasks, _ROW_GROUP)):
                 rows: dict[str, list[dict[str, Any]]] = {name: [] for name in TABLES}
                 for task in chunk:
@@ -143,14 +147,6 @@ class RunWriter:
                 path.unlink()
         return open_run(self.path)
 
-    @contextmanager
-    def _table(self, name: str) -> Iterator[pq.ParquetWriter]:
-        with (
-            atomic_write(self.path / f"{name}.parquet") as partial,
-            pq.ParquetWriter(partial, TABLES[name], **_WRITE_OPTIONS) as table,
-        ):
-            yield table
-
     def close(self) -> None:
         """Let another process work on the folder."""
         self._journal.close()
@@ -158,27 +154,21 @@ class RunWriter:
     def _write_rollouts(self) -> dict[Task, RolloutLocation]:
         """Put rollouts into files by scenario; one that others have left is written anew."""
         order = sorted(self.ended, key=lambda task: (task.token, task))
-        records = [(task, self.ended[task]) for task in order]
         locations = {
-            task: record.location
-            for task, record in records
-            if record.location and record.location.file not in self._outdated
+            task: location
+            for task in order
+            if (location := self.ended[task].location) and location.file not in self._outdated
         }
         reader = files.RolloutReader()
-        written = files.write_rollouts(
-            self.rollouts,
-            (
-                (
-                    task,
-                    reader.read(record.location)
-                    if record.location
-                    else decode_rows(self._journal.data(record.number)),
-                )
-                for task, record in records
-                if task not in locations and (record.location or record.has_rollout)
-            ),
-        )
-        return locations | written
+
+        def moved() -> Iterator[tuple[Task, pa.RecordBatch]]:
+            for task, record in ((task, self.ended[task]) for task in order):
+                if task not in locations and record.location:
+                    yield task, reader.read(record.location)
+                elif task not in locations and record.has_rollout:
+                    yield task, decode_rows(self._journal.data(record.number))
+
+        return locations | files.write_rollouts(self.rollouts, moved())
 
 
 def _entry(result: TaskResult) -> tuple[str, dict[str, Any]]:

@@ -6,6 +6,7 @@ import platform
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cache
@@ -86,10 +87,8 @@ def versions() -> dict[str, str]:
     """Versions of Python, shiftsim and the packages that results could depend on."""
     out = {"shiftsim": __version__, "python": sys.version.split()[0]}
     for name in _PACKAGES:
-        try:
+        with suppress(metadata.PackageNotFoundError):
             out[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
     return out
 
 

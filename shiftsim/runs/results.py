@@ -12,9 +12,9 @@ import pyarrow.compute as pc
 
 from shiftsim.errors import ConfigError, DataError, listed, one_of
 from shiftsim.files import write_text
-from shiftsim.runs.rollouts import Task, describe
+from shiftsim.runs.rollouts import Task, damaged, describe
 from shiftsim.runs.rollouts.files import FOLDER, RolloutLocation, RolloutReader, complete_rollout
-from shiftsim.runs.tables import LOCATION, OK, damaged, read_table, stored_location
+from shiftsim.runs.tables import LOCATION, OK, read_table, stored_location
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.scenario import Scenario
 
@@ -195,14 +195,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         for name in key.split("."):
             value = value.get(name) if isinstance(value, dict) else None
         if not isinstance(value, kind):
-            raise DataError(
-                f"{str(path)!r} cannot be read: {key!r} is missing or no {kind.__name__}",
-                hint="make the run again",
-            )
+            raise damaged(path, f"{key!r} is missing or no {kind.__name__}")
     named, found = manifest["config"]["planners"], manifest["determining"]["planners"]
     if not all(isinstance(name, str) for name in named) or not all(
         isinstance(about, (dict, str)) for about in found.values()
     ):
-        what = f"{str(path)!r} cannot be read: its planners are no names with what they are"
-        raise DataError(what, hint="make the run again")
+        raise damaged(path, "its planners are no names with what they are")
     return manifest

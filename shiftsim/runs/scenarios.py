@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from shiftsim.data.store.reading import ScenarioStore, open_store
 from shiftsim.data.store.tables import REVIEW
-from shiftsim.errors import ConfigError, DataError, listed, nearest, one_of
+from shiftsim.errors import ConfigError, DataError, listed, one_of
 from shiftsim.files import DEFAULT_STORE, read_toml, safe_join, store_path
 from shiftsim.runs.config import RunConfig
 from shiftsim.runs.results import Run, read_manifest, write_manifest
@@ -249,18 +249,11 @@ def find_split(name: str, store: Path, tokens: tuple[str, ...]) -> Split:
     if name in ("", store.name):
         return Split(store.name, tokens)
     path = Path(name)
-    if path.suffix in (".toml", ".txt"):
-        return read_split(path)
-    path = store / "splits" / f"{name}.toml"
-    if path.is_file():
-        return read_split(path)
-    known = sorted([store.name, *(found.stem for found in (store / "splits").glob("*.toml"))])
-    near = nearest(name, known)
-    hint = f"did you mean {near!r}? " if near else ""
-    raise ConfigError(
-        f"split {name!r} unknown",
-        hint=f"{hint}available: {', '.join(known)}, or a .toml or .txt file",
-    )
+    if path.suffix not in (".toml", ".txt"):
+        known = [store.name, *(found.stem for found in (store / "splits").glob("*.toml"))]
+        one_of("split", name, known, ", or a .toml or .txt file")
+        path = store / "splits" / f"{name}.toml"
+    return read_split(path)
 
 
 def read_split(path: Path) -> Split:

@@ -5,7 +5,7 @@ fixed settings, so that the same run gives the same bytes for any number of work
 Timings are in `tasks.parquet`.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
@@ -14,9 +14,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from shiftsim.errors import DataError
 from shiftsim.metrics import SHORT_NAMES
-from shiftsim.runs.rollouts import Task, describe
+from shiftsim.runs.rollouts import Task, damaged, describe
 from shiftsim.runs.rollouts.files import FOLDER, RolloutLocation, part_file
 from shiftsim.world.ranges import RUN, require
 
@@ -92,9 +91,7 @@ class TaskResult:
     # the rows of `metrics.parquet` beyond the key
     metrics: list[dict[str, Any]] = field(default_factory=list)
     rollout: bytes = b""  # the rollout, encoded; empty where it is not stored, or stored elsewhere
-    location: RolloutLocation | None = (
-        None  # where the rollout is stored, where it is in a file already
-    )
+    location: RolloutLocation | None = None  # of the rollout, where it is in a file already
     warning: str = ""  # why the first plan is most likely not what was meant
     remarks: tuple[str, ...] = ()  # what a reader must know of a rollout that was driven elsewhere
 
@@ -124,7 +121,7 @@ class TaskResult:
         )
 
 
-def task_of(row: dict[str, Any]) -> Task:
+def task_of(row: Mapping[str, Any]) -> Task:
     """The task of a row of any table."""
     return Task(*(row[name] for name in Task._fields))
 
@@ -186,8 +183,3 @@ def _batches(path: Path) -> Iterator[pa.RecordBatch]:
             yield batch
     except (OSError, ValueError, pa.ArrowException) as error:
         raise damaged(path, str(error)) from error
-
-
-def damaged(path: Path, what: str) -> DataError:
-    """The error that a file of a run cannot be read."""
-    return DataError(f"{str(path)!r} cannot be read: {what}", hint="make the run again")

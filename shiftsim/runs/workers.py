@@ -61,24 +61,16 @@ def map_unordered(
     """Apply a function to every task, in whatever order they finish.
 
     Args:
-        make: Called once per worker; returns the function. Must pickle when `workers` is above 1
-            or there is a limit, and so must the tasks and results. A `close` attribute of the
-            function is called at the end.
+        make: Called once per worker; returns the function, whose `close` is called at the end. It,
+            tasks and results must pickle, but for a single worker, this process, without a limit.
         tasks: The tasks.
-        workers: Number of worker processes; with 1 and no limit everything happens in this process.
-        alone: So many leading tasks are done one at a time before the others, so that kernels
-            which are not in the disk cache yet are compiled once.
-        limit: Time that each task, or each part of a batch, may take [s]; 0 for any. What a worker
-            has to load, or to compile, does not count.
-        in_batches: Whether the tasks are tuples of several in one; when the worker of one dies,
-            its parts are done one by one, so that only one of them is lost.
+        workers: Number of worker processes.
+        alone: So many leading tasks are done one by one, so that kernels are compiled once.
+        limit: Time per task or part of a batch [s]; 0 for any. Loading, compiling do not count.
+        in_batches: Whether tasks are tuples of several; those of a dead worker are done one by one.
         group: What a worker should stay with, as it has read it already; neighbours only.
 
-    Yields:
-        One outcome per task, or per part of a batch whose worker died.
-
-    Raises:
-        ConfigError: Workers cannot be started.
+    Yields an outcome per task, or per part of such a batch. ConfigError: workers cannot be started.
     """
     if workers <= 1 and not limit:
         function = make()

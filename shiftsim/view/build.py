@@ -18,6 +18,7 @@ from shiftsim.report import words
 from shiftsim.report.palette import planner_styles
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
+from shiftsim.sim.perception import drift_order
 from shiftsim.view.page import MAX_ROLLOUTS, Page, framed, replay_page
 from shiftsim.view.scene import ShownRollout
 from shiftsim.view.thumbnails import thumbnails
@@ -291,7 +292,7 @@ def list_page(
     scenes = {one: n for n, one in enumerate(dict.fromkeys(row.get("scene") for row in rows))}
     looks = {
         "multipliers": [SHORT_NAMES[name] for name in MULTIPLIERS],
-        "noises": words.noise_order(row["noise"] for row in rows),
+        "noises": drift_order(row["noise"] for row in rows),
         "styles": planner_styles(sorted({row["planner"] for row in rows})),
         "scenes": list(scenes),
     }

@@ -27,7 +27,7 @@ import pyarrow.parquet as pq
 from shiftsim.data.store.schema import BOX, EGO_COLUMNS, list_of
 from shiftsim.data.store.tables import write_blocks
 from shiftsim.errors import DataError
-from shiftsim.runs.rollouts import Task
+from shiftsim.runs.rollouts import Task, damaged
 from shiftsim.sim.log import NUM_KEPT, Seen, SimulationLog
 from shiftsim.sim.noise import sample_noise
 from shiftsim.sim.perception import noise_of
@@ -311,9 +311,7 @@ class RolloutReader:
                     raise ValueError(f"column {name!r} holds {nulls} nulls")
             return batch
         except (OSError, ValueError, TypeError, IndexError, pa.ArrowException) as error:
-            raise DataError(
-                f"{str(location.file)!r} cannot be read: {error}", hint="make the run again"
-            ) from error
+            raise damaged(location.file, str(error)) from error
 
     def _open(self, path: Path) -> None:
         self._file, self._rows = pq.ParquetFile(path), pa.table({})
@@ -328,15 +326,13 @@ class RolloutReader:
     def _read_group(self, row: int) -> None:
         """Read the row group that holds a row."""
         assert self._file is not None
-        first = 0
-        for group in range(self._file.num_row_groups):
-            end = first + self._file.metadata.row_group(group).num_rows
-            if first <= row < end:
-                self._rows = self._file.read_row_group(group, use_threads=False)
-                self._first = first
-                return
-            first = end
-        raise IndexError(f"it has no row {row}")
+        about = self._file.metadata
+        ends = np.cumsum([about.row_group(i).num_rows for i in range(about.num_row_groups)])
+        group = int(np.searchsorted(ends, row, "right"))
+        if row < 0 or group == len(ends):
+            raise IndexError(f"it has no row {row}")
+        self._rows = self._file.read_row_group(group, use_threads=False)
+        self._first = int(ends[group]) - len(self._rows)
 
 
 def write_rollouts(
