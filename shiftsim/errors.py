@@ -108,9 +108,8 @@ def one_of(what: str, value: str, choices: Iterable[str], others: str = "") -> s
         return value
     near = nearest(value, valid)
     hint = f"did you mean {near!r}? " if near else ""
-    raise ConfigError(
-        f"{what} {value!r} unknown", hint=f"{hint}available: {', '.join(valid)}{others}"
-    )
+    hint += f"available: {', '.join(valid)}{others}"
+    raise ConfigError(f"{what} {value!r} unknown", hint)
 
 
 def beginning(where: str, what: str, text: str, choices: Iterable[str]) -> str:

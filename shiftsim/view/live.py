@@ -128,11 +128,7 @@ class LiveRun:
             }
 
     def replay(self, number: int | str) -> str | None:
-        """The replay of one of the worst rollouts; None where it is none of them any more.
-
-        Raises:
-            ShiftsimError: Its scenario cannot be read.
-        """
+        """The replay of one of the worst rollouts; None where it is none of them any more."""
         with self._lock:
             worst = self._worst.values()
             found = (r for _, n, r in worst if str(n) == str(number) and r.rollout)
@@ -156,10 +152,7 @@ def _statistics(scores: Sequence[tuple[str, float]]) -> dict[str, Any]:
 
 
 def _describe(result: TaskResult) -> dict[str, Any]:
-    """A finished rollout as JSON values, with the violations that cost most, the earliest first.
-
-    That is those of multipliers, else all.
-    """
+    """A finished rollout as JSON values, with the violations of multipliers, else all."""
     found = violations(result.metrics)
     costly = [one for one in found if one.is_multiplier] or found
     return {
