@@ -64,12 +64,7 @@ class Plan:
 def plan_bench(
     track: Track, settings: Mapping[str, Any], *, reference: str = "", out: str = ""
 ) -> Plan:
-    """Check all runs of a track before the first one starts; a ShiftsimError if anything is wrong.
-
-    Traffic, noise, seeds and thresholds are the track's unless the settings, of `RunConfig`, give
-    them. `reference` is the store, or `STORE:SPLIT`, with the scenarios of the track's published
-    list, empty to leave it out; `out` the folder, by default `runs/<id>`.
-    """
+    """Check all runs of a track, whose settings others replace; `reference` is STORE[:SPLIT]."""
     values = dict(settings)
     resumes = values.pop("resume", False)
     given = values.pop("traffic", None) or list(track.traffic)
@@ -161,10 +156,7 @@ def _prepared(
 
 
 def _edits(drawn: Drawn, own: RunPlan, given: str, folder: Path) -> tuple[EditSet, str]:
-    """The edits that are given, else those of the folder, else those that the track draws.
-
-    The text is that of a file of those that were drawn.
-    """
+    """The edits that are given, the folder's, or those drawn, and these as the text of a file."""
     store = open_store(own.store)
     if given or (folder / EDITS).is_file():
         return open_edits(given or str(folder / EDITS), store), ""
@@ -228,11 +220,7 @@ def run_bench(
     on_progress: Callable[[Progress], None] = lambda progress: None,
     argv: Sequence[str] = (),
 ) -> list[Run]:
-    """Do all runs; those that are complete already are kept as they are.
-
-    `on_progress` is called after every rollout with counts over all runs; `argv`, the command line,
-    is for the manifests.
-    """
+    """Do all runs but those that are complete; `on_progress` gets counts over all of them."""
     plan.folder.mkdir(parents=True, exist_ok=True)
     columns = ("name", "count", "sha256")
     own, *edited = ({name: getattr(one, name) for name in columns} for one in plan.own)
@@ -307,13 +295,7 @@ class OpenedRuns(NamedTuple):
         form: FigureFormat = DEFAULT_FORM,
         on_progress: Callable[[int, int], None] = lambda done, total: None,
     ) -> list[Path]:
-        """Write tables and pictures to a folder, and return the files.
-
-        There is a file per format, of all formats where none is given; with `pages` there are HTML
-        pages in place of these: tables, pictures, and every scenario with its replay. It is a
-        ConfigError if there is no such format, a MissingExtraError if matplotlib is missing for
-        pictures.
-        """
+        """Write tables and pictures, a file per format or HTML `pages` with replays; the files."""
         for name in formats:
             one_of("format", name, FORMATS)
         is_whole = options.tables == tuple(build.TABLES)
@@ -342,11 +324,7 @@ def _store_of(run: Run) -> Any:
 
 
 def open_runs(folders: Iterable[Path], labels: Iterable[str] = ()) -> OpenedRuns:
-    """The runs of folders, where the folder of a benchmark stands for all of its runs.
-
-    `labels`, as those of `label_runs`, are what planners are called. It is a ShiftsimError if a
-    folder is neither, or damaged.
-    """
+    """The runs of folders, a benchmark's being all of its runs, by `labels` as in `label_runs`."""
     out = OpenedRuns([], [], [])
     for folder in folders:
         found = _read_manifest(folder)
@@ -361,11 +339,7 @@ def open_runs(folders: Iterable[Path], labels: Iterable[str] = ()) -> OpenedRuns
 
 
 def paired_runs(first: Path, second: Path, labels: Iterable[str] = ()) -> list[tuple[Run, Run]]:
-    """Two run folders, or the runs of two benchmarks that have the same name.
-
-    `labels`, as those of `label_runs`, are what planners are called. It is a ShiftsimError if a
-    folder is neither, or there is no such pair.
-    """
+    """Two run folders, or runs of one name of two benchmarks, by `labels` as in `label_runs`."""
     ours, theirs = (open_runs([folder]).runs for folder in (first, second))
     runs = label_runs([*ours, *theirs], labels)
     ours, theirs = runs[: len(ours)], runs[len(ours) :]

@@ -47,12 +47,7 @@ def apply_edit(
     driven_lanes: DrivenLanes | None = None,
     replay: Replay | None = None,
 ) -> Scenario:
-    """The scenario that an edit makes of a recorded one.
-
-    Codes of interPlan need `driven_lanes`, such as `metrics.interplan.driven_lanes`, and what
-    begins in traffic that reacts needs a `replay` of it. It is a ConfigError if it cannot be
-    applied; the message names scenario, edit and reason.
-    """
+    """The scenario that an edit makes of a recorded one; a ConfigError where it cannot."""
     try:
         if edit.start is not None:
             scenario = _begin_at(scenario, edit.start, replay)

@@ -337,11 +337,9 @@ def open_loop_values(group: Group, metric: str) -> FloatArray:
 
 
 def _open_loop_record(group: Group) -> Record:
-    metrics = group.metrics
-    found = metrics.group_by("metric").aggregate([("value", "sum"), ("value", "mean")]).to_pylist()
-    sums, means = ({row["metric"]: row[f"value_{of}"] for row in found} for of in ("sum", "mean"))
+    metrics, means = group.metrics, _metric_means(group)
     plans = metrics.filter(pc.equal(metrics["metric"], open_loop.COUNT))
-    counted, there = sums.get(open_loop.COUNT), pc.sum(plans["threshold"]).as_py()
+    counted, there = (pc.sum(plans[name]).as_py() for name in ("value", "threshold"))
 
     def mean(name: str, scale: float = 1.0) -> Number | None:
         return None if (value := means.get(name)) is None else Number(scale * value)

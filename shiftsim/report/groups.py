@@ -5,7 +5,7 @@ table is decided by their `DataSet`: the same scenarios under the same threshold
 """
 
 import hashlib
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, compress, product
 from pathlib import Path, PurePath
@@ -333,11 +333,8 @@ def _groups(run: Run, known: Sequence[KnownSet]) -> Iterator[Group]:
     table = np.stack([pc.fill_null(scores[name], 0.0).to_numpy() for name in COLUMNS], axis=1)
     table[:, [name in undefined_columns(run) for name in COLUMNS]] = np.nan
     places = pc.index_in(scores["token"], value_set=pa.array(data.tokens, pa.string())).to_numpy()
-    order = product(
-        _ordered(tasks["planner"], run.manifest["config"]["planners"]),
-        drift_order(pc.unique(tasks["noise"]).to_pylist()),
-    )
-    for planner, noise in order:
+    noises = drift_order(pc.unique(tasks["noise"]).to_pylist())
+    for planner, noise in product(run.manifest["config"]["planners"], noises):
         seeds = np.unique(tasks["seed"].to_numpy()[_matching(tasks, planner, noise)])
         values = np.full((len(seeds), len(data.tokens), len(COLUMNS)), np.nan)
         rows = np.flatnonzero(_matching(scores, planner, noise))
@@ -347,12 +344,6 @@ def _groups(run: Run, known: Sequence[KnownSet]) -> Iterator[Group]:
         whole = Group(run, data, mode, *names, noise, tuple(seeds.tolist()), values)
         for part, chosen in parts if len(seeds) else ():
             yield replace(whole.only(chosen), data=part)
-
-
-def _ordered(column: pa.ChunkedArray, names: Collection[str]) -> list[str]:
-    """The values of a column in the order of the names, others behind them."""
-    rank = {name: place for place, name in enumerate(names)}
-    return sorted(pc.unique(column).to_pylist(), key=lambda name: rank.get(name, len(rank)))
 
 
 def _matching(table: pa.Table, planner: str, noise: str) -> BoolArray:

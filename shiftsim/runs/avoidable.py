@@ -120,8 +120,7 @@ class Braking:
         start = self._recorded(np.array([since]))[0]
         speed = float(np.interp(since, self._time_us, self._speed))
         late = np.clip((time_us - since) * 1e-6, 0.0, speed / self._deceleration)
-        braked: FloatArray = start + speed * late - 0.5 * self._deceleration * late**2
-        return braked
+        return start + speed * late - 0.5 * self._deceleration * late**2
 
     def _recorded(self, time_us: IntArray) -> FloatArray:
         """Where the recording was, and goes on at its last speed [m]."""

@@ -91,8 +91,7 @@ class FilterResults:
     @property
     def config(self) -> Mapping[str, Any]:
         """What a scenario had to satisfy."""
-        config: Mapping[str, Any] = self.conditions["config"]
-        return config
+        return self.conditions["config"]
 
     @property
     def accepted(self) -> tuple[str, ...]:

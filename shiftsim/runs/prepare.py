@@ -339,8 +339,7 @@ def _fingerprint(
         "metrics": config.added_metrics,
         "strict": config.strict,
     }
-    plain: dict[str, Any] = json.loads(json.dumps(values, sort_keys=True, default=str))
-    return plain
+    return json.loads(json.dumps(values, sort_keys=True, default=str))
 
 
 def run_name(config: RunConfig, split: str, fingerprint: dict[str, Any]) -> str:

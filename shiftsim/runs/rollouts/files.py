@@ -247,8 +247,7 @@ def encode_rows(rows: pa.RecordBatch) -> bytes:
     options = pa.ipc.IpcWriteOptions(compression="lz4")
     with pa.ipc.new_stream(sink, rows.schema, options=options) as stream:
         stream.write_batch(rows)
-    encoded: bytes = sink.getvalue().to_pybytes()
-    return encoded
+    return sink.getvalue().to_pybytes()
 
 
 def decode_rows(data: bytes) -> pa.RecordBatch:
