@@ -96,16 +96,12 @@ def plan_bench(
         sets[track.reference.name] = values | rules
     folder = Path(out) if out else RUNS / _name(track, sets, edits_of)
     if resumes and not (folder / MANIFEST).is_file():
-        raise ConfigError(
-            f"there is no benchmark to go on with at {str(folder)!r}",
-            hint="name its folder with --out, or begin without --resume",
-        )
+        what = f"there is no benchmark to go on with at {str(folder)!r}"
+        raise ConfigError(what, hint="name its folder with --out, or begin without --resume")
     _check_folder(folder, track)
     if edits_of and track.drawn is None:
-        raise ConfigError(
-            f"the track {track.name} drives recorded scenarios",
-            hint="`shiftsim bench edits --edits FILE` drives edited ones",
-        )
+        what = f"the track {track.name} drives recorded scenarios"
+        raise ConfigError(what, hint="`shiftsim bench edits --edits FILE` drives edited ones")
     runs = _prepared(track, sets, modes, folder)
     unlimited = _without_limit(next(iter(runs.values())))
     if track.drawn is None:
@@ -192,10 +188,8 @@ def _check_folder(folder: Path, track: Track) -> None:
         return
     found = _read_manifest(folder)
     if found is None or found["track"] != track.name:
-        raise ConfigError(
-            f"{str(folder)!r} holds something else than a {track.name} benchmark",
-            hint="choose another --out",
-        )
+        what = f"{str(folder)!r} holds something else than a {track.name} benchmark"
+        raise ConfigError(what, hint="choose another --out")
 
 
 def _without_limit(run: RunPlan) -> RunPlan:
@@ -364,12 +358,9 @@ def _read_manifest(folder: Path) -> dict[str, Any] | None:
         found: dict[str, Any] = json.loads(path.read_text("utf-8"))
         version, _, _ = found["format"], found["runs"], found["own"]["sha256"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(
-            f"{str(path)!r} is damaged: {error}", hint="run the benchmark again"
-        ) from error
+        what = f"{str(path)!r} is damaged: {error}"
+        raise DataError(what, hint="run the benchmark again") from error
     if version != _FORMAT:
-        raise DataError(
-            f"{str(path)!r} has format {version!r}, this version reads {_FORMAT}",
-            hint="run the benchmark again with this version of shiftsim",
-        )
+        what = f"{str(path)!r} has format {version!r}, this version reads {_FORMAT}"
+        raise DataError(what, hint="run the benchmark again with this version of shiftsim")
     return found

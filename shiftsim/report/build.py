@@ -71,9 +71,8 @@ def make_tables(
     default_weights = "; ".join(sorted(weights))
     groups = [group for group in groups if group not in left_out]
     if left_out and not groups:
-        raise ConfigError(
-            f"nothing to show beside published figures: {default_weights}", hint=_ASK_FOR_WEIGHTS
-        )
+        what = f"nothing to show beside published figures: {default_weights}"
+        raise ConfigError(what, hint=_ASK_FOR_WEIGHTS)
     runs = list({group.run.path: group.run for group in groups}.values())
     notes = planner_notes(runs)
     if left_out:

@@ -73,9 +73,8 @@ def _check_shards(runs: Sequence[Run], *, allow_partial: bool) -> list[str]:
     first, shards = runs[0], [run.manifest["shard"] for run in runs]
     for run, shard in zip(runs, shards, strict=True):
         if not shard:
-            raise ConfigError(
-                f"{str(run.path)!r} is not a shard", hint="merge joins runs made with --shard i/n"
-            )
+            what = f"{str(run.path)!r} is not a shard"
+            raise ConfigError(what, hint="merge joins runs made with --shard i/n")
         differing = difference(run.manifest, first.manifest["determining"], shard)
         if differing or parse_shard(shard)[1] != parse_shard(shards[0])[1]:
             raise ConfigError(
@@ -142,10 +141,8 @@ def tasks_with_rollouts(run: Run) -> list[Task]:
     statuses = zip(run.rollout_places.items(), run.tasks["status"].to_pylist(), strict=True)
     done = {task: place for (task, place), status in statuses if status == OK}
     if without := sum(place is None for place in done.values()):
-        raise DataError(
-            f"run {run.path.name!r} holds no rollouts for {without} of {len(done)} tasks",
-            hint="run again with --save-rollouts all",
-        )
+        what = f"run {run.path.name!r} holds no rollouts for {without} of {len(done)} tasks"
+        raise DataError(what, hint="run again with --save-rollouts all")
     return sorted(done, key=lambda task: task.token)
 
 

@@ -61,16 +61,12 @@ class EditSet:
                     continue
                 token = edited_id(base, edit)
                 if token in out or token in types:
-                    raise ConfigError(
-                        f"edits {self.name!r}: two scenarios have the id {token!r}",
-                        hint="give each edit of a scenario a name of its own",
-                    )
+                    what = f"edits {self.name!r}: two scenarios have the id {token!r}"
+                    raise ConfigError(what, hint="give each edit of a scenario a name of its own")
                 out[token] = Edited(base, edit)
         if not out:
-            raise ConfigError(
-                f"edits {self.name!r} are for no scenario of the {len(chosen)} chosen",
-                hint="check tokens, split and types of its edits",
-            )
+            what = f"edits {self.name!r} are for no scenario of the {len(chosen)} chosen"
+            raise ConfigError(what, hint="check tokens, split and types of its edits")
         return out
 
     def named(self, store: ScenarioStore) -> dict[str, str]:
@@ -90,23 +86,17 @@ class EditSet:
         for edit in self.edits:
             where = f"edits {self.name!r}, edit {edit.name!r}"
             if edit.start is not None and edit.start.traffic not in (NONREACTIVE, traffic):
-                raise ConfigError(
-                    f"{where}: it begins in traffic {edit.start.traffic}, not {traffic}",
-                    hint=f"--traffic {edit.start.traffic}",
-                )
+                what = f"{where}: it begins in traffic {edit.start.traffic}, not {traffic}"
+                raise ConfigError(what, hint=f"--traffic {edit.start.traffic}")
             moving = bool(edit.density) or any(
                 spawn.kind == "vehicle" and spawn.behavior != "stopped" for spawn in edit.spawn
             )
             if traffic == "nonreactive" and moving:
-                raise ConfigError(
-                    f"{where}: spawned vehicles that drive have no recording to be replayed",
-                    hint='--traffic reactive, or behavior = "stopped"',
-                )
+                what = f"{where}: spawned vehicles that drive have no recording to be replayed"
+                raise ConfigError(what, hint='--traffic reactive, or behavior = "stopped"')
             if traffic != "reactive" and edit.code:
-                raise ConfigError(
-                    f"{where}: the code {edit.code!r} is for reactive traffic, not {traffic}",
-                    hint="--traffic reactive",
-                )
+                what = f"{where}: the code {edit.code!r} is for reactive traffic, not {traffic}"
+                raise ConfigError(what, hint="--traffic reactive")
             slowed = bool(edit.stop) or any(
                 not slow.kinds or "vehicle" in slow.kinds for slow in edit.slow
             )
@@ -145,10 +135,8 @@ class EditedStore(ScenarioStore):
                     for token, found in made.items()
                 }
             except (KeyError, TypeError) as error:
-                raise DataError(
-                    f"edits {edits.name!r} of the manifest do not make its scenarios",
-                    hint="make the run again",
-                ) from error
+                what = f"edits {edits.name!r} of the manifest do not make its scenarios"
+                raise DataError(what, hint="make the run again") from error
         self.tokens = tuple(self.edited)
 
     def __reduce__(self) -> Any:
@@ -160,10 +148,8 @@ class EditedStore(ScenarioStore):
     def base(self, token: str) -> str:
         """Token of the recorded scenario that an edited one was made of."""
         if token not in self.edited:
-            raise DataError(
-                f"store {self.path.name!r} has no edited scenario {token!r}",
-                hint="its `tokens` are the scenarios it has",
-            )
+            what = f"store {self.path.name!r} has no edited scenario {token!r}"
+            raise DataError(what, hint="its `tokens` are the scenarios it has")
         return self.edited[token].base
 
     def read(self, token: str, *, validate: bool = True) -> Scenario:
@@ -209,10 +195,8 @@ def make_edits(table: Mapping[str, Any], name: str) -> EditSet:
     edits = tuple(make_edit(item, f"{where}, edit {i}") for i, item in enumerate(listed, 1))
     codes = [edit for edit in edits if edit.code]
     if codes and profile != "interplan":
-        raise ConfigError(
-            f"{where}: the code of edit {codes[0].name!r} is interPlan's",
-            hint='write profile = "interplan" at the top of the file',
-        )
+        what = f"{where}: the code of edit {codes[0].name!r} is interPlan's"
+        raise ConfigError(what, hint='write profile = "interplan" at the top of the file')
     return EditSet(str(table.get("name", name)), profile, edits)
 
 

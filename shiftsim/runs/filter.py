@@ -130,10 +130,8 @@ def read_filter_results(store: str | Path, store_hash: str) -> FilterResults | N
         return None
     found = _read(path)
     if found.conditions.get("store") != store_hash:
-        raise DataError(
-            f"{found.path}: the verdicts are of another content of the store",
-            hint=f"shiftsim filter {path}, or --all to use every scenario",
-        )
+        what = f"{found.path}: the verdicts are of another content of the store"
+        raise DataError(what, hint=f"shiftsim filter {path}, or --all to use every scenario")
     return found
 
 

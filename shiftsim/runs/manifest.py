@@ -127,17 +127,14 @@ def check_target(folder: Path, fingerprint: dict[str, Any], *, shard: str = "") 
     try:
         state = state_of(folder)
     except (DataError, KeyError) as error:
-        raise ConfigError(
-            f"{str(folder)!r} exists and is not a run folder", hint="choose another --out"
-        ) from error
+        what = f"{str(folder)!r} exists and is not a run folder"
+        raise ConfigError(what, hint="choose another --out") from error
     if state == "new":
         return state
     differs = difference(read_manifest(folder), fingerprint, shard)
     if differs:
-        raise ConfigError(
-            f"{str(folder)!r} holds another run: {differs}",
-            hint="choose another --out, or remove that folder",
-        )
+        what = f"{str(folder)!r} holds another run: {differs}"
+        raise ConfigError(what, hint="choose another --out, or remove that folder")
     return state
 
 
@@ -160,7 +157,5 @@ def check_resumable(folder: Path, fingerprint: dict[str, Any], *, shard: str = "
         except (DataError, KeyError):
             continue
         differs = difference(manifest, fingerprint, shard)
-        raise ConfigError(
-            f"no unfinished run with these settings; {str(other)!r} is another one: {differs}",
-            hint="give its settings, or leave out --resume to begin anew",
-        )
+        what = f"no unfinished run with these settings; {str(other)!r} is another one: {differs}"
+        raise ConfigError(what, hint="give its settings, or leave out --resume to begin anew")

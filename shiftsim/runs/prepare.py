@@ -156,10 +156,8 @@ def _traffic(config: RunConfig) -> tuple[RunPlanner | None, dict[str, Any], bool
     try:
         model = make_traffic(config.traffic, config.device)
     except (ImportError, AttributeError, TypeError) as error:
-        raise ConfigError(
-            f"traffic {config.traffic!r} is not available: {error}",
-            hint="use --traffic nonreactive",
-        ) from error
+        what = f"traffic {config.traffic!r} is not available: {error}"
+        raise ConfigError(what, hint="use --traffic nonreactive") from error
     fingerprint = getattr(model, "fingerprint", None)
     in_batches = isinstance(model, BatchTraffic) and config.batch_size > 1
     return None, {"traffic_made_of": dict(fingerprint)} if fingerprint else {}, in_batches
@@ -189,10 +187,8 @@ def _planners(config: RunConfig, given: Sequence[Any]) -> list[RunPlanner]:
         isolated = _isolated(config, source, arguments) if isolates else source
         entry = registry.run_planner(isolated, arguments, name)
         if size and not entry.in_batches:
-            raise ConfigError(
-                f"planner {name!r} takes no batch_size: it answers for one scenario at a time",
-                hint="leave it out",
-            )
+            what = f"planner {name!r} takes no batch_size: it answers for one scenario at a time"
+            raise ConfigError(what, hint="leave it out")
         if size:
             entry.batch_size, entry.fingerprint = size, {**entry.fingerprint, "batch_size": size}
         entries.append(entry)
@@ -244,10 +240,8 @@ def _checkpoints(config: RunConfig, takers: Sequence[str]) -> dict[str, str]:
         if not equals or name not in labels:
             name, path = (takers[0], text) if len(takers) == 1 else ("", text)
         if not name and not takers:
-            raise ConfigError(
-                f"checkpoint {text!r}: {', '.join(labels)} takes none",
-                hint="leave --checkpoint out",
-            )
+            what = f"checkpoint {text!r}: {', '.join(labels)} takes none"
+            raise ConfigError(what, hint="leave --checkpoint out")
         if not name:
             raise ConfigError(
                 f"checkpoint {text!r} does not say which planner is meant",
@@ -266,10 +260,8 @@ def _check_folder(config: RunConfig, folder: Path, fingerprint: dict[str, Any]) 
         if before == "new" and not config.out:
             check_resumable(folder, fingerprint, shard=config.shard)
     elif before == "unfinished":
-        raise ConfigError(
-            f"{str(folder)!r} holds an unfinished run with these settings",
-            hint="--resume finishes it; remove the folder to begin anew",
-        )
+        what = f"{str(folder)!r} holds an unfinished run with these settings"
+        raise ConfigError(what, hint="--resume finishes it; remove the folder to begin anew")
     return before
 
 

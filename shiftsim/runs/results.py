@@ -46,10 +46,8 @@ class Run:
             one_of(f"run {self.path.name!r}: planner", name, config["planners"])
         new = {name: labels.get(name, name) for name in config["planners"]}
         if len({*new.values()}) < len(new):
-            raise ConfigError(
-                f"run {self.path.name!r}: two planners would be called the same",
-                hint=f"its planners: {', '.join(new)}",
-            )
+            what = f"run {self.path.name!r}: two planners would be called the same"
+            raise ConfigError(what, hint=f"its planners: {', '.join(new)}")
         given = (text.partition("=") for text in config.get("checkpoints", ()))
         config = config | {
             "planners": [*new.values()],
@@ -110,10 +108,8 @@ class Run:
         """One stored rollout as it lies on disk, a row per sample; or a DataError."""
         location = self.rollout_places.get(task)
         if location is None:
-            raise DataError(
-                f"run {self.path.name!r} holds no rollout of {describe(task)}",
-                hint="run again with --save-rollouts all",
-            )
+            what = f"run {self.path.name!r} holds no rollout of {describe(task)}"
+            raise DataError(what, hint="run again with --save-rollouts all")
         return self._reader.read(location)
 
     @cached_property
@@ -140,10 +136,8 @@ def open_run(path: str | Path) -> Run:
         raise ConfigError(f"no run folder {str(folder)!r}", hint)
     manifest = read_manifest(folder)
     if manifest["state"] == "running":
-        raise DataError(
-            f"run {str(folder)!r} is not finished, or still under way",
-            hint="the command that started it, with --resume, finishes it",
-        )
+        what = f"run {str(folder)!r} is not finished, or still under way"
+        raise DataError(what, hint="the command that started it, with --resume, finishes it")
     return Run(folder, manifest)
 
 
@@ -180,15 +174,11 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         manifest: dict[str, Any] = json.loads(path.read_text("utf-8"))
         version, _ = manifest["format"], manifest["state"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise DataError(
-            f"{str(folder)!r} is not a run folder: manifest.json is missing or broken",
-            hint="name a folder that `shiftsim run` wrote",
-        ) from error
+        what = f"{str(folder)!r} is not a run folder: manifest.json is missing or broken"
+        raise DataError(what, hint="name a folder that `shiftsim run` wrote") from error
     if version != FORMAT_VERSION:
-        raise DataError(
-            f"{str(path)!r} has format {version!r}, this version reads {FORMAT_VERSION}",
-            hint=f"python tools/upgrade.py {folder}, or make the run again",
-        )
+        what = f"{str(path)!r} has format {version!r}, this version reads {FORMAT_VERSION}"
+        raise DataError(what, hint=f"python tools/upgrade.py {folder}, or make the run again")
     counts = {"counts.ok": int, "counts.expected": int} if manifest["state"] == "finished" else {}
     for key, kind in {**_MANIFEST, **counts}.items():
         value: Any = manifest

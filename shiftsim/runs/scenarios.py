@@ -53,17 +53,13 @@ def _recorded(run: Run, store: str | None) -> ScenarioStore:
             )
         found = open_store(place)
     elif not (path := store_path(place)).exists():
-        raise DataError(
-            f"the store of run {run.path.name!r} is not at {str(path)!r}",
-            hint=f"say where it is with --store; or, where it is, {_REMEDY}",
-        )
+        what = f"the store of run {run.path.name!r} is not at {str(path)!r}"
+        raise DataError(what, hint=f"say where it is with --store; or, where it is, {_REMEDY}")
     else:
         found = open_store(path)
     if found.hash != wanted:
-        raise DataError(
-            f"store {str(found.path)!r} is not the one run {run.path.name!r} was made with",
-            hint="name the right one with --store, or run again",
-        )
+        what = f"store {str(found.path)!r} is not the one run {run.path.name!r} was made with"
+        raise DataError(what, hint="name the right one with --store, or run again")
     found.hash = recorded
     return found
 
@@ -174,10 +170,8 @@ def select_scenarios(
     if not config.allow_partial:
         require_scenarios(split.name, tokens, config.store, held)
     if len(missing) == len(tokens):
-        raise DataError(
-            f"split {split.name!r}: store {config.store!r} holds none of its scenarios",
-            hint="name the store that was converted for this split",
-        )
+        what = f"split {split.name!r}: store {config.store!r} holds none of its scenarios"
+        raise DataError(what, hint="name the store that was converted for this split")
     fingerprint["tokens"] = token_hash(tokens)
     if store.is_reviewed and store.reviews.hash:
         fingerprint["review"] = store.reviews.hash
@@ -266,9 +260,8 @@ def read_split(path: Path) -> Split:
         try:
             listed = path.read_text("utf-8").split()
         except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(
-                f"cannot read split {str(path)!r}: {error}", hint="check the path"
-            ) from error
+            what = f"cannot read split {str(path)!r}: {error}"
+            raise ConfigError(what, hint="check the path") from error
     if not isinstance(listed, list) or not listed or not all(isinstance(t, str) for t in listed):
         raise ConfigError(f"split {str(path)!r} lists no tokens", hint='write tokens = ["…", "…"]')
     split = Split(str(table.get("name", path.stem)), tuple(listed))
@@ -278,10 +271,8 @@ def read_split(path: Path) -> Split:
     actual = {"count": len(listed), "hash": split.hash}
     for name, value in actual.items():
         if table.get(name, value) != value:
-            raise ConfigError(
-                f"split {str(path)!r} says {name} = {table[name]!r}, but it is {value!r}",
-                hint="the file was edited or cut off; fetch or write it again",
-            )
+            what = f"split {str(path)!r} says {name} = {table[name]!r}, but it is {value!r}"
+            raise ConfigError(what, hint="the file was edited or cut off; fetch or write it again")
     return split
 
 

@@ -207,9 +207,8 @@ class Pool:
                 return Outcome(worker.task, None, death)
             self.failed_starts += 1
             if self.failed_starts >= _MAX_START_FAILURES:
-                raise ConfigError(
-                    f"workers cannot start: {death}", hint="run with --workers 1 to see why"
-                ) from end
+                what = f"workers cannot start: {death}"
+                raise ConfigError(what, hint="run with --workers 1 to see why") from end
             return None
         worker.state, worker.deadline = "idle", inf
         self.failed_starts = 0

@@ -108,10 +108,8 @@ def _challenge(path: Path, mode: str | None) -> str:
             if part.startswith(name):
                 return challenge
     if mode is None:
-        raise DataError(
-            f"{path}: its name says neither {' nor '.join(_CHALLENGES)}",
-            hint="say what was simulated: --mode NR or --mode R",
-        )
+        what = f"{path}: its name says neither {' nor '.join(_CHALLENGES)}"
+        raise DataError(what, hint="say what was simulated: --mode NR or --mode R")
     return mode
 
 

@@ -79,10 +79,8 @@ class Gallery:
         self._rollouts: dict[Task, _Rollout] = {}
         for run, name in zip(runs, _names(runs), strict=True):
             if store is not None and run.manifest["determining"]["store"] != store.hash:
-                raise DataError(
-                    f"run {run.path.name!r} was made with another store than {str(store.path)!r}",
-                    hint="name the store that its manifest.json names",
-                )
+                what = f"run {run.path.name!r} was made with another store than {str(store.path)!r}"
+                raise DataError(what, hint="name the store that its manifest.json names")
             tables = (run.scores, run.metrics, run.tasks.select(_ENDS))
             scores, metrics, ends = map(words.rows_by_task, tables)
             for key, place in run.rollout_places.items():
@@ -143,10 +141,8 @@ class Gallery:
             there = zip(*sorted(t for t in tasks if self._rollouts[t].is_drawable), strict=True)
             names = zip(("planners", "noise", "seeds"), there, strict=False)
             available = (f"{n}: {', '.join(map(str, dict.fromkeys(v)))}" for n, v in names)
-            raise ConfigError(
-                f"scenario {token!r} has no stored rollout with {self.choice}",
-                hint="; ".join(available) or "--save-rollouts all keeps them",
-            )
+            what = f"scenario {token!r} has no stored rollout with {self.choice}"
+            raise ConfigError(what, hint="; ".join(available) or "--save-rollouts all keeps them")
         return found[part]
 
     def shown(

@@ -34,10 +34,8 @@ def find_fork(scenario: Scenario, item: ShownRollout, manifest: Mapping[str, Any
     """The fork of a rollout, by planners of its run; None where it hits nothing at fault."""
     made_with = manifest["determining"]
     if made_with["controller"] != "lqr":
-        raise ConfigError(
-            f"a fork repeats commands, and controller {made_with['controller']!r} has none",
-            hint="run with --controller lqr",
-        )
+        what = f"a fork repeats commands, and controller {made_with['controller']!r} has none"
+        raise ConfigError(what, hint="run with --controller lqr")
     first = next((row for row in item.metrics if row["metric"] == COLLISIONS), None)
     if first is None or first["first_violation_iteration"] is None:
         return None

@@ -54,10 +54,8 @@ def save_figure(
         MissingExtraError: matplotlib, or for mp4 ffmpeg, is missing.
     """
     if path.suffix.lower() not in STILLS + FILMS:
-        raise ConfigError(
-            f"{str(path)!r} ends in {path.suffix!r}",
-            hint=f"pictures: {' '.join(STILLS)}; films: {' '.join(FILMS)}",
-        )
+        what = f"{str(path)!r} ends in {path.suffix!r}"
+        raise ConfigError(what, hint=f"pictures: {' '.join(STILLS)}; films: {' '.join(FILMS)}")
     if not 0.1 <= speed <= 100.0:
         raise ConfigError(f"speed {speed:g} is not within 0.1 … 100", hint="--speed 2")
     path.parent.mkdir(parents=True, exist_ok=True)

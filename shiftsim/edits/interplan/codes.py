@@ -35,9 +35,8 @@ def parse_code(code: str) -> dict[str, Any]:
         if not value:
             raise ConfigError(f"code {code!r}: letter {letter!r} has no value")
         if letter not in LETTERS:
-            raise ConfigError(
-                f"code {code!r}: letter {letter!r} unknown", f"there are: {', '.join(LETTERS)}"
-            )
+            what = f"code {code!r}: letter {letter!r} unknown"
+            raise ConfigError(what, f"there are: {', '.join(LETTERS)}")
         if letter == "a" and not value.isdigit():
             raise ConfigError(f"code {code!r}: share {value!r} is no digit")
         out[LETTERS[letter]] = int(value) if letter == "a" else value

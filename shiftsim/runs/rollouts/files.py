@@ -137,10 +137,8 @@ def complete_rollout(
     if scenario.script is not None and scenario.script.termination is not None:
         samples = samples[: len(time_us)]  # it may have ended before its time
     if not np.array_equal(time_us, scenario.time_us[samples]):
-        raise DataError(
-            f"scenario {scenario.token!r} in the store is not the one that was driven",
-            hint="use the store that the manifest names",
-        )
+        what = f"scenario {scenario.token!r} in the store is not the one that was driven"
+        raise DataError(what, hint="use the store that the manifest names")
     ego = stack(rows, EGO_COLUMNS)
     where = f"the rollout of scenario {scenario.token!r}"
     require(RUN, "state", ego, f"{where}: an ego")
@@ -377,9 +375,8 @@ def _keys(rollouts: list[tuple[Task, pa.RecordBatch]]) -> list[pa.Array]:
 def part_file(folder: Path, name: str) -> Path:
     """The file of rollouts in a folder that a table or a journal names, or a DataError."""
     if not _PART.fullmatch(name):
-        raise DataError(
-            f"{str(folder)!r}: {name!r} is no file of rollouts", hint="make the run again"
-        )
+        what = f"{str(folder)!r}: {name!r} is no file of rollouts"
+        raise DataError(what, hint="make the run again")
     return folder / name
 
 
