@@ -255,10 +255,6 @@ class OpenedRuns(NamedTuple):
     own: list[KnownSet]  # lists of scenarios that benchmarks name
     tracks: list[Track]  # of the benchmarks
 
-    def coverage(self, groups: Sequence[Group]) -> list[Table]:
-        """The tables that only a benchmark has."""
-        return [coverage(track, groups) for track in dict.fromkeys(self.tracks)]
-
     def groups(self, *, allow_partial: bool = False) -> list[Group]:
         """The scores by planner and noise."""
         known = (*known_sets(), *self.own)
@@ -268,12 +264,8 @@ class OpenedRuns(NamedTuple):
         self, options: build.Options, *, with_coverage: bool = False, allow_partial: bool = False
     ) -> list[Table]:
         """The tables that are asked for, also those that only a benchmark has if wanted."""
-        return self._tables(self.groups(allow_partial=allow_partial), options, with_coverage)
-
-    def _tables(
-        self, groups: Sequence[Group], options: build.Options, with_coverage: bool
-    ) -> list[Table]:
-        own = self.coverage(groups) if with_coverage else []
+        groups, tracks = self.groups(allow_partial=allow_partial), dict.fromkeys(self.tracks)
+        own = [coverage(track, groups) for track in tracks if with_coverage]
         return [*own, *build.make_tables(groups, published_figures(), options)]
 
     def report(
@@ -293,8 +285,8 @@ class OpenedRuns(NamedTuple):
         for name in formats:
             one_of("format", name, FORMATS)
         is_whole = options.tables == tuple(build.TABLES)
+        tables = self.tables(options, with_coverage=is_whole, allow_partial=allow_partial)
         groups = self.groups(allow_partial=allow_partial)
-        tables = self._tables(groups, options, is_whole)
         drawn = figures(groups, form=form) if pictures or pages else []
         title = title or f"Report on {', '.join(run.path.name for run in self.runs)}"
         if not pages:

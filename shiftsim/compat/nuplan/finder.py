@@ -5,6 +5,7 @@ import logging
 import re
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
@@ -120,14 +121,9 @@ def install() -> bool:
     """Make `import nuplan…` work in this process, and return whether the shims are used."""
     if any(isinstance(finder, ShimFinder) for finder in sys.meta_path):
         return True
-    try:
-        if (
-            importlib.util.find_spec("nuplan.planning.simulation.planner.abstract_planner")
-            is not None
-        ):
+    with suppress(ModuleNotFoundError):
+        if importlib.util.find_spec("nuplan.planning.simulation.planner.abstract_planner"):
             return False
-    except ModuleNotFoundError:
-        pass
     # a folder named nuplan, of data for instance, counts as an empty package: drop it
     for name in [name for name in sys.modules if name.partition(".")[0] == "nuplan"]:
         del sys.modules[name]
