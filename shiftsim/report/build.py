@@ -18,6 +18,7 @@ from shiftsim.report.groups import Group, planner_identities
 from shiftsim.report.paper import Published
 from shiftsim.report.scores import planner_notes, scores
 from shiftsim.report.tables import ENDINGS, FORMATS, Table, latex_picture, markdown_escape, render
+from shiftsim.runs.config import named_checkpoint
 from shiftsim.runs.results import Run
 
 _HASH = 12  # characters shown of a hash
@@ -66,7 +67,7 @@ def make_tables(
 ) -> list[Table]:
     """The tables of a report; beside published figures no weights that nobody asked for."""
     chosen = options or Options()
-    left_out = [group for group in groups if chosen.with_published and _has_default_weights(group)]
+    left_out = [group for group in groups if chosen.with_published and _is_unasked(group)]
     weights = {f"{group.name}, {group.weights}" for group in left_out}
     default_weights = "; ".join(sorted(weights))
     groups = [group for group in groups if group not in left_out]
@@ -89,13 +90,10 @@ def make_tables(
     return out
 
 
-def _has_default_weights(group: Group) -> bool:
+def _is_unasked(group: Group) -> bool:
     """Whether a planner drove with weights of our own that nobody asked for by `--checkpoint`."""
     config = group.run.manifest["config"]
-    given = [text.partition("=") for text in config.get("checkpoints", ())]
-    named = any(not equals or owner == group.name for owner, equals, _ in given)
-    named = named or "checkpoint" in config.get("planner_args", {}).get(group.name, {})
-    return bool(group.weights) and not named
+    return bool(group.weights) and not named_checkpoint(config, group.name)
 
 
 def _makers(

@@ -19,6 +19,7 @@ from shiftsim.errors import DataError, one_of
 from shiftsim.kernels import BoolArray, FloatArray
 from shiftsim.metrics import SHORT_NAMES
 from shiftsim.report.tables import Number
+from shiftsim.runs.config import named_checkpoint
 from shiftsim.runs.results import Run
 from shiftsim.sim.perception import drift_order
 from shiftsim.world.scenario import FULL_DURATION
@@ -291,11 +292,8 @@ def _planner_facts(group: Group) -> dict[str, Any]:
     out |= {k: PurePath(str(v)).name for k, v in identity.get("arguments", {}).items()}
     out |= {"batch size": identity["batch_size"]} if "batch_size" in identity else {}
     if "checkpoint" in identity:
-        others = {*config["planners"]} - {group.name}
-        given = [t for t in config.get("checkpoints", ()) if t.partition("=")[0] not in others]
-        given += [config.get("planner_args", {}).get(group.name, {}).get("checkpoint")]
-        found = given[0] or ("shiftsim" if identity.get("weights") else "official")
-        out["checkpoint"] = PurePath(found.removeprefix(f"{group.name}=")).name
+        shipped = "shiftsim" if identity.get("weights") else "official"
+        out["checkpoint"] = PurePath(named_checkpoint(config, group.name) or shipped).name
     return out
 
 

@@ -216,6 +216,14 @@ def split_label(planner: str) -> tuple[str, str]:
     return label, source
 
 
+def named_checkpoint(config: Mapping[str, Any], planner: str) -> str:
+    """The checkpoint that settings in a manifest name for a planner; empty where they do not."""
+    others = {*config["planners"]} - {planner}
+    given = [t for t in config.get("checkpoints", ()) if t.partition("=")[0] not in others]
+    given += [config.get("planner_args", {}).get(planner, {}).get("checkpoint", "")]
+    return str(given[0]).removeprefix(f"{planner}=")
+
+
 def parse_argument(text: str, planners: tuple[str, ...]) -> tuple[str, str, Value]:
     """Label, name and value, of TOML or text, of `key=value`, or `label.key=value` of several."""
     planners = tuple(split_label(planner)[0] for planner in planners)

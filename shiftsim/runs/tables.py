@@ -16,13 +16,12 @@ import pyarrow.parquet as pq
 
 from shiftsim.metrics import SHORT_NAMES
 from shiftsim.runs.rollouts import Task, damaged, describe
-from shiftsim.runs.rollouts.files import FOLDER, RolloutLocation, part_file
+from shiftsim.runs.rollouts.files import FOLDER, KEY, RolloutLocation, part_file
 from shiftsim.world.ranges import RUN, require
 
 OK, FAILED, TIMEOUT, MISSING = STATUSES = ("ok", "failed", "timeout", "missing")
 
 _TEXT, _NUMBER, _INTEGER = pa.string(), pa.float64(), pa.int64()
-_KEY = {"planner": _TEXT, "noise": _TEXT, "seed": _INTEGER, "token": _TEXT}
 _PROFILE = {"thresholds": _TEXT, "metric_version": _TEXT}
 _TEXTS = ("scenario_type", "status", "error", "hint", "traceback")
 _DURATIONS = (
@@ -37,11 +36,11 @@ _DURATIONS = (
 LOCATION = {"rollout": _TEXT, "rollout_row": _INTEGER, "rollout_rows": _INTEGER}
 TABLES = {
     "tasks": pa.schema(
-        _KEY | dict.fromkeys(_TEXTS, _TEXT) | dict.fromkeys(_DURATIONS, _NUMBER) | LOCATION
+        KEY | dict.fromkeys(_TEXTS, _TEXT) | dict.fromkeys(_DURATIONS, _NUMBER) | LOCATION
     ),
     "scores": pa.schema(
         {
-            **_KEY,
+            **KEY,
             **dict.fromkeys(("scenario_type", "city", "log_name", "traffic"), _TEXT),
             "duration_class": _TEXT,
             "cls": _NUMBER,
@@ -52,7 +51,7 @@ TABLES = {
     ),
     "metrics": pa.schema(
         {
-            **_KEY,
+            **KEY,
             "metric": _TEXT,
             "value": _NUMBER,
             "unit": _TEXT,

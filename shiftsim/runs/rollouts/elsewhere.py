@@ -23,7 +23,7 @@ from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.metrics import MetricResult, Thresholds, compute_metrics
 from shiftsim.metrics.score import without
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.rollouts.files import KINDS, SEEN, STATES, TRACKS, stack
+from shiftsim.runs.rollouts.files import KEY, KINDS, SEEN, STATES, TRACKS, stack
 from shiftsim.runs.rollouts.poses import NEED_BOXES, POINTS, REAR_AXLE, Boxes, Driven, rollout_of
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.scenario import Scenario
@@ -35,10 +35,9 @@ _SAME = {  # other names of columns, those of our own rollouts among them
     **{"yaw_acceleration": "yaw_accel", "planning_seconds": "seconds", "scenario": "token"},
     **{"length_m": "length", "width_m": "width"},
 }
-_KEY = {"planner": pa.string(), "noise": pa.string(), "seed": pa.int64(), "token": pa.string()}
 _TIMES, _POSE = {"time_us": 1.0, "time_s": 1e6}, ("x", "y", "heading")
 _BOX = (*STATE_COLUMNS[:5], "length", "width")
-_KNOWN = {*_KEY, *_TIMES, *STATE_COLUMNS, *_BOX, "seconds", "track_token", "type"}
+_KNOWN = {*KEY, *_TIMES, *STATE_COLUMNS, *_BOX, "seconds", "track_token", "type"}
 _KNOWN |= {*STATES.names, *TRACKS.names, *SEEN.names, KINDS, "iteration"}  # of rollouts of our own
 _EGO = -2  # in place of an AgentKind
 _TEXTS = dict.fromkeys(
@@ -282,8 +281,8 @@ def _times(table: pa.Table, where: str) -> IntArray:
 
 def _groups(table: pa.Table, where: str) -> dict[tuple[tuple[str, Any], ...], IntArray]:
     """The rows of each rollout, by the names and values of the key columns there are."""
-    names = [name for name in _KEY if name in table.column_names]
-    columns = {name: _column(table, name, _KEY[name], where) for name in names}
+    names = [name for name in KEY if name in table.column_names]
+    columns = {name: _column(table, name, KEY[name], where) for name in names}
     numbered = pa.table(columns | {"row": np.arange(len(table))})
     found = numbered.group_by(names, use_threads=False).aggregate([("row", "list")])
     keys = zip(*(found[name].to_pylist() for name in names), strict=True)
@@ -297,7 +296,7 @@ def _nested(table: pa.Table) -> pa.Table:
     """The boxes in rollouts as a run stores them, a row per box."""
     tokens = table[TRACKS.names[0]].combine_chunks()
     owner = np.repeat(np.arange(len(table)), tokens.value_lengths().to_numpy())
-    kept = [name for name in (*_KEY, "time_us") if name in table.column_names]
+    kept = [name for name in (*KEY, "time_us") if name in table.column_names]
     columns = {name: table[name].take(pa.array(owner)) for name in kept}
     nested = {"track_token": TRACKS.names[0], "type": KINDS, **{n: f"track_{n}" for n in BOX}}
     for name, of in nested.items():

@@ -261,13 +261,8 @@ def stack(rows: pa.RecordBatch, names: Iterable[str]) -> np.ndarray:
 FOLDER = "rollouts"
 _PART = re.compile(r"part-(\d+)\.parquet")
 _GROUP, _FILE = 16, 1024  # rollouts of a row group and of a file
-_KINDS = {"planner": pa.string(), "noise": pa.string(), "seed": pa.int64(), "token": pa.string()}
-_KEY = pa.schema(
-    [
-        pa.field(name, kind, nullable=False)
-        for name, kind in (_KINDS | {"iteration": pa.int64()}).items()
-    ]
-)
+KEY = {"planner": pa.string(), "noise": pa.string(), "seed": pa.int64(), "token": pa.string()}
+_KEY = _schema(KEY | {"iteration": pa.int64()})
 
 
 class RolloutLocation(NamedTuple):
@@ -367,7 +362,7 @@ def _keys(rollouts: list[tuple[Task, pa.RecordBatch]]) -> list[pa.Array]:
     owner = pa.array(np.repeat(np.arange(len(rollouts)), lengths))
     columns = [
         pa.array([getattr(task, name) for task, _ in rollouts], kind).take(owner)
-        for name, kind in _KINDS.items()
+        for name, kind in KEY.items()
     ]
     return [*columns, pa.array(np.concatenate([np.arange(length) for length in lengths]))]
 
