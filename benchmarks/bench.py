@@ -27,7 +27,7 @@ from shiftsim.report.groups import Group, KnownSet, read_groups, token_digest
 from shiftsim.report.palette import DEFAULT_FORM, FigureFormat
 from shiftsim.report.tables import FORMATS, Table
 from shiftsim.runs.avoidable import grade
-from shiftsim.runs.config import DRIFT, default_workers, make_config
+from shiftsim.runs.config import DRIFT, make_config
 from shiftsim.runs.edited import EditSet, edits_text, make_edits
 from shiftsim.runs.execute import Progress, execute
 from shiftsim.runs.filter import filter_store
@@ -119,7 +119,7 @@ def plan_bench(
 def _plan_towns(track: Track, values: Mapping[str, Any], modes: Sequence[str], out: str) -> Plan:
     """The plan of a track in generated towns, which are made here where they are not there."""
     workers = int(values.get("workers") or 0)
-    spread = partial(map_unordered, workers=workers or default_workers(), alone=1)
+    spread = partial(map_unordered, workers=workers, alone=1)
     sets = {}
     for asked in track.towns:
         place = store_path(f"{track.name}-{asked.domain}")

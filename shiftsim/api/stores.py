@@ -196,10 +196,9 @@ def convert_reader(
         ConversionError: None of the recordings can be converted.
     """
     from shiftsim.data.readers.convert import convert
-    from shiftsim.runs.config import default_workers
     from shiftsim.runs.workers import map_unordered
 
-    executor = partial(map_unordered, workers=workers or default_workers())
+    executor = partial(map_unordered, workers=workers)
     return convert(reader, store_path(store), progress=on_progress, executor=executor)
 
 
@@ -245,11 +244,9 @@ def make_towns(
         ```
     """
     from shiftsim.data.synthetic.store import write_towns
-    from shiftsim.runs.config import default_workers
     from shiftsim.runs.workers import map_unordered
 
-    count = min(workers or default_workers(), towns)
-    spread = partial(map_unordered, workers=count, alone=1)
+    spread = partial(map_unordered, workers=workers, alone=1)
     folder = store_path(store)
     return write_towns(
         folder, towns=towns, seed=seed, domain=domain, spread=spread, progress=on_progress

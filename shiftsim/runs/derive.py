@@ -15,7 +15,7 @@ from shiftsim.data.store.tables import digest
 from shiftsim.errors import ConfigError, DataError, one_of
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.metrics.open_loop import NAMES as OPEN_LOOP
-from shiftsim.runs.config import RunConfig, default_workers, make_config, parse_shard
+from shiftsim.runs.config import RunConfig, make_config, parse_shard
 from shiftsim.runs.edited import make_edits
 from shiftsim.runs.execute import ALONE, OnProgress, Progress
 from shiftsim.runs.folder import RunWriter
@@ -220,7 +220,7 @@ def _scored(
     outcomes = map_unordered(
         partial(_attempting, make),
         entries,
-        workers=min(workers or default_workers(), len(entries)),
+        workers=workers,
         alone=1,
         group=lambda entry: entry.task.token,
     )

@@ -22,7 +22,6 @@ from shiftsim.data.store.tables import Table, digest, write_blocks
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.files import safe_join
 from shiftsim.metrics import METRIC_VERSION, MetricResult, compute_metrics, thresholds_of
-from shiftsim.runs.config import default_workers
 from shiftsim.runs.journal import Journal
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.tables import TaskResult
@@ -196,7 +195,6 @@ def filter_store(
     path, config = Path(store), config or FilterConfig()
     opened = open_store(path)
     conditions = _conditions(config, opened.hash, opened.reviews.route_hash)
-    number = max(1, min(workers or default_workers(), len(opened)))
     unfinished = safe_join(path, _UNFINISHED)
     unfinished.parent.mkdir(exist_ok=True)
     journal = Journal(unfinished, keep=True)
@@ -212,7 +210,7 @@ def filter_store(
         waiting = [token for token in opened.tokens if token not in done]
         on_progress(len(done), len(opened))
         make = partial(_judge, path.resolve(), config)
-        with closing(map_unordered(make, waiting, workers=number, alone=1)) as outcomes:
+        with closing(map_unordered(make, waiting, workers=workers, alone=1)) as outcomes:
             for outcome in outcomes:
                 row = outcome.result or _failed(outcome.task, outcome.death)
                 journal.put(f"{conditions['hash']} {outcome.task}", row)

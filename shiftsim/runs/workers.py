@@ -23,6 +23,7 @@ from uuid import uuid4
 from shiftsim.errors import ConfigError, import_extra
 from shiftsim.kernels import machine_code
 from shiftsim.processes import Process, ProcessEndedError, close, packed, start
+from shiftsim.runs.config import default_workers
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -52,7 +53,7 @@ def map_unordered(
     make: MakeFunction[T, R],
     tasks: Iterable[T],
     *,
-    workers: int,
+    workers: int = 0,
     alone: int = 0,
     limit: float = 0.0,
     in_batches: bool = False,
@@ -64,7 +65,7 @@ def map_unordered(
         make: Called once per worker; returns the function, whose `close` is called at the end. It,
             tasks and results must pickle, but for a single worker, this process, without a limit.
         tasks: The tasks.
-        workers: Number of worker processes.
+        workers: Number of worker processes, no more than tasks; 0 chooses from the cores.
         alone: So many leading tasks are done one by one, so that kernels are compiled once.
         limit: Time per task or part of a batch [s]; 0 for any. Loading, compiling do not count.
         in_batches: Whether tasks are tuples of several; those of a dead worker are done one by one.
@@ -72,6 +73,8 @@ def map_unordered(
 
     Yields an outcome per task, or per part of such a batch. ConfigError: workers cannot be started.
     """
+    tasks = list(tasks)
+    workers = min(workers or default_workers(), len(tasks))
     if workers <= 1 and not limit:
         function = make()
         try:

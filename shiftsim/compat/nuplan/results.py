@@ -29,7 +29,6 @@ from shiftsim.errors import ConfigError, DataError
 from shiftsim.files import atomic_write, safe_join
 from shiftsim.metrics import evaluate, measure
 from shiftsim.metrics.score import closed_loop_score, nuplan_columns
-from shiftsim.runs.config import default_workers
 from shiftsim.runs.derive import tasks_with_rollouts
 from shiftsim.runs.results import Run, open_run
 from shiftsim.runs.rollouts import Task, describe
@@ -81,8 +80,7 @@ def export_results(
     places = (Path(place).expanduser().resolve() for place in (logs, maps))
     written_to = folders if simulation_logs else {}
     exporter = partial(_exporter, run.path.resolve(), opened, written_to, *places)
-    number = min(workers or default_workers(), len(tasks))
-    with closing(map_unordered(exporter, tasks, workers=number, alone=1)) as outcomes:
+    with closing(map_unordered(exporter, tasks, workers=workers, alone=1)) as outcomes:
         for outcome in outcomes:
             result = outcome.result or TaskResult(outcome.task, FAILED, error=outcome.death)
             if isinstance(result, TaskResult):
