@@ -28,7 +28,7 @@ from shiftsim.data.store.schema import BOX, EGO_COLUMNS, list_of
 from shiftsim.data.store.tables import write_blocks
 from shiftsim.errors import DataError
 from shiftsim.runs.rollouts import Task, damaged
-from shiftsim.sim.log import NUM_KEPT, Seen, SimulationLog
+from shiftsim.sim.log import NUM_KEPT, Seen, SimulationLog, as_recorded
 from shiftsim.sim.noise import sample_noise
 from shiftsim.sim.perception import noise_of
 from shiftsim.world.ranges import RUN, require
@@ -133,16 +133,15 @@ def complete_rollout(
     if is_partial:
         shown = scenario.iteration_rows[: len(time_us) + 1]
         scenario = replace(scenario, iteration_rows=shown)
-    samples = scenario.iteration_rows[:-1]
-    if scenario.script is not None and scenario.script.termination is not None:
-        samples = samples[: len(time_us)]  # it may have ended before its time
-    if not np.array_equal(time_us, scenario.time_us[samples]):
+    log, may_end = as_recorded(scenario), scenario.script and scenario.script.termination
+    samples = slice(len(time_us) if may_end else None)  # it may have ended before its time
+    if not np.array_equal(time_us, log.time_us[samples]):
         what = f"scenario {scenario.token!r} in the store is not the one that was driven"
         raise DataError(what, hint="use the store that the manifest names")
     ego = stack(rows, EGO_COLUMNS)
     where = f"the rollout of scenario {scenario.token!r}"
     require(RUN, "state", ego, f"{where}: an ego")
-    tracks = scenario.tracks.rows(samples)
+    tracks = log.tracks.rows(samples)
     try:
         plans = stored_plans(rows)
         if KINDS in rows.schema.names:
@@ -157,20 +156,16 @@ def complete_rollout(
     except ValueError as error:
         raise DataError(f"{where} is damaged: {error}", hint="make the run again") from error
     if rows[NOISE_COLUMNS[0]].null_count:
-        noise = sample_noise(
-            noise_of(task.noise), seed=task.seed, token=task.token, num_steps=len(rows)
-        )
+        key: dict[str, Any] = {"seed": task.seed, "token": task.token, "num_steps": len(rows)}
+        noise = sample_noise(noise_of(task.noise), **key)
     else:
         noise = stack(rows, NOISE_COLUMNS)
-    return SimulationLog(
-        token=scenario.token,
-        time_us=scenario.time_us[samples],
+    return replace(
+        log,
+        time_us=log.time_us[samples],
         ego=ego,
         tracks=tracks,
-        traffic_lights=scenario.traffic_lights.rows(samples),
-        expert_time_us=scenario.iteration_times,
-        expert_ego=scenario.expert,
-        route=scenario.route,
+        traffic_lights=log.traffic_lights.rows(samples),
         commands=stack(rows, COMMAND_COLUMNS),
         noise=noise,
         plans=plans,
