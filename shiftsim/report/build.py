@@ -148,11 +148,7 @@ class Comparison:
 
 
 def in_format(tables: Sequence[Table], format: str) -> Any:
-    """Tables as text in a format, or for `pandas` as one DataFrame with numbers in full.
-
-    In that, `attrs["notes"]` are the notes, and a column `table` tells several tables apart. It is
-    a MissingExtraError if pandas is not installed.
-    """
+    """Tables as text in a format, or for `pandas` as one DataFrame with numbers in full."""
     one_of("format", format, (*FORMATS, "pandas"))
     if format != "pandas":
         return "\n\n".join(render(table, format) for table in tables)
@@ -178,12 +174,7 @@ def write_report(
     drawn: Sequence[Figure],
     styles: Sequence[str],
 ) -> list[Path]:
-    """Write tables and pictures to a folder, made if needed, and return the files.
-
-    There is one file per style, of `FORMATS`, and one per table for `csv`; the pictures are PNG
-    files and shown in the HTML page. LaTeX gets them as PDF files, and `cite.bib`. Files of the
-    same names are replaced.
-    """
+    """Write tables and pictures, a file per style, of CSV per table; LaTeX has PDF pictures."""
     folder.mkdir(parents=True, exist_ok=True)
     pictures = {figure.save(folder): figure.title for figure in drawn}
     cite, subtitle = citation(runs), made_of(runs)

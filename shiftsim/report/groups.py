@@ -226,13 +226,7 @@ def distinct_sets(groups: Iterable[Group]) -> list[DataSet]:
 def read_groups(
     runs: Sequence[Run], known: Sequence[KnownSet] = (), *, allow_partial: bool = False
 ) -> list[Group]:
-    """The groups of runs, in the order of runs, planners and noises.
-
-    Sets of scenarios are recognised by the published lists that are known. Planners of one name
-    that are not the same, or were run otherwise and did otherwise, say what tells them apart.
-    `allow_partial` gives labelled means of groups that are not complete. It is a DataError if runs
-    contradict each other, or hold no tasks.
-    """
+    """The groups of runs, named by what tells them apart; a DataError if they contradict."""
     found = [group for run in runs for group in _groups(run, known)]
     by_name: dict[str, list[Group]] = {}
     for group in found:

@@ -42,10 +42,7 @@ class FigureFormat(NamedTuple):
     def of(
         cls, width: float | str | None = None, *, serif: bool = False, plain: bool = False
     ) -> "FigureFormat":
-        """A format of a width [inches] that may have a unit, as in `3.5in`, `89mm` or `252pt`.
-
-        Raises ConfigError: the width is no length between 2 and 40 inches.
-        """
+        """A format of a width [inches], or with a unit as in `89mm`, or a ConfigError."""
         found = re.fullmatch(r"(\d+\.?\d*) ?(in|cm|mm|pt|)", str(width or 0))
         inches = float(found[1]) * _INCHES[found[2]] if found else 0.0
         if width is not None and not 2.0 <= inches <= 40.0:

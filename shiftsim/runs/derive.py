@@ -7,7 +7,7 @@ from contextlib import closing
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from shiftsim._version import __version__
 from shiftsim.data import open_store
@@ -31,18 +31,12 @@ from shiftsim.runs.tables import FAILED, MISSING, OK, TaskResult, stored_results
 from shiftsim.runs.task import ScenarioReader, attempt, planner_times, score_rollout
 from shiftsim.runs.workers import map_unordered
 
+Score: TypeAlias = Callable[[Entry], TaskResult]
 ELSEWHERE = "elsewhere"  # what moved ego and others, where nobody says more
 
 
 def merge_runs(runs: Sequence[Run], *, out: str | None = None, allow_partial: bool = False) -> Run:
-    """Write the run folder that shards `1/n` to `n/n` are parts of: the same bytes as without.
-
-    By default it has the name of the shards without their number. With `allow_partial` shards may
-    be missing; their tasks then are `missing`.
-
-    Raises:
-        ConfigError: Something is no shard, of another run, given twice or missing.
-    """
+    """Write the run folder that shards `1/n` to `n/n` are parts of: the same bytes as without."""
     first = runs[0].manifest
     shards = _check_shards(runs, allow_partial=allow_partial)
     name = first["run"].removesuffix(f".{first['shard'].replace('/', '-of-')}")
@@ -114,7 +108,7 @@ def _without_result(run: Run) -> Iterator[tuple[Task, str]]:
             yield Task(*key), error
 
 
-def _rescorer(path: Path, store: str, config: RunConfig) -> Callable[[Entry], TaskResult]:
+def _rescorer(path: Path, store: str, config: RunConfig) -> Score:
     """What scores one stored rollout of a run after the other."""
     run = open_run(path)
     about = run.manifest
@@ -157,14 +151,7 @@ def rescore(
     on_progress: OnProgress = lambda progress: None,
     argv: Sequence[str] = (),
 ) -> Run:
-    """Write a run folder (`runs/<id>`) as if the run had been made with other thresholds.
-
-    `metrics` are custom ones by `module:attribute`, `store` says where the store has moved,
-    `workers` of 0 chooses from the cores, `argv` is for the manifest.
-
-    Raises:
-        DataError: Rollouts are missing, or the store is another one.
-    """
+    """Write a run folder as if the run had been made with other thresholds or `metrics`."""
     run = open_run(run.path)  # with its own names
     for metric in metrics:
         load_metric(metric)
@@ -202,15 +189,13 @@ def rescore(
         return writer.finish(manifest, run.rollout_places, dict(_without_result(run)))
 
 
-def _attempting(
-    make: Callable[[], Callable[[Entry], TaskResult]],
-) -> Callable[[Entry], TaskResult]:
+def _attempting(make: Callable[[], Score]) -> Score:
     score = make()
     return lambda entry: attempt(entry.task, partial(score, entry))
 
 
 def _scored(
-    make: Callable[[], Callable[[Entry], TaskResult]],
+    make: Callable[[], Score],
     entries: Sequence[Entry],
     workers: int,
     on_progress: OnProgress,
@@ -234,7 +219,7 @@ def _scored(
 
 def _elsewhere_scorer(
     store: str, config: RunConfig, undefined: Sequence[str], given: dict[str, Any]
-) -> Callable[[Entry], TaskResult]:
+) -> Score:
     """What scores rollouts that were driven elsewhere; arguments of `rollout_of` are given."""
     scenarios = ScenarioReader(store)
 
@@ -273,15 +258,7 @@ def score_elsewhere(
     on_progress: OnProgress = lambda progress: None,
     argv: Sequence[str] = (),
 ) -> Run:
-    """Write a run folder (`runs/<id>`) with the scores of rollouts that were driven elsewhere.
-
-    `recorded` and `partial_rollouts` are as in `rollout_of`, and so is `point`, where the source
-    does not say it; `traffic` and `controller` name what moved others and ego there.
-
-    Raises:
-        ConfigError: Settings contradict the source.
-        DataError: A scenario is unknown, or none of the rollouts can be scored.
-    """
+    """Write a run folder with the scores of rollouts; arguments are labels, or of `rollout_of`."""
     if point and one_of("point", point, POINTS) != (source.point or point):
         words = f"--point {point}, but {source.name} says {source.point}"
         raise ConfigError(words, hint="leave --point out")

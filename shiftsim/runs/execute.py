@@ -48,12 +48,7 @@ OnProgress: TypeAlias = Callable[[Progress], None]
 def execute(
     plan: RunPlan, *, on_progress: OnProgress = lambda progress: None, argv: Sequence[str] = ()
 ) -> Run:
-    """Do all tasks and write the run folder; a DataError where it cannot be written.
-
-    Whatever happens, what is finished is on disk and can be resumed. An interrupt writes the tables
-    with the other tasks `missing`, and `KeyboardInterrupt` is raised again; a complete run is never
-    replaced by an incomplete one. `argv` is for the manifest.
-    """
+    """Do all tasks and write the run folder; an interrupt leaves the others missing in it."""
     try:
         if plan.config.resumes and plan.before == "complete":
             return _bundled(open_run(plan.folder), plan)

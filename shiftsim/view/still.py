@@ -47,12 +47,7 @@ def save_figure(
     speed: float = 1.0,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
-    """A picture, or a film of all samples that is so much faster, by the ending of the file's name.
-
-    Raises:
-        ConfigError: The ending, a time or the speed is none of those possible.
-        MissingExtraError: matplotlib, or for mp4 ffmpeg, is missing.
-    """
+    """A picture, or a film of all samples that is so much faster, by the ending of the file."""
     if path.suffix.lower() not in STILLS + FILMS:
         what = f"{str(path)!r} ends in {path.suffix!r}"
         raise ConfigError(what, hint=f"pictures: {' '.join(STILLS)}; films: {' '.join(FILMS)}")

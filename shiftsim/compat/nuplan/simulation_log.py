@@ -145,13 +145,7 @@ def _without_collector() -> Iterator[None]:
 def write_simulation_log(
     path: Path, task: Task, scenario: Scenario, log: SimulationLog, *, database: Path, maps: Path
 ) -> None:
-    """Write a rollout as a simulation log, packed with msgpack and xz.
-
-    Velocities of plans are derived from their poses. The planner is a stand-in: it has the name and
-    the run times, and `shiftsim` says what was run. In `database`, the recording (.db), and in the
-    folder `maps` nuPlan's tools look for the rest of the scenario. It is a ConversionError if a
-    light belongs to a connector without an integer id.
-    """
+    """Write a rollout as a simulation log; nuPlan's tools look in `database` and `maps`."""
     with _without_collector():
         planner = _DEVKIT.SimplePlanner(
             _compute_trajectory_runtimes=log.planning_seconds.tolist(),

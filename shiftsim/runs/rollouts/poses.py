@@ -82,12 +82,7 @@ def rollout_of(
     recorded: bool = False,
     partial: bool = False,
 ) -> tuple[SimulationLog, tuple[str, ...]]:
-    """The rollout that poses in a scenario are, and what a reader of its score must know.
-
-    The poses are of one of `POINTS`; `recorded`: the others did what was recorded, if no boxes are
-    given; `partial`: it may end before the scenario, and the expert then ends as well. Raises
-    DataError: something cannot be right; the message names the row.
-    """
+    """The rollout that poses in a scenario are, and remarks; a DataError names the row."""
     _check_rows(driven)
     states, remarks = np.array(driven.states), [*driven.remarks]
     if point == CENTER:
