@@ -40,9 +40,7 @@ _BOX = (*STATE_COLUMNS[:5], "length", "width")
 _KNOWN = {*KEY, *_TIMES, *STATE_COLUMNS, *_BOX, "seconds", "track_token", "type"}
 _KNOWN |= {*STATES.names, *TRACKS.names, *SEEN.names, KINDS, "iteration"}  # of rollouts of our own
 _EGO = -2  # in place of an AgentKind
-_TEXTS = dict.fromkeys(
-    ("planner", "noise", "token", "scenario", "track_token", "type"), pa.string()
-)
+_NAMES = ("planner", "noise", "token", "scenario", "track_token", "type")
 _HINT = "needed are token, time_us (or time_s from 0 on), x, y, heading; docs/score_elsewhere.md"
 _EVERY = "give it in every row"
 _BOX_HINT = f"boxes have token, time_us, track_token, type, {', '.join(_BOX)}"
@@ -184,7 +182,7 @@ def _read_table(path: Path) -> pa.Table:
         )
     try:
         if ".csv" in path.suffixes:
-            texts = pyarrow.csv.ConvertOptions(column_types=_TEXTS)
+            texts = pyarrow.csv.ConvertOptions(column_types=dict.fromkeys(_NAMES, pa.string()))
             return pyarrow.csv.read_csv(path, convert_options=texts)
         return pq.ParquetFile(path).read()
     except (OSError, pa.ArrowException) as error:
