@@ -168,13 +168,9 @@ def rescore(
     target = Path(out) if out else RUNS / run_name(config, run.manifest["split"], fingerprint)
     check_target(target, fingerprint)
     done = tasks_with_rollouts(run)
+    place = run.manifest["store"] if store is None else found.source
     manifest = make_manifest(
-        target,
-        config=config,
-        split=run.manifest["split"],
-        store=run.manifest["store"] if store is None else found.source,
-        fingerprint=fingerprint,
-        argv=argv,
+        target, config, fingerprint, split=run.manifest["split"], store=place, argv=argv
     )
     kept = ("edits", "split_size", "elsewhere")
     manifest |= {key: run.manifest[key] for key in kept if key in run.manifest}
@@ -283,7 +279,7 @@ def score_elsewhere(
     target = Path(out) if out else RUNS / run_name(config, split, fingerprint)
     is_new = check_target(target, fingerprint) == "new"
     manifest = make_manifest(
-        target, config=config, split=split, store=found.source, fingerprint=fingerprint, argv=argv
+        target, config, fingerprint, split=split, store=found.source, argv=argv
     )
     undefined = () if recorded or source.has_boxes else NEED_BOXES
     remarks, failed = Counter[str](), list[TaskResult]()

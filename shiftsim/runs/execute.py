@@ -65,12 +65,7 @@ def execute(
 def _execute(plan: RunPlan, argv: Sequence[str], on_progress: OnProgress) -> Run:
     config, selection = plan.config, plan.selection
     manifest = make_manifest(
-        plan.folder,
-        config=config,
-        split=selection.split,
-        store=plan.store,
-        fingerprint=plan.fingerprint,
-        argv=argv,
+        plan.folder, config, plan.fingerprint, split=selection.split, store=plan.store, argv=argv
     )
     manifest |= {"workers": plan.workers, "split_size": selection.size}
     if selection.edits is not None:

@@ -38,11 +38,11 @@ _NAMES = {"tokens": "scenarios", "review": "reviews"}  # in messages
 
 def make_manifest(
     folder: Path,
-    *,
     config: RunConfig,
+    fingerprint: Any,
+    *,
     split: str,
     store: str,
-    fingerprint: dict[str, Any],
     argv: Sequence[str],
 ) -> dict[str, Any]:
     """What a run folder says of how it was made; state and counts come later."""
