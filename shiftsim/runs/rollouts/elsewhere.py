@@ -23,7 +23,7 @@ from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.metrics import MetricResult, Thresholds, compute_metrics
 from shiftsim.metrics.score import without
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.rollouts.files import KEY, KINDS, SEEN, STATES, TRACKS, stack
+from shiftsim.runs.rollouts.files import KEY, KINDS, SEEN, STATES, TRACKS
 from shiftsim.runs.rollouts.poses import NEED_BOXES, POINTS, REAR_AXLE, Boxes, Driven, rollout_of
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.scenario import Scenario
@@ -40,6 +40,7 @@ _BOX = (*STATE_COLUMNS[:5], "length", "width")
 _KNOWN = {*KEY, *_TIMES, *STATE_COLUMNS, *_BOX, "seconds", "track_token", "type"}
 _KNOWN |= {*STATES.names, *TRACKS.names, *SEEN.names, KINDS, "iteration"}  # of rollouts of our own
 _EGO = -2  # in place of an AgentKind
+_NO_ROWS = np.zeros(0, np.int64)
 _NAMES = ("planner", "noise", "token", "scenario", "track_token", "type")
 _HINT = "needed are token, time_us (or time_s from 0 on), x, y, heading; docs/score_elsewhere.md"
 _EVERY = "give it in every row"
@@ -306,23 +307,19 @@ def _nested(table: pa.Table) -> pa.Table:
 def _read_boxes(table: pa.Table, where: str) -> Callable[[Task], Callable[[], Boxes]]:
     """By a rollout, what makes its boxes; those of its scenario where no column says more."""
     _require(table, where, ("token", "track_token", *_POSE, "length", "width"), _BOX_HINT)
-    groups, values = _groups(table, where), _numbers(table, _BOX, where)
+    groups, time_us = _groups(table, where), _times(table, where)
+    values, kinds = _numbers(table, _BOX, where), _kinds(table, where)
+    tracks = _column(table, "track_token", pa.string(), where)
     names = [name for name, _ in next(iter(groups), ())]
-    columns = {
-        "row": np.arange(len(table)),
-        "time_us": _times(table, where),
-        "track_token": _column(table, "track_token", pa.string(), where),
-        "kind": _kinds(table, where),
-        **dict(zip(_BOX, values.T, strict=True)),
-    }
     broken = ~np.isfinite(values[:, [0, 1, 2, 5, 6]])
     _refuse(np.logical_or.reduce(broken, axis=1), where, "a number is missing")
     _refuse(values[:, 5:].min(axis=1) <= 0.0, where, "length and width must be above 0")
-    boxes = pa.table(columns)
 
     def of(task: Task) -> Callable[[], Boxes]:
-        rows = groups.get(tuple((name, getattr(task, name)) for name in names), ())
-        return partial(_boxes, where, boxes.take(pa.array(rows, pa.int64())))
+        rows = groups.get(tuple((name, getattr(task, name)) for name in names), _NO_ROWS)
+        rows = rows[kinds[rows] != _EGO]
+        tokens = tracks.take(pa.array(rows))
+        return partial(_boxes, where, rows, time_us[rows], kinds[rows], values[rows], tokens)
 
     return of
 
@@ -342,12 +339,17 @@ def _kinds(table: pa.Table, where: str) -> IntArray:
     return np.array([known[name.upper()] for name in names], np.int64)[codes]
 
 
-def _boxes(where: str, boxes: pa.Table) -> Boxes:
-    """The tracks at all times that have rows, in order of appearance."""
-    boxes = boxes.filter(pc.not_equal(boxes["kind"], _EGO))
-    rows, time_us, kinds = (boxes[name].to_numpy() for name in ("row", "time_us", "kind"))
-    tokens = boxes["track_token"].combine_chunks().dictionary_encode()  # as they appear
-    track = tokens.indices.to_numpy()
+def _boxes(
+    where: str,
+    rows: IntArray,
+    time_us: IntArray,
+    kinds: IntArray,
+    values: FloatArray,
+    tokens: pa.Array,
+) -> Boxes:
+    """The tracks at all times that have rows of a table, in order of appearance."""
+    numbered = tokens.dictionary_encode()
+    track = numbered.indices.to_numpy()
     _, first = np.unique(track, return_index=True)
     times, frame = np.unique(time_us, return_inverse=True)
     is_first = np.zeros(len(rows), np.bool_)
@@ -355,5 +357,5 @@ def _boxes(where: str, boxes: pa.Table) -> Boxes:
     _refuse(~is_first, where, "its track is there twice at one time", rows=rows)
     _refuse(kinds[first][track] != kinds, where, "its track changes its type", rows=rows)
     dense = np.full((len(times), len(first), len(_BOX)), np.nan)
-    dense[frame, track] = stack(boxes, _BOX)
-    return Boxes(times, tracks_of_boxes(dense, kinds[first], tokens.dictionary.to_pylist()))
+    dense[frame, track] = values
+    return Boxes(times, tracks_of_boxes(dense, kinds[first], numbered.dictionary.to_pylist()))
