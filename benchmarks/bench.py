@@ -27,7 +27,7 @@ from shiftsim.report.groups import Group, KnownSet, read_groups, token_digest
 from shiftsim.report.palette import DEFAULT_FORM, FigureFormat
 from shiftsim.report.tables import FORMATS, Table
 from shiftsim.runs.avoidable import grade
-from shiftsim.runs.config import DRIFT, default_workers, make_config
+from shiftsim.runs.config import DRIFT, make_config
 from shiftsim.runs.edited import EditSet, edits_text, make_edits
 from shiftsim.runs.execute import Progress, execute
 from shiftsim.runs.filter import filter_store
@@ -64,12 +64,7 @@ class Plan:
 def plan_bench(
     track: Track, settings: Mapping[str, Any], *, reference: str = "", out: str = ""
 ) -> Plan:
-    """Check all runs of a track before the first one starts; a ShiftsimError if anything is wrong.
-
-    Traffic, noise, seeds and thresholds are the track's unless the settings, of `RunConfig`, give
-    them. `reference` is the store, or `STORE:SPLIT`, with the scenarios of the track's published
-    list, empty to leave it out; `out` the folder, by default `runs/<id>`.
-    """
+    """Check all runs of a track, whose settings others replace; `reference` is STORE[:SPLIT]."""
     values = dict(settings)
     resumes = values.pop("resume", False)
     given = values.pop("traffic", None) or list(track.traffic)
@@ -101,16 +96,12 @@ def plan_bench(
         sets[track.reference.name] = values | rules
     folder = Path(out) if out else RUNS / _name(track, sets, edits_of)
     if resumes and not (folder / MANIFEST).is_file():
-        raise ConfigError(
-            f"there is no benchmark to go on with at {str(folder)!r}",
-            hint="name its folder with --out, or begin without --resume",
-        )
+        what = f"there is no benchmark to go on with at {str(folder)!r}"
+        raise ConfigError(what, hint="name its folder with --out, or begin without --resume")
     _check_folder(folder, track)
     if edits_of and track.drawn is None:
-        raise ConfigError(
-            f"the track {track.name} drives recorded scenarios",
-            hint="`shiftsim bench edits --edits FILE` drives edited ones",
-        )
+        what = f"the track {track.name} drives recorded scenarios"
+        raise ConfigError(what, hint="`shiftsim bench edits --edits FILE` drives edited ones")
     runs = _prepared(track, sets, modes, folder)
     unlimited = _without_limit(next(iter(runs.values())))
     if track.drawn is None:
@@ -128,7 +119,7 @@ def plan_bench(
 def _plan_towns(track: Track, values: Mapping[str, Any], modes: Sequence[str], out: str) -> Plan:
     """The plan of a track in generated towns, which are made here where they are not there."""
     workers = int(values.get("workers") or 0)
-    spread = partial(map_unordered, workers=workers or default_workers(), alone=1)
+    spread = partial(map_unordered, workers=workers, alone=1)
     sets = {}
     for asked in track.towns:
         place = store_path(f"{track.name}-{asked.domain}")
@@ -161,10 +152,7 @@ def _prepared(
 
 
 def _edits(drawn: Drawn, own: RunPlan, given: str, folder: Path) -> tuple[EditSet, str]:
-    """The edits that are given, else those of the folder, else those that the track draws.
-
-    The text is that of a file of those that were drawn.
-    """
+    """The edits that are given, the folder's, or those drawn, and these as the text of a file."""
     store = open_store(own.store)
     if given or (folder / EDITS).is_file():
         return open_edits(given or str(folder / EDITS), store), ""
@@ -200,10 +188,8 @@ def _check_folder(folder: Path, track: Track) -> None:
         return
     found = _read_manifest(folder)
     if found is None or found["track"] != track.name:
-        raise ConfigError(
-            f"{str(folder)!r} holds something else than a {track.name} benchmark",
-            hint="choose another --out",
-        )
+        what = f"{str(folder)!r} holds something else than a {track.name} benchmark"
+        raise ConfigError(what, hint="choose another --out")
 
 
 def _without_limit(run: RunPlan) -> RunPlan:
@@ -228,11 +214,7 @@ def run_bench(
     on_progress: Callable[[Progress], None] = lambda progress: None,
     argv: Sequence[str] = (),
 ) -> list[Run]:
-    """Do all runs; those that are complete already are kept as they are.
-
-    `on_progress` is called after every rollout with counts over all runs; `argv`, the command line,
-    is for the manifests.
-    """
+    """Do all runs but those that are complete; `on_progress` gets counts over all of them."""
     plan.folder.mkdir(parents=True, exist_ok=True)
     columns = ("name", "count", "sha256")
     own, *edited = ({name: getattr(one, name) for name in columns} for one in plan.own)
@@ -273,10 +255,6 @@ class OpenedRuns(NamedTuple):
     own: list[KnownSet]  # lists of scenarios that benchmarks name
     tracks: list[Track]  # of the benchmarks
 
-    def coverage(self, groups: Sequence[Group]) -> list[Table]:
-        """The tables that only a benchmark has."""
-        return [coverage(track, groups) for track in dict.fromkeys(self.tracks)]
-
     def groups(self, *, allow_partial: bool = False) -> list[Group]:
         """The scores by planner and noise."""
         known = (*known_sets(), *self.own)
@@ -286,12 +264,8 @@ class OpenedRuns(NamedTuple):
         self, options: build.Options, *, with_coverage: bool = False, allow_partial: bool = False
     ) -> list[Table]:
         """The tables that are asked for, also those that only a benchmark has if wanted."""
-        return self._tables(self.groups(allow_partial=allow_partial), options, with_coverage)
-
-    def _tables(
-        self, groups: Sequence[Group], options: build.Options, with_coverage: bool
-    ) -> list[Table]:
-        own = self.coverage(groups) if with_coverage else []
+        groups, tracks = self.groups(allow_partial=allow_partial), dict.fromkeys(self.tracks)
+        own = [coverage(track, groups) for track in tracks if with_coverage]
         return [*own, *build.make_tables(groups, published_figures(), options)]
 
     def report(
@@ -307,18 +281,12 @@ class OpenedRuns(NamedTuple):
         form: FigureFormat = DEFAULT_FORM,
         on_progress: Callable[[int, int], None] = lambda done, total: None,
     ) -> list[Path]:
-        """Write tables and pictures to a folder, and return the files.
-
-        There is a file per format, of all formats where none is given; with `pages` there are HTML
-        pages in place of these: tables, pictures, and every scenario with its replay. It is a
-        ConfigError if there is no such format, a MissingExtraError if matplotlib is missing for
-        pictures.
-        """
+        """Write tables and pictures, a file per format or HTML `pages` with replays; the files."""
         for name in formats:
             one_of("format", name, FORMATS)
         is_whole = options.tables == tuple(build.TABLES)
+        tables = self.tables(options, with_coverage=is_whole, allow_partial=allow_partial)
         groups = self.groups(allow_partial=allow_partial)
-        tables = self._tables(groups, options, is_whole)
         drawn = figures(groups, form=form) if pictures or pages else []
         title = title or f"Report on {', '.join(run.path.name for run in self.runs)}"
         if not pages:
@@ -342,11 +310,7 @@ def _store_of(run: Run) -> Any:
 
 
 def open_runs(folders: Iterable[Path], labels: Iterable[str] = ()) -> OpenedRuns:
-    """The runs of folders, where the folder of a benchmark stands for all of its runs.
-
-    `labels`, as those of `label_runs`, are what planners are called. It is a ShiftsimError if a
-    folder is neither, or damaged.
-    """
+    """The runs of folders, a benchmark's being all of its runs, by `labels` as in `label_runs`."""
     out = OpenedRuns([], [], [])
     for folder in folders:
         found = _read_manifest(folder)
@@ -361,11 +325,7 @@ def open_runs(folders: Iterable[Path], labels: Iterable[str] = ()) -> OpenedRuns
 
 
 def paired_runs(first: Path, second: Path, labels: Iterable[str] = ()) -> list[tuple[Run, Run]]:
-    """Two run folders, or the runs of two benchmarks that have the same name.
-
-    `labels`, as those of `label_runs`, are what planners are called. It is a ShiftsimError if a
-    folder is neither, or there is no such pair.
-    """
+    """Two run folders, or runs of one name of two benchmarks, by `labels` as in `label_runs`."""
     ours, theirs = (open_runs([folder]).runs for folder in (first, second))
     runs = label_runs([*ours, *theirs], labels)
     ours, theirs = runs[: len(ours)], runs[len(ours) :]
@@ -390,12 +350,9 @@ def _read_manifest(folder: Path) -> dict[str, Any] | None:
         found: dict[str, Any] = json.loads(path.read_text("utf-8"))
         version, _, _ = found["format"], found["runs"], found["own"]["sha256"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(
-            f"{str(path)!r} is damaged: {error}", hint="run the benchmark again"
-        ) from error
+        what = f"{str(path)!r} is damaged: {error}"
+        raise DataError(what, hint="run the benchmark again") from error
     if version != _FORMAT:
-        raise DataError(
-            f"{str(path)!r} has format {version!r}, this version reads {_FORMAT}",
-            hint="run the benchmark again with this version of shiftsim",
-        )
+        what = f"{str(path)!r} has format {version!r}, this version reads {_FORMAT}"
+        raise DataError(what, hint="run the benchmark again with this version of shiftsim")
     return found

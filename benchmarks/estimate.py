@@ -36,10 +36,7 @@ class Cost:
 
 
 def estimate(plan: Plan, *, shards: int = 1) -> list[Cost]:
-    """The cost of every planner in every run of a benchmark that has been checked.
-
-    `shards` machines like this one share the tasks, each with the workers of the plan.
-    """
+    """The cost of every planner in every run, shared by so many machines like this one."""
     return [cost for name, run in plan.runs.items() for cost in _costs(name, run, shards)]
 
 

@@ -117,9 +117,8 @@ def _run(metric: Any, log: SimulationLog, road: VectorMap | Scenario) -> list[Me
     try:
         number = float(value)
     except (TypeError, ValueError) as error:
-        raise ConfigError(
-            f"metric {name!r} returned {value!r}", "return a number or a MetricRow"
-        ) from error
+        what = f"metric {name!r} returned {value!r}"
+        raise ConfigError(what, "return a number or a MetricRow") from error
     return [MetricRow(name, None, number, "", None, None)]
 
 

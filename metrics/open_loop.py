@@ -121,15 +121,12 @@ def _compared(plan: Poses, expert: Poses, frame: int, token: str) -> tuple[Float
         times = np.append(times[:reached], end)
     if len(times) <= HORIZONS[-1]:
         seconds = (end - plan.time_us[0]) / 1e6
-        raise DataError(
-            f"{where}: the plan covers {seconds:.3g} s", "open loop compares plans of 8 s"
-        )
+        what = f"{where}: the plan covers {seconds:.3g} s"
+        raise DataError(what, "open loop compares plans of 8 s")
     if times[-1] > expert.time_us[-1]:
         missing = (times[-1] - expert.time_us[-1]) / 1e6
-        raise DataError(
-            f"{where}: the recording ends {missing:.3g} s before the plan",
-            "shorten the scenario: 8 s of the recording must lie behind it",
-        )
+        what = f"{where}: the recording ends {missing:.3g} s before the plan"
+        raise DataError(what, "shorten the scenario: 8 s of the recording must lie behind it")
     return plan.centers(times[1:]), expert.centers(times[1:])
 
 

@@ -236,10 +236,8 @@ def _parts(m: Measurements, profile: Thresholds) -> list[MetricPart]:
 def _check(log: SimulationLog, tracks: collision.FlatTracks) -> None:
     where = f"rollout of scenario {log.token!r}"
     if len(log.time_us) < MIN_SAMPLES:
-        raise DataError(
-            f"{where} has {len(log.time_us)} samples; the metrics need {MIN_SAMPLES}",
-            f"simulate at least {MIN_SAMPLES + 1} iterations",
-        )
+        what = f"{where} has {len(log.time_us)} samples; the metrics need {MIN_SAMPLES}"
+        raise DataError(what, f"simulate at least {MIN_SAMPLES + 1} iterations")
     if len(log.expert_ego) == 0:
         raise DataError(f"{where} has no expert states, which progress is measured against")
     if not len(log.time_us) == len(log.ego) == len(log.tracks):
@@ -250,9 +248,8 @@ def _check(log: SimulationLog, tracks: collision.FlatTracks) -> None:
     for name, states in (("ego", log.ego), ("expert", log.expert_ego)):
         if not np.isfinite(states).all():
             row, column = (int(i) for i in np.argwhere(~np.isfinite(states))[0])
-            raise DataError(
-                f"{where}: {name} {STATE_COLUMNS[column]} at sample {row} is not finite"
-            )
+            what = f"{where}: {name} {STATE_COLUMNS[column]} at sample {row} is not finite"
+            raise DataError(what)
     poses, sizes = tracks.poses, tracks.sizes
     # not finite as soon as one of them is
     total = poses[..., 0] + poses[..., 1] + poses[..., 2] + sizes[..., 0] + sizes[..., 1]

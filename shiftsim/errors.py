@@ -101,14 +101,15 @@ def listed(names: Sequence[str], most: int = 8) -> str:
     return f"{', '.join(names[:most])}{more}"
 
 
-def one_of(what: str, value: str, choices: Iterable[str]) -> str:
-    """The value, when it is among the choices, or a ConfigError, which names the nearest."""
+def one_of(what: str, value: str, choices: Iterable[str], others: str = "") -> str:
+    """The value, when it is among the choices, or a ConfigError: these, the nearest, `others`."""
     valid = sorted(choices)
     if value in valid:
         return value
     near = nearest(value, valid)
     hint = f"did you mean {near!r}? " if near else ""
-    raise ConfigError(f"{what} {value!r} unknown", hint=f"{hint}available: {', '.join(valid)}")
+    hint += f"available: {', '.join(valid)}{others}"
+    raise ConfigError(f"{what} {value!r} unknown", hint)
 
 
 def beginning(where: str, what: str, text: str, choices: Iterable[str]) -> str:

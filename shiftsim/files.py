@@ -130,9 +130,8 @@ def read_json_lines(path: Path) -> Iterator[tuple[str, Any]]:
             try:
                 yield where, json.loads(line.decode())
             except (ValueError, RecursionError) as error:
-                raise DataError(
-                    f"{where}: not JSON: {error}", hint="repair or remove that line"
-                ) from error
+                what = f"{where}: not JSON: {error}"
+                raise DataError(what, hint="repair or remove that line") from error
 
 
 def lock(path: Path) -> BinaryIO:
@@ -166,13 +165,11 @@ def read_toml(path: Path) -> dict[str, Any]:
         with path.open("rb") as file:
             return tomllib.load(file)
     except OSError as error:
-        raise ConfigError(
-            f"cannot read {str(path)!r}: {error.strerror or error}", hint="check the path"
-        ) from error
+        what = f"cannot read {str(path)!r}: {error.strerror or error}"
+        raise ConfigError(what, hint="check the path") from error
     except (ValueError, RecursionError) as error:  # also a number of thousands of digits
-        raise ConfigError(
-            f"{str(path)!r} is not TOML: {error}", hint="repair the line named above"
-        ) from error
+        what = f"{str(path)!r} is not TOML: {error}"
+        raise ConfigError(what, hint="repair the line named above") from error
 
 
 def make_table(cls: type[_T], table: Any, where: str, check: Check = lambda *_: None) -> _T:

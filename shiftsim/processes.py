@@ -147,10 +147,8 @@ def in_background(make: Callable[[], object]) -> Iterator[None]:
     try:
         process.receive()
     except ProcessEndedError as end:
-        raise ConfigError(
-            f"the process for the device cannot start: it {end}",
-            hint="run with --workers 1 to see why",
-        ) from end
+        what = f"the process for the device cannot start: it {end}"
+        raise ConfigError(what, hint="run with --workers 1 to see why") from end
     # the thread that starts a process must outlive it, as that is killed when its parent ends
     keeper = Thread(target=restart, daemon=True)
     keeper.start()

@@ -71,9 +71,8 @@ def _read_text(path: Path) -> str:
 def _tokens(path: Path, values: list[Any]) -> frozenset[str]:
     for value in values:
         if not isinstance(value, str) or not _TOKEN.match(value):
-            raise ConfigError(
-                f"{path}: {value!r} is not a token", hint="tokens have 16 hexadecimal digits"
-            )
+            what = f"{path}: {value!r} is not a token"
+            raise ConfigError(what, hint="tokens have 16 hexadecimal digits")
     if not values:
         raise ConfigError(f"{path}: there is no token in it", hint="one token per line")
     return frozenset(str(value) for value in values)
@@ -210,9 +209,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except yaml.YAMLError as error:
         raise ConfigError(f"{path}: not YAML: {error}", hint="check the path") from error
     if not isinstance(values, dict):
-        raise ConfigError(
-            f"{path}: line 1: no keys with values", hint="give one of nuPlan's scenario filters"
-        )
+        words = f"{path}: line 1: no keys with values"
+        raise ConfigError(words, hint="give one of nuPlan's scenario filters")
     return values
 
 

@@ -225,7 +225,6 @@ def read_index(path: Path) -> dict[str, Any]:
 def load_map(maps: dict[str, Path], name: str) -> VectorMap:
     """One of the maps found by `find_maps`, or a DataError."""
     if name not in maps:
-        raise DataError(
-            f"there is no map {name!r} in the map folder", hint=f"found: {', '.join(sorted(maps))}"
-        )
+        what = f"there is no map {name!r} in the map folder"
+        raise DataError(what, hint=f"found: {', '.join(sorted(maps))}")
     return read_map(maps[name], name)

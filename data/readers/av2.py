@@ -92,9 +92,8 @@ def _scenario_id(path: Path) -> str:
 def _read_tracks(source: SourceFile) -> TrackSamples:
     table = source.columns(_COLUMNS)
     if pc.all(table["observed"]).as_py():
-        raise source.fault(
-            "holds the observed 5 s only", "convert train or val; test hides the future"
-        )
+        what = "holds the observed 5 s only"
+        raise source.fault(what, "convert train or val; test hides the future")
     start_us = round(float(source.numbers(table, "start_timestamp", "time_ns")[0]) / 1000.0)
     city = str(table["city"][0].as_py())
     table = table.filter(pc.not_equal(table["object_type"], _LEFT_OUT))

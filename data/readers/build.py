@@ -80,13 +80,11 @@ def make_samples(
     sizes = np.zeros((len(xy), 2)) if sizes is None else sizes
     for what, is_bad in ("position", ~np.isfinite(xy)), ("heading", np.isinf(headings)):
         if is_bad.any():
-            raise ConversionError(
-                f"{where}: {is_bad.sum()} values of {what} are not finite", "leave those rows out"
-            )
+            words = f"{where}: {is_bad.sum()} values of {what} are not finite"
+            raise ConversionError(words, "leave those rows out")
     if frames is None and (len(time_us) < 2 or time_us.min() == time_us.max()):
-        raise ConversionError(
-            f"{where}: {len(time_us)} rows at one time", "give rows at two times or more"
-        )
+        words = f"{where}: {len(time_us)} rows at one time"
+        raise ConversionError(words, "give rows at two times or more")
     track_ids, track = index_ids(ids)
     order = np.lexsort((time_us, track))
     time_us, track, category, xy = time_us[order], track[order], category[order], xy[order]
@@ -238,9 +236,8 @@ def _track_categories(
     most = voted[np.lexsort((voted, -votes, voted_track))[first]]
     found = tuple(names[code] for code in most.tolist())
     if unknown := sorted(set(found) - set(known)):
-        raise ConversionError(
-            f"{where}: category {unknown[0]!r} is unknown", f"{remedy} {', '.join(sorted(known))}"
-        )
+        what = f"{where}: category {unknown[0]!r} is unknown"
+        raise ConversionError(what, f"{remedy} {', '.join(sorted(known))}")
     return found
 
 

@@ -268,8 +268,7 @@ def _locked(store: Path) -> Iterator[None]:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield
     except BlockingIOError as error:
-        raise DataError(
-            f"{store}: another conversion writes to this store", "wait until it has finished"
-        ) from error
+        what = f"{store}: another conversion writes to this store"
+        raise DataError(what, "wait until it has finished") from error
     finally:
         os.close(handle)

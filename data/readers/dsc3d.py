@@ -117,9 +117,8 @@ def read_recording(
     clock = (frames - frames[0]) / site.frame_rate
     file = Dsc3dFile(folder / "annotations.parquet")
     if fault := find_pause(clock * 1e6):
-        raise ConversionError(
-            f"{folder}: {fault[0]}", "check frame_id, and frame_rate in data_meta.json"
-        )
+        words = f"{folder}: {fault[0]}"
+        raise ConversionError(words, "check frame_id, and frame_rate in data_meta.json")
     wrong = np.abs((stamps - stamps[0]) * 1e-6 - clock) > 0.5 * site.period
     warnings["frames whose time disagrees with their id"] += int(wrong.sum())
     warnings["frames missing"] += int((np.diff(frames) // site.frame_distance - 1).sum())

@@ -87,10 +87,8 @@ class Py123dReader(SceneFolder):
             return found
         missing = set(self._starts) - {Path(path).name for path in found}
         if missing:
-            raise ConversionError(
-                f"{self.source}: {len(missing)} logs are not there, such as {min(missing)}",
-                "give the folder that holds them, or leave them out",
-            )
+            what = f"{self.source}: {len(missing)} logs are not there, such as {min(missing)}"
+            raise ConversionError(what, "give the folder that holds them, or leave them out")
         return [path for path in found if Path(path).name in self._starts]
 
     def files(self, recording: str) -> list[Path]:
@@ -105,9 +103,8 @@ class Py123dReader(SceneFolder):
         about, map_path = _read_sync(path)
         dataset, split = about["dataset"], about["split"]
         if dataset.startswith("wod") and split.endswith("test"):
-            raise SourceFile(path).fault(
-                f"split {split!r} hides the future", "convert train or val"
-            )
+            what = f"split {split!r} hides the future"
+            raise SourceFile(path).fault(what, "convert train or val")
         with SourceFile(path).naming():
             samples = _read_tracks(path)
         lights = _read_lights(path)

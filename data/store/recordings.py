@@ -40,9 +40,8 @@ def write_recording(folder: Path, recording: Recording) -> None:
         for block in blocks:
             require_ranges(block, str(folder / name))
     if (np.diff(recording.time_us) < 0).any():  # they may repeat, nuPlan rule 431
-        raise DataError(
-            f"{folder / tables.FRAMES}: column 'time_us' does not increase", tables.REPAIR
-        )
+        what = f"{folder / tables.FRAMES}: column 'time_us' does not increase"
+        raise DataError(what, tables.REPAIR)
     blocks_of[tables.FRAMES] = _split(blocks_of[tables.FRAMES][0])
     for name, blocks in blocks_of.items():
         tables.write_blocks(folder / name, blocks)
@@ -150,9 +149,8 @@ class StoredRecording:
         frames = _rows(self.frames, first, last, validate)
         time_us = tables.column(frames, "time_us")
         if validate and (np.diff(time_us) < 0).any():
-            raise DataError(
-                f"{self.frames.path}: column 'time_us' does not increase", tables.REPAIR
-            )
+            what = f"{self.frames.path}: column 'time_us' does not increase"
+            raise DataError(what, tables.REPAIR)
         lights = self._lights(first, last, validate)
         tracks = self._tracks(first, last, choose, validate)
         return Recording(self.log_name, self.city, time_us, tracks, lights)

@@ -254,9 +254,7 @@ class Run(results.Run):
         from shiftsim.runs.scenarios import open_run_store
 
         if isinstance(task, str):
-            rows = select_tasks(
-                self, task, **{"planner": None, "noise": None, "seed": None} | choice
-            )
+            rows = select_tasks(self, task, **choice)
             if len(rows) > 1:
                 there = listed([task_words(row) for row in rows])
                 raise ConfigError(f"{task!r} was driven {len(rows)} times", f"there are {there}")

@@ -24,10 +24,6 @@ if TYPE_CHECKING:
 OnProgress = Callable[..., None]  # done, total and the name of the last one
 
 
-def _silent(*_: Any) -> None:
-    """Shows no progress."""
-
-
 def convert_nuplan(
     logs: str | Path, maps: str | Path, store: str | Path, **filters: Any
 ) -> "NuplanReport":
@@ -64,7 +60,7 @@ def convert_dsc3d(
     site: str | None = None,
     map_path: str | Path | None = None,
     workers: int = 0,
-    on_progress: OnProgress = _silent,
+    on_progress: OnProgress = lambda *_: None,
     **thresholds: Any,
 ) -> "ConversionReport":
     """Convert recordings in the layout of DSC3D into a store.
@@ -150,7 +146,7 @@ def convert_dataset(
     egos: str = "recorded",
     at: str | Path | None = None,
     workers: int = 0,
-    on_progress: OnProgress = _silent,
+    on_progress: OnProgress = lambda *_: None,
 ) -> "ConversionReport":
     """Convert scenes of an open data set: `av2`, `py123d` or `commonroad`.
 
@@ -192,7 +188,7 @@ def convert_dataset(
 
 
 def convert_reader(
-    reader: "Reader", store: str | Path, workers: int = 0, on_progress: OnProgress = _silent
+    reader: "Reader", store: str | Path, workers: int = 0, on_progress: OnProgress = lambda *_: None
 ) -> "ConversionReport":
     """Convert what a reader gives, over processes, into a store by name or folder.
 
@@ -200,10 +196,9 @@ def convert_reader(
         ConversionError: None of the recordings can be converted.
     """
     from shiftsim.data.readers.convert import convert
-    from shiftsim.runs.config import default_workers
     from shiftsim.runs.workers import map_unordered
 
-    executor = partial(map_unordered, workers=workers or default_workers())
+    executor = partial(map_unordered, workers=workers)
     return convert(reader, store_path(store), progress=on_progress, executor=executor)
 
 
@@ -227,7 +222,7 @@ def make_towns(
     seed: int = 0,
     domain: str = "all",
     workers: int = 0,
-    on_progress: OnProgress = _silent,
+    on_progress: OnProgress = lambda *_: None,
 ) -> ScenarioStore:
     """A store of random towns to train in; the same bytes for the same number and seed.
 
@@ -249,11 +244,9 @@ def make_towns(
         ```
     """
     from shiftsim.data.synthetic.store import write_towns
-    from shiftsim.runs.config import default_workers
     from shiftsim.runs.workers import map_unordered
 
-    count = min(workers or default_workers(), towns)
-    spread = partial(map_unordered, workers=count, alone=1)
+    spread = partial(map_unordered, workers=workers, alone=1)
     folder = store_path(store)
     return write_towns(
         folder, towns=towns, seed=seed, domain=domain, spread=spread, progress=on_progress
@@ -261,7 +254,11 @@ def make_towns(
 
 
 def _filter(
-    self: ScenarioStore, *, workers: int = 0, on_progress: OnProgress = _silent, **limits: Any
+    self: ScenarioStore,
+    *,
+    workers: int = 0,
+    on_progress: OnProgress = lambda *_: None,
+    **limits: Any,
 ) -> "FilterResults":
     """Drive every scenario as recorded; those that cannot be driven so are left out of runs.
 

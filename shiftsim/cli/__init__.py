@@ -92,10 +92,7 @@ def print_result(values: Any, lines: Iterable[str], *, as_json: bool) -> None:
 
 
 def stdout_to_stderr() -> redirect_stdout[TextIO]:
-    """What planners print within goes to the standard error: the output is the command's own.
-
-    What workers print goes there anyway.
-    """
+    """What planners print within goes to the standard error, as what workers print does."""
     return redirect_stdout(sys.stderr)
 
 
@@ -201,12 +198,7 @@ _KIND = inspect.Parameter.KEYWORD_ONLY  # those with a default may come first
 def with_settings(
     *names: str, of: Any = RunConfig, **helps: str
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options of settings, at the place of its parameter `settings`.
-
-    The command gets those that were given, as the dataclass `of` settings wants them; arguments of
-    planners are texts still, for `planner_arguments`. Without `names` it has all of them. `helps`
-    are other help texts for some of them.
-    """
+    """Give a command options of settings at its parameter `settings`; `helps` replaces texts."""
     known = {item.name: item for item in fields(of)}
     items = [known[name] for name in names or known]
     in_file = of is RunConfig  # where settings may be that are not given

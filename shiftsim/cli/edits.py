@@ -46,9 +46,8 @@ def check(
         try:
             scenario = edited.read(token)
             if avoidable and not is_avoidable(scenario):
-                raise ConfigError(
-                    f"{token!r}: neither braking at 4 m/s^2 nor PDM-Closed avoids a collision"
-                )
+                what = f"{token!r}: neither braking at 4 m/s^2 nor PDM-Closed avoids a collision"
+                raise ConfigError(what)
         except ShiftsimError as error:
             refused.append({"token": token, "error": error.message, "hint": error.hint})
     count = len(edited.tokens)
@@ -58,10 +57,8 @@ def check(
     ]
     print_result({"edited": count, "refused": refused}, lines, as_json=as_json)
     if refused:
-        raise ConfigError(
-            f"{len(refused)} of {plural(count, 'edited scenario')} cannot be made",
-            hint="repair or remove the edits named above",
-        )
+        what = f"{len(refused)} of {plural(count, 'edited scenario')} cannot be made"
+        raise ConfigError(what, hint="repair or remove the edits named above")
 
 
 @app.command()

@@ -97,10 +97,7 @@ def run_settings(
 def progress_of(
     plans: "Sequence[RunPlan]", folder: Path, words: list[str], live: bool, quiet: bool
 ) -> "Iterator[OnProgress]":
-    """Yields what shows progress; an interrupt, or a request to end, keeps what is finished.
-
-    It then says in which folder that is kept, and the words of the command that goes on with it.
-    """
+    """Yields what shows progress; an interrupt, or a request to end, says how to go on."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with stdout_to_stderr(), progress_bar(quiet=quiet) as advance:

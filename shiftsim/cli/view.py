@@ -313,9 +313,8 @@ def _times(text: str) -> list[float]:
     try:
         return [float(word) for word in text.split(",")]
     except ValueError as error:
-        raise ConfigError(
-            f"times {text!r} are not numbers", hint="--at 5, or --at 0,5,10"
-        ) from error
+        what = f"times {text!r} are not numbers"
+        raise ConfigError(what, hint="--at 5, or --at 0,5,10") from error
 
 
 def inspect(

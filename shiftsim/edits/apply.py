@@ -47,12 +47,7 @@ def apply_edit(
     driven_lanes: DrivenLanes | None = None,
     replay: Replay | None = None,
 ) -> Scenario:
-    """The scenario that an edit makes of a recorded one.
-
-    Codes of interPlan need `driven_lanes`, such as `metrics.interplan.driven_lanes`, and what
-    begins in traffic that reacts needs a `replay` of it. It is a ConfigError if it cannot be
-    applied; the message names scenario, edit and reason.
-    """
+    """The scenario that an edit makes of a recorded one; a ConfigError where it cannot."""
     try:
         if edit.start is not None:
             scenario = _begin_at(scenario, edit.start, replay)
@@ -244,10 +239,8 @@ def _begin_at(scenario: Scenario, start: spec.Start, replay: Replay | None) -> S
     ego[known], tracks = driven, scenario.tracks
     if start.traffic != NONREACTIVE:
         if replay is None:
-            raise ConfigError(
-                f"start: traffic {start.traffic!r} is driven in runs only",
-                hint="write the edit into a file, and run that",
-            )
+            what = f"start: traffic {start.traffic!r} is driven in runs only"
+            raise ConfigError(what, hint="write the edit into a file, and run that")
         seen, tracks = replay(scenario, driven, start.traffic), tracks.copy()
         at = np.searchsorted(known, past, side="right") - 1
         for name in ("valid", "poses", "velocities", "sizes"):
@@ -278,9 +271,8 @@ def _set_window(builder: ScenarioBuilder, seconds: float) -> None:
 def _shift(builder: ScenarioBuilder, track: int, ahead: float, left: float) -> None:
     tracks, now = builder.tracks, builder.now
     if not tracks.valid[now, track]:
-        raise ConfigError(
-            f"track {tracks.tokens[track]!r} is not there at the start, so it cannot be moved"
-        )
+        what = f"track {tracks.tokens[track]!r} is not there at the start, so it cannot be moved"
+        raise ConfigError(what)
     pose = _ahead_of(tracks.poses[now, track], ahead, left)
     size = tracks.sizes[now, track].copy()
     by = pose[:2] - tracks.poses[now, track, :2]

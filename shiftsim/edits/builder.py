@@ -100,9 +100,8 @@ class ScenarioBuilder:
         if lost := [token for token in wanted if token not in self.tracks.tokens]:
             there = self.tracks.valid[self.now]
             seen = [t for t, is_there in zip(self.tracks.tokens, there, strict=True) if is_there]
-            raise ConfigError(
-                f"there is no track {lost[0]!r}", hint=f"there are: {listed(seen) or 'none'}"
-            )
+            what = f"there is no track {lost[0]!r}"
+            raise ConfigError(what, hint=f"there are: {listed(seen) or 'none'}")
         chosen = np.ones(self.tracks.num_tracks, np.bool_)
         if wanted:
             chosen &= np.array([token in wanted for token in self.tracks.tokens], np.bool_)
@@ -166,10 +165,8 @@ class ScenarioBuilder:
             if other == 0:
                 hint = "choose a place farther ahead or aside"
                 raise ConfigError(f"{what} is on the ego", hint=hint)
-            raise ConfigError(
-                f"{what} is on track {tracks.tokens[there[other - 1]]!r}",
-                hint="choose another place, or remove that track first",
-            )
+            words = f"{what} is on track {tracks.tokens[there[other - 1]]!r}"
+            raise ConfigError(words, hint="choose another place, or remove that track first")
 
     def add_vehicle(
         self, token: str, pose: FloatArray, size: FloatArray, speed: float, behavior: int

@@ -64,10 +64,7 @@ def draw_slots(
     *,
     reach: float = 50.0,  # how far beyond the ego the lanes are filled [m]
 ) -> tuple[list[Slot], float | None]:
-    """Places of vehicles in all lanes, and the speed of the ego where it takes one of them.
-
-    Raises ConfigError: a point is in no roadblock, or the lanes of a line do not meet.
-    """
+    """Places of vehicles in all lanes, and the ego's speed in one of them; or a ConfigError."""
     block = int(road.block_of[ego_edge])
     lanes = road.block_edges.at(block).tolist()
     for x, y in also_at:
@@ -114,11 +111,7 @@ def draw_slots(
 
 
 def safe_speed(lead: float, distance: float, reaction: float) -> float:
-    """Speed at which a vehicle can stop behind one that brakes [m/s].
-
-    `lead` is the speed of that one [m/s], at a `distance` [m], `reaction` the time before the
-    vehicle brakes, too [s].
-    """
+    """Speed [m/s] that stops behind a `lead` [m/s] that brakes, at a `distance` [m]."""
     root = math.sqrt(reaction**2 + 4 * _ALPHA * (_ALPHA * lead**2 + distance))
     return min(distance / 2, (-reaction + root) / (2 * _ALPHA))
 

@@ -69,9 +69,8 @@ def _blocks(road: VectorMap, wanted: Reroute, first: int, count: int) -> list[in
         raise ConfigError(f"reroute: map {road.name!r} has no roadblock {lost[0]!r}")
     blocks = [road.blocks.index[name] for name in wanted.route]
     if first not in blocks:
-        raise ConfigError(
-            f"reroute: the route does not hold roadblock {road.blocks.ids[first]!r} of the ego"
-        )
+        what = f"reroute: the route does not hold roadblock {road.blocks.ids[first]!r} of the ego"
+        raise ConfigError(what)
     return blocks[blocks.index(first) :]
 
 

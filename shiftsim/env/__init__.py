@@ -8,9 +8,8 @@ from shiftsim.errors import MissingExtraError
 try:
     from gymnasium.envs.registration import register, registry
 except ModuleNotFoundError as error:
-    raise MissingExtraError(
-        "the environment needs gymnasium", hint='pip install "shiftsim[gym]"'
-    ) from error
+    what = "the environment needs gymnasium"
+    raise MissingExtraError(what, hint='pip install "shiftsim[gym]"') from error
 
 from shiftsim.env.raster import raster_observation as raster_observation
 from shiftsim.env.vector import vector_observation as vector_observation

@@ -284,10 +284,8 @@ def DrivingVectorEnv(
         DataError: The store is not there, or has no scenario.
     """
     if not 1 <= num_workers <= num_envs:
-        raise ConfigError(
-            f"{num_workers} workers for {num_envs} environments",
-            hint="num_workers must be at least 1, and at most num_envs",
-        )
+        what = f"{num_workers} workers for {num_envs} environments"
+        raise ConfigError(what, hint="num_workers must be at least 1, and at most num_envs")
     makers = [partial(DrivingEnv, **settings)] * num_envs
     return vector_env(makers, num_workers, timeout, autoreset_mode=autoreset_mode)
 

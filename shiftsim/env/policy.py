@@ -208,10 +208,8 @@ def _load_model(file: BytesIO) -> Any:
     try:
         from stable_baselines3.common.save_util import load_from_zip_file
     except ImportError as error:
-        raise MissingExtraError(
-            "the policy is a model of Stable-Baselines3, which is not installed",
-            hint="pip install stable-baselines3",
-        ) from error
+        what = "the policy is a model of Stable-Baselines3, which is not installed"
+        raise MissingExtraError(what, hint="pip install stable-baselines3") from error
     # schedules, which only training needs, are code of the Python that wrote them
     unread = dict.fromkeys(("learning_rate", "lr_schedule", "clip_range", "clip_range_vf"))
     data, tensors, _ = load_from_zip_file(file, device="cpu", custom_objects=unread)
@@ -258,10 +256,8 @@ def from_spec(spec: str) -> Callable[[], PolicyPlanner]:
     if kind != _MODEL:
         files["interface"] = beside = path.with_name(f"{path.name}.toml")
         if not beside.is_file():
-            raise ConfigError(
-                f"{str(path)!r} needs a file {beside.name!r} beside it that says how it acts",
-                hint='two lines: observation = "vector" and action = "command"',
-            )
+            what = f"{str(path)!r} needs a file {beside.name!r} beside it that says how it acts"
+            raise ConfigError(what, hint='two lines: observation = "vector" and action = "command"')
 
     def make() -> PolicyPlanner:
         require_torch("a policy")

@@ -135,8 +135,7 @@ def wrap_angle(angle: float) -> float:
 
 def wrap_angles(angles: FloatArray) -> FloatArray:
     """Angles of any shape wrapped to [-pi, pi) [rad]."""
-    wrapped: FloatArray = (angles + np.pi) % (2.0 * np.pi) - np.pi
-    return wrapped
+    return (angles + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def from_frame(poses: FloatArray, origin: FloatArray) -> FloatArray:

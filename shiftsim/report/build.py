@@ -18,6 +18,7 @@ from shiftsim.report.groups import Group, planner_identities
 from shiftsim.report.paper import Published
 from shiftsim.report.scores import planner_notes, scores
 from shiftsim.report.tables import ENDINGS, FORMATS, Table, latex_picture, markdown_escape, render
+from shiftsim.runs.config import named_checkpoint
 from shiftsim.runs.results import Run
 
 _HASH = 12  # characters shown of a hash
@@ -64,20 +65,15 @@ class Options:
 def make_tables(
     groups: Sequence[Group], published: Published | None = None, options: Options | None = None
 ) -> list[Table]:
-    """The tables of a report, in the order of `TABLES`; without `options` everything is shown.
-
-    Beside published figures stands no planner with weights of our own that nobody asked for; it is
-    a ConfigError if nothing is left beside them.
-    """
+    """The tables of a report; beside published figures no weights that nobody asked for."""
     chosen = options or Options()
-    left_out = [group for group in groups if chosen.with_published and _has_default_weights(group)]
+    left_out = [group for group in groups if chosen.with_published and _is_unasked(group)]
     weights = {f"{group.name}, {group.weights}" for group in left_out}
     default_weights = "; ".join(sorted(weights))
     groups = [group for group in groups if group not in left_out]
     if left_out and not groups:
-        raise ConfigError(
-            f"nothing to show beside published figures: {default_weights}", hint=_ASK_FOR_WEIGHTS
-        )
+        what = f"nothing to show beside published figures: {default_weights}"
+        raise ConfigError(what, hint=_ASK_FOR_WEIGHTS)
     runs = list({group.run.path: group.run for group in groups}.values())
     notes = planner_notes(runs)
     if left_out:
@@ -94,13 +90,10 @@ def make_tables(
     return out
 
 
-def _has_default_weights(group: Group) -> bool:
+def _is_unasked(group: Group) -> bool:
     """Whether a planner drove with weights of our own that nobody asked for by `--checkpoint`."""
     config = group.run.manifest["config"]
-    given = [text.partition("=") for text in config.get("checkpoints", ())]
-    named = any(not equals or owner == group.name for owner, equals, _ in given)
-    named = named or "checkpoint" in config.get("planner_args", {}).get(group.name, {})
-    return bool(group.weights) and not named
+    return bool(group.weights) and not named_checkpoint(config, group.name)
 
 
 def _makers(
@@ -134,11 +127,7 @@ def _makers(
 
 
 class Comparison:
-    """Planners compared scenario by scenario, in pairs; printed as text.
-
-    Attributes:
-        tables: The tables, of clean rollouts and of those under noise.
-    """
+    """Tables of planners compared scenario by scenario, in pairs; printed as text."""
 
     def __init__(self, tables: Sequence[Table]) -> None:
         self.tables = tuple(tables)
@@ -159,11 +148,7 @@ class Comparison:
 
 
 def in_format(tables: Sequence[Table], format: str) -> Any:
-    """Tables as text in a format, or for `pandas` as one DataFrame with numbers in full.
-
-    In that, `attrs["notes"]` are the notes, and a column `table` tells several tables apart. It is
-    a MissingExtraError if pandas is not installed.
-    """
+    """Tables as text in a format, or for `pandas` as one DataFrame with numbers in full."""
     one_of("format", format, (*FORMATS, "pandas"))
     if format != "pandas":
         return "\n\n".join(render(table, format) for table in tables)
@@ -189,12 +174,7 @@ def write_report(
     drawn: Sequence[Figure],
     styles: Sequence[str],
 ) -> list[Path]:
-    """Write tables and pictures to a folder, made if needed, and return the files.
-
-    There is one file per style, of `FORMATS`, and one per table for `csv`; the pictures are PNG
-    files and shown in the HTML page. LaTeX gets them as PDF files, and `cite.bib`. Files of the
-    same names are replaced.
-    """
+    """Write tables and pictures, a file per style, of CSV per table; LaTeX has PDF pictures."""
     folder.mkdir(parents=True, exist_ok=True)
     pictures = {figure.save(folder): figure.title for figure in drawn}
     cite, subtitle = citation(runs), made_of(runs)
@@ -236,11 +216,7 @@ def write_report(
 def report_html(
     runs: Sequence[Run], tables: Sequence[Table], images: Mapping[str, str], *more: str
 ) -> str:
-    """Tables, pictures (titles by address) and citation as sections that any page can hold.
-
-    The ranking and the first picture stand above the contents, which also link `more` ids of the
-    page. The first picture is that of robustness where there is noise.
-    """
+    """Sections for any page: ranking and first picture, contents (with `more` ids), the others."""
     sections = {table.name: (table.title, render(table, "html")) for table in tables}
     for number, (address, title) in enumerate(images.items()):
         words, name = html.escape(title), f"figure-{number + 1}"

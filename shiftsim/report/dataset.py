@@ -88,10 +88,7 @@ def stats_dict(stats: StoreStats, published: Published) -> dict[str, object]:
 def stats_figure(
     stats: StoreStats, published: Published, *, title: str, form: FigureFormat = DEFAULT_FORM
 ) -> Any:
-    """The store beside the published sets, and its cities; all bars lie, so that names have room.
-
-    Raises MissingExtraError: matplotlib is not installed, as for all pictures.
-    """
+    """The store beside the published sets, and its cities, as bars that lie: names have room."""
     groups = stats.groups("city")
     means, cities = [*groups.values()], [name for name in groups if name != ALL]
     width = form.width or palette.PAGE

@@ -13,7 +13,8 @@ from shiftsim.report import statistics
 from shiftsim.report.groups import COLUMNS, Group, by_set, distinct_sets, planner_identities
 from shiftsim.report.statistics import FEW_CLUSTERS, Comparison, score_interval
 from shiftsim.report.tables import Cell, Interval, Number, Record, Row, Table
-from shiftsim.report.words import REASONS, noise_order
+from shiftsim.report.words import REASONS
+from shiftsim.sim.perception import drift_order
 
 ALL_KINDS = "all"
 _BORNE = 5.0  # points of the score that a planner may lose to what it is said to bear
@@ -21,15 +22,11 @@ _SIGNIFICANT = 0.05  # p-value below which a difference is called so
 
 
 def ranking(groups: Sequence[Group]) -> Table | None:
-    """Planners by their score without noise, beside that under the noise of the lowest mean.
-
-    The first noise takes the place of none where that was not run. Only complete groups are ranked;
-    None where there are none. The findings are those of the largest set of scenarios.
-    """
+    """Complete groups by score without noise, beside that under the hardest; None without any."""
     places = list(dict.fromkeys(map(_place, groups)))
     known = [group for group in groups if group.is_complete]
     known.sort(key=lambda group: (places.index(_place(group)), -_score(group)))
-    noises = noise_order(group.noise for group in known)
+    noises = drift_order(group.noise for group in known)
     means = {name: np.mean([*map(_score, _under(known, name))]) for name in noises}
     first, hardest = next(iter(noises), ""), min(noises[1:], key=means.__getitem__, default="")
     heads = ["without noise" if name == "none" else f"under {name}" for name in (first, hardest)]
@@ -192,11 +189,7 @@ def scenario_types(groups: Sequence[Group]) -> list[Table]:
 
 
 def edited_scores(groups: Sequence[Group]) -> list[Table]:
-    """Scores of edited scenarios by kind and difficulty; one table per set that was edited.
-
-    Beside them stand those of the same recorded scenarios without the edit, each as often as it was
-    edited. Scenarios of interPlan's codes have interPlan's score, and no such column.
-    """
+    """Scores of edited scenarios by kind and difficulty, beside the recorded; a table per set."""
     out = []
     for data, mine in by_set(group for group in groups if group.data.edits):
         kinds, difficulties = np.array([graded(name) for name in data.types], str).T
@@ -255,10 +248,7 @@ def _driven_as(group: Group) -> tuple[object, ...]:
 
 
 def drift_matrix(groups: Sequence[Group]) -> Table | None:
-    """Planners by traffic under what they see and when their plans arrive; None without such runs.
-
-    Beside each score stands its change from that of the same planner without any drift.
-    """
+    """Scores by planner, traffic and what drifts, and their changes; None without such runs."""
     drifts = [group for group in groups if _senses(group)]
     modes = list(dict.fromkeys(group.traffic for group in drifts))
     records, findings = list[Record](), list[str]()
@@ -266,7 +256,7 @@ def drift_matrix(groups: Sequence[Group]) -> Table | None:
         for planner in dict.fromkeys(group.planner for group in mine):
             own = [group for group in mine if group.planner == planner]
             by_mode = {mode: {g.noise: g for g in own if g.traffic == mode} for mode in modes}
-            for noise in noise_order(noise for found in by_mode.values() for noise in found):
+            for noise in drift_order(noise for found in by_mode.values() for noise in found):
                 record: Record = {"set": data.label, "planner": planner, "drift": noise}
                 for mode, found in by_mode.items():
                     record[mode] = found[noise].estimate() if noise in found else None
@@ -299,7 +289,7 @@ def _change(before: Group | None, after: Group | None) -> Number | None:
 def _borne(planner: str, mode: str, groups: Mapping[str, Group]) -> str:
     """How late the plans of a planner may be before its score falls; empty where it is unknown."""
     scores = {noise: _score(group) for noise, group in groups.items() if group.is_complete}
-    late = [name for name in noise_order(scores) if name[8:].isdecimal()]
+    late = [name for name in drift_order(scores) if name[8:].isdecimal()]
     if not scores.get("none", 0.0) > _BORNE or not late:  # there is nothing that could fall
         return ""
     falls = [name for name in late if scores[name] < scores["none"] - _BORNE]
@@ -347,11 +337,9 @@ def open_loop_values(group: Group, metric: str) -> FloatArray:
 
 
 def _open_loop_record(group: Group) -> Record:
-    metrics = group.metrics
-    found = metrics.group_by("metric").aggregate([("value", "sum"), ("value", "mean")]).to_pylist()
-    sums, means = ({row["metric"]: row[f"value_{of}"] for row in found} for of in ("sum", "mean"))
+    metrics, means = group.metrics, _metric_means(group)
     plans = metrics.filter(pc.equal(metrics["metric"], open_loop.COUNT))
-    counted, there = sums.get(open_loop.COUNT), pc.sum(plans["threshold"]).as_py()
+    counted, there = (pc.sum(plans[name]).as_py() for name in ("value", "threshold"))
 
     def mean(name: str, scale: float = 1.0) -> Number | None:
         return None if (value := means.get(name)) is None else Number(scale * value)

@@ -24,12 +24,7 @@ def select_tasks(
     noise: str | None = None,
     seed: int | None = None,
 ) -> list[dict[str, Any]]:
-    """The tasks of one scenario, each with its score row and its metric rows.
-
-    The token may be an unambiguous beginning of one. Rows are those of `tasks.parquet`, with `cls`,
-    `why` and `metrics` added; every metric has its `role` (`multiplier`, `weighted` or empty) and
-    `weight`. It is a ConfigError if there is no such task, or several scenarios begin like that.
-    """
+    """Rows of `tasks.parquet` of a scenario, or its beginning, with `cls`, `why`, `metrics`."""
     tokens = set(run.tasks["token"].to_pylist())
     full = beginning(f"run {run.path.name!r}", "scenario", token, tokens)
     wanted = {"planner": planner, "noise": noise, "seed": seed}

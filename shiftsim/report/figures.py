@@ -24,8 +24,8 @@ from shiftsim.report.groups import COLUMNS, DataSet, Group, by_set
 from shiftsim.report.palette import DEFAULT_FORM, SMALL, TEXT, FigureFormat, Style, dashes
 from shiftsim.report.statistics import rank_correlation, score_interval
 from shiftsim.report.tables import Interval, Number
-from shiftsim.report.words import LONG, noise_order
-from shiftsim.sim.perception import LEVELS
+from shiftsim.report.words import LONG
+from shiftsim.sim.perception import LEVELS, drift_order
 
 _NOISES = {"awgn": "white noise (AWGN)", "ou": "correlated noise (OU)"}
 _BOXES = {"perception": "errors", "miss": "misses", "dropout": "drop-outs"}
@@ -148,11 +148,7 @@ def figures(groups: Sequence[Group], *, form: FigureFormat = DEFAULT_FORM) -> li
 
 @palette.in_format
 def open_against_closed(groups: Sequence[Group], *, form: FigureFormat = DEFAULT_FORM) -> Figure:
-    """Open loop against closed loop: a mark per planner and scenario, clean where there is that.
-
-    The legends have Spearman's rank correlations over scenarios, and over the planners' means. It
-    is a ConfigError if no run has open-loop scores.
-    """
+    """A mark per planner and scenario, and rank correlations; a ConfigError without open loop."""
     asked = [group for group in groups if has_open_loop(group)]
     if not asked:
         raise ConfigError("no open-loop scores", hint="shiftsim run --open-loop makes them")
@@ -251,7 +247,7 @@ def _levels(kind: str, groups: Sequence[Group]) -> list[_Place]:
 
     levels = (f"{kind}-{level}" for level in LEVELS)
     if kind == "latency":
-        levels = (n for n in noise_order(g.noise for g in groups) if n[8:].isdecimal())
+        levels = (n for n in drift_order(g.noise for g in groups) if n[8:].isdecimal())
     return [*map(place, ("none", *levels))]
 
 
@@ -264,11 +260,7 @@ def _scores(
     noise: str = "",
     labels: tuple[str, str] = ("", "closed-loop score"),
 ) -> Any:
-    """Planners side by side at every place, a row of panels per traffic mode.
-
-    `columns` are the panels of a row by title, `labels` those of axes without their own. Places are
-    joined by lines if a `noise` is given, which look like it.
-    """
+    """Planners side by side at every place of `columns`, joined by lines if there is a `noise`."""
     planners = list(dict.fromkeys(group.planner for group in groups))
     spread = {"": _SPREAD, "none": 0.06 * len(planners)}.get(noise, 0.02 * len(planners))
     rows = list(dict.fromkeys(group.traffic for group in groups))
@@ -350,10 +342,7 @@ def _series(
     noise: str,
     label: str,
 ) -> tuple[float, float]:
-    """One planner's scores, a little beside the places, so that bars do not cover each other.
-
-    A line has a gap where there is no score. Returns the last point.
-    """
+    """Draw one planner's scores, a little beside the places, and return the last point."""
     xs, ys = np.arange(len(places)) + shift, np.full(len(places), math.nan)
     for index, (found, interval) in enumerate(place.score(group) for place in places):
         if interval is not None:
@@ -376,11 +365,7 @@ def _series(
 def _panels(
     rows: Sequence[str], columns: Sequence[str], form: FigureFormat, *, is_small: bool = False
 ) -> tuple[Any, list[tuple[Any, str, str]]]:
-    """A figure, and its axes with the names of their row and column.
-
-    One that is not wide has all panels below each other. What `is_small` needs one column of a
-    paper, if it is a single panel.
-    """
+    """A figure, and its axes by row and column; a single panel that `is_small` needs one column."""
     width = form.width or (palette.COLUMN if is_small and len(columns) == 1 else palette.PAGE)
     across = len(columns) if width > _WIDE else 1
     down = len(rows) * len(columns) // across

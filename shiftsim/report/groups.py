@@ -5,7 +5,7 @@ table is decided by their `DataSet`: the same scenarios under the same threshold
 """
 
 import hashlib
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, compress, product
 from pathlib import Path, PurePath
@@ -19,6 +19,7 @@ from shiftsim.errors import DataError, one_of
 from shiftsim.kernels import BoolArray, FloatArray
 from shiftsim.metrics import SHORT_NAMES
 from shiftsim.report.tables import Number
+from shiftsim.runs.config import named_checkpoint
 from shiftsim.runs.results import Run
 from shiftsim.sim.perception import drift_order
 from shiftsim.world.scenario import FULL_DURATION
@@ -225,13 +226,7 @@ def distinct_sets(groups: Iterable[Group]) -> list[DataSet]:
 def read_groups(
     runs: Sequence[Run], known: Sequence[KnownSet] = (), *, allow_partial: bool = False
 ) -> list[Group]:
-    """The groups of runs, in the order of runs, planners and noises.
-
-    Sets of scenarios are recognised by the published lists that are known. Planners of one name
-    that are not the same, or were run otherwise and did otherwise, say what tells them apart.
-    `allow_partial` gives labelled means of groups that are not complete. It is a DataError if runs
-    contradict each other, or hold no tasks.
-    """
+    """The groups of runs, named by what tells them apart; a DataError if they contradict."""
     found = [group for run in runs for group in _groups(run, known)]
     by_name: dict[str, list[Group]] = {}
     for group in found:
@@ -291,11 +286,8 @@ def _planner_facts(group: Group) -> dict[str, Any]:
     out |= {k: PurePath(str(v)).name for k, v in identity.get("arguments", {}).items()}
     out |= {"batch size": identity["batch_size"]} if "batch_size" in identity else {}
     if "checkpoint" in identity:
-        others = {*config["planners"]} - {group.name}
-        given = [t for t in config.get("checkpoints", ()) if t.partition("=")[0] not in others]
-        given += [config.get("planner_args", {}).get(group.name, {}).get("checkpoint")]
-        found = given[0] or ("shiftsim" if identity.get("weights") else "official")
-        out["checkpoint"] = PurePath(found.removeprefix(f"{group.name}=")).name
+        shipped = "shiftsim" if identity.get("weights") else "official"
+        out["checkpoint"] = PurePath(named_checkpoint(config, group.name) or shipped).name
     return out
 
 
@@ -333,11 +325,8 @@ def _groups(run: Run, known: Sequence[KnownSet]) -> Iterator[Group]:
     table = np.stack([pc.fill_null(scores[name], 0.0).to_numpy() for name in COLUMNS], axis=1)
     table[:, [name in undefined_columns(run) for name in COLUMNS]] = np.nan
     places = pc.index_in(scores["token"], value_set=pa.array(data.tokens, pa.string())).to_numpy()
-    order = product(
-        _ordered(tasks["planner"], run.manifest["config"]["planners"]),
-        drift_order(pc.unique(tasks["noise"]).to_pylist()),
-    )
-    for planner, noise in order:
+    noises = drift_order(pc.unique(tasks["noise"]).to_pylist())
+    for planner, noise in product(run.manifest["config"]["planners"], noises):
         seeds = np.unique(tasks["seed"].to_numpy()[_matching(tasks, planner, noise)])
         values = np.full((len(seeds), len(data.tokens), len(COLUMNS)), np.nan)
         rows = np.flatnonzero(_matching(scores, planner, noise))
@@ -349,23 +338,13 @@ def _groups(run: Run, known: Sequence[KnownSet]) -> Iterator[Group]:
             yield replace(whole.only(chosen), data=part)
 
 
-def _ordered(column: pa.ChunkedArray, names: Collection[str]) -> list[str]:
-    """The values of a column in the order of the names, others behind them."""
-    rank = {name: place for place, name in enumerate(names)}
-    return sorted(pc.unique(column).to_pylist(), key=lambda name: rank.get(name, len(rank)))
-
-
 def _matching(table: pa.Table, planner: str, noise: str) -> BoolArray:
     mask = pc.and_(pc.equal(table["planner"], planner), pc.equal(table["noise"], noise))
     return mask.to_numpy().astype(np.bool_)
 
 
 def _by_duration(data: DataSet) -> list[tuple[DataSet, BoolArray]]:
-    """The scenarios of each class of duration, as a set of its own, and (N,) which they are.
-
-    Scores of short scenarios are others (`docs/open_data.md`). One of unknown duration belongs
-    to each part, so that no part of an incomplete set looks complete.
-    """
+    """A set per class of duration, and (N,) its scenarios; each has those of unknown duration."""
     if not set(data.classes) - {FULL_DURATION}:
         return [(data, np.ones(len(data.tokens), np.bool_))]
     masks = {name: np.isin(data.durations, (name, "")) for name in data.classes}

@@ -42,10 +42,7 @@ class FigureFormat(NamedTuple):
     def of(
         cls, width: float | str | None = None, *, serif: bool = False, plain: bool = False
     ) -> "FigureFormat":
-        """A format of a width [inches] that may have a unit, as in `3.5in`, `89mm` or `252pt`.
-
-        Raises ConfigError: the width is no length between 2 and 40 inches.
-        """
+        """A format of a width [inches], or with a unit as in `89mm`, or a ConfigError."""
         found = re.fullmatch(r"(\d+\.?\d*) ?(in|cm|mm|pt|)", str(width or 0))
         inches = float(found[1]) * _INCHES[found[2]] if found else 0.0
         if width is not None and not 2.0 <= inches <= 40.0:
@@ -72,10 +69,7 @@ def in_format(draw: Callable[_Call, _Made]) -> Callable[_Call, _Made]:
 def new_figure(
     layout: Literal["constrained", "compressed"] | None = "constrained", **settings: Any
 ) -> Any:
-    """An empty figure of matplotlib that can be measured; a MissingExtraError without matplotlib.
-
-    Ids in SVG files are always the same; PDF files hold their fonts as TrueType, as papers ask for.
-    """
+    """An empty figure that can be measured; a MissingExtraError without matplotlib."""
     _matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -164,10 +158,7 @@ def dashes(noise: str) -> Literal["-", "--"]:
 
 
 def planner_styles(planners: Iterable[str]) -> dict[str, Style]:
-    """A style per planner; those without one of their own get one by their order.
-
-    A name may end in a remark, as in `idm (reactive)`; the first of these has the planner's style.
-    """
+    """A style per planner, its own (also with a remark, as in `idm (reactive)`) or the next one."""
     out: dict[str, Style] = {}
     others = cycle(_OTHERS)
     for name in dict.fromkeys(planners):

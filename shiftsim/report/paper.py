@@ -8,8 +8,9 @@ from typing import NamedTuple
 from shiftsim.report.groups import COLUMNS, DataSet, Group, by_set, distinct_sets
 from shiftsim.report.statistics import FEW_CLUSTERS, score_interval
 from shiftsim.report.tables import Cell, Number, Row, Table
-from shiftsim.report.words import LONG, NAMES, noise_order
+from shiftsim.report.words import LONG, NAMES
 from shiftsim.sim.noise import NOISE_NAMES
+from shiftsim.sim.perception import drift_order
 
 VAL14 = "val14"
 INTERVALS = (
@@ -70,11 +71,7 @@ class _Column(NamedTuple):
 def semantic_shift(
     groups: Sequence[Group], published: Published | None = None, *, with_published: bool = False
 ) -> list[Table]:
-    """Clean scores of all scenarios, per city and per metric: one table per set of scenarios.
-
-    The paper's sites give cities their short names and order. `with_published` shows its scores as
-    well, in the same table where the cities are the same.
-    """
+    """Clean scores of all scenarios, per city and per metric; a table per set of scenarios."""
     sets = by_set(group for group in groups if group.noise == "none")
     others = [one for one in sets if one[0].known != VAL14]
     val14 = [one for one in sets if one[0].known == VAL14]
@@ -197,7 +194,7 @@ def noise_robustness(groups: Sequence[Group], published: Published | None = None
     found = {group.noise for group in groups}
     if found <= {"none"}:
         return None
-    noises = noise_order([*found, *(NOISE_NAMES if published else ())])
+    noises = drift_order([*found, *(NOISE_NAMES if published else ())])
     scores: dict[tuple[str, ...], dict[str, Cell]] = {}
     for data, mine in by_set(groups):
         for group in mine:

@@ -20,20 +20,13 @@ from shiftsim.runs.rollouts import Task
 
 
 def score_table(runs: Sequence[Run], *, allow_partial: bool = False, **look: Any) -> str:
-    """The scores of runs as text; threshold profile, metric version and count stand with it.
-
-    `allow_partial` prints the mean over the finished tasks of an incomplete row, labelled so;
-    `look` has the width and marks of `tables.text`.
-    """
+    """The scores of runs as text; `allow_partial` labels means, `look` is that of `tables.text`."""
     table = scores(read_groups(runs, allow_partial=allow_partial))
     return text(replace(table, title=""), **look)
 
 
 def scores(groups: Sequence[Group], *, by: str | None = None) -> Table:
-    """All columns of all groups: means, and below them their deviations over the seeds.
-
-    For machines every row says by itself what it is.
-    """
+    """All columns of all groups: means, and below them their deviations over the seeds."""
     several = len({(group.data.key, group.traffic) for group in groups}) > 1
     heading = [*(["set", "traffic"] if several else []), "planner", "noise", *([by] if by else [])]
     rows: list[Row] = []
@@ -114,11 +107,7 @@ def _lines(labels: tuple[str, ...], part: Group, caption: str) -> tuple[list[Row
 
 
 def worst_rollouts(run: Run, count: int = 10) -> list[dict[str, Any]]:
-    """The worst scenarios, each by its worst rollout, in the order of `words.worst_of`.
-
-    Each with the key of that rollout, its `cls`, the `reason` in words, and how many `others` of
-    the same recording have the same cause.
-    """
+    """The worst scenarios by their worst rollout: key, `cls`, `reason`, number of like `others`."""
     keys = [*Task._fields]
     lowest = run.scores.group_by("token").aggregate([("cls", "min")])
     scores = run.scores.select([*keys, "cls", "log_name"]).join(lowest, "token")

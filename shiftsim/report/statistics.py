@@ -37,12 +37,7 @@ def cluster_codes(clusters: Sequence[str]) -> IntArray:
 def bootstrap_interval(
     values: FloatArray, clusters: IntArray, *, draws: int = DRAWS
 ) -> Interval | None:
-    """Percentile interval of the mean; clusters are drawn with replacement.
-
-    `values` (S,) are those of scenarios, `clusters` (S,) their recordings, by `cluster_codes`. The
-    mean of a draw is over its scenarios, so large recordings weigh as they do in the score. None
-    with fewer than two clusters: then nothing is known of the spread between them.
-    """
+    """Percentile interval of the mean of values (S,), clusters drawn; None with fewer than two."""
     sums, sizes = np.bincount(clusters, values), np.bincount(clusters).astype(np.float64)
     count = len(sums)
     if count < 2:
@@ -106,11 +101,7 @@ def forest(found: Sequence[Comparison]) -> list[str]:
 def sign_flip_test(
     delta: FloatArray, clusters: IntArray, *, draws: int = DRAWS
 ) -> tuple[float, float]:
-    """Two-sided p-value of a mean difference, and the smallest one that could come out.
-
-    If the planners were alike, the sign of each recording's summed difference would be a toss of
-    a coin. Few recordings: all patterns of signs are tried; else `draws` random ones.
-    """
+    """Two-sided p-value of a mean difference by signs of whole clusters, and the smallest one."""
     sums = np.bincount(clusters, delta)
     observed = abs(float(sums.sum()))
     # sums that differ by rounding alone are as extreme as the observed one

@@ -124,10 +124,7 @@ def shown(cell: Cell) -> str:
 
 
 def text(table: Table, width: int = 0, mark: Callable[[str], str] = str) -> str:
-    """A table in plain text; wider than `width` it is printed in pieces, 0 for any.
-
-    `mark` changes the look, not the width, of the best numbers of each setting.
-    """
+    """A table in plain text, in pieces if wider than `width` > 0; the best numbers get a `mark`."""
     columns, best = [], _best(table) if mark is not str else ()
     for index, cells in enumerate(zip(*table.lines, strict=True)):
         side, size = "<" if index < table.num_labels else ">", max(map(len, cells))
@@ -251,11 +248,7 @@ def _latex(table: Table) -> str:
 
 
 def _for_paper(table: Table) -> Table:
-    """The measured columns of a table, where it says which these are, and the labels that differ.
-
-    What all rows share is said in the title. Rows of one setting, which are all labels but the
-    planner, stand together.
-    """
+    """The measured columns and the labels that differ; what all rows share goes into the title."""
     table = table.paper or table
     shared, said = _shared(table)
     names = list(enumerate(table.header))
@@ -289,10 +282,7 @@ def _shared(table: Table) -> tuple[Collection[str], str]:
 
 
 def _best(table: Table) -> set[tuple[int, int]]:
-    """Row and column of the best numbers of planners by setting, as printed, if any is worse.
-
-    Rows below that of a planner, such as deviations, are compared with nothing.
-    """
+    """Row and column of the best planner's numbers by setting, as printed, where they differ."""
     if "planner" not in table.header:
         return set()
     planner, labels = list(table.header).index("planner"), range(table.num_labels)
@@ -380,11 +370,7 @@ def latex_picture(name: str, title: str, *, is_wide: bool = False) -> str:
 
 
 def _html(table: Table) -> str:
-    """A section; its table lies in a box that scrolls where the page is too narrow.
-
-    The planner comes first, the best numbers of each setting are bold, and settings that all rows
-    share stand above the table.
-    """
+    """A section: planner first, the best in bold, shared settings above, in a box that scrolls."""
     (shared, said), names = _shared(table), table.header
     places = [i for i, name in enumerate(names) if i >= table.num_labels or name not in shared]
     places.sort(key=lambda i: names[i] != "planner")

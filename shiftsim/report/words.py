@@ -8,7 +8,7 @@ import pyarrow as pa
 
 from shiftsim.metrics import MULTIPLIERS, SHORT_NAMES
 from shiftsim.runs.rollouts import Task
-from shiftsim.sim.perception import drift_order
+from shiftsim.runs.tables import task_of as task_of
 from shiftsim.world.state import AgentKind, Tracks
 
 COLLISIONS = "no_ego_at_fault_collisions"
@@ -54,16 +54,6 @@ def in_words(metric: str, names: Mapping[str, str] = NAMES) -> str:
 def legend(shorts: Iterable[str], words: Mapping[str, str] = LONG) -> str:
     """What those of some headings mean that are short: "no at-fault collision (NCR), …"."""
     return ", ".join(f"{words[name]} ({name})" for name in shorts if name in words)
-
-
-def noise_order(names: Iterable[str]) -> list[str]:
-    """Noises, each once: none, then by kind from low to high, then custom ones by name."""
-    return drift_order(names)
-
-
-def task_of(row: Mapping[str, Any]) -> Task:
-    """The task that a row of one of a run's tables is of."""
-    return Task(*(row[name] for name in Task._fields))
 
 
 def rows_by_task(table: pa.Table) -> dict[Task, list[dict[str, Any]]]:
@@ -142,11 +132,7 @@ def worst_moment(found: Iterable[Violation]) -> Violation | None:
 
 
 def worst_of(rows: Iterable[Mapping[str, Any]], count: int) -> list[tuple[Mapping[str, Any], int]]:
-    """The worst scenarios, each by its worst rollout, by score and by the severity of its cause.
-
-    At most one per recording and cause; with each, how many other scenarios are like it. Rows hold
-    a task, `cls`, `cause`, its `severity`, and `log`, the recording.
-    """
+    """The worst scenarios, one per recording and cause, and how many others are like each."""
     by_token: dict[str, Mapping[str, Any]] = {}
     for row in sorted(
         rows, key=lambda r: (r["cls"], r["severity"], r["noise"] != "none", task_of(r))

@@ -26,12 +26,7 @@ _AHEAD: IntArray = np.arange(0, 2_100_000, 100_000)  # us, times of a plan
 
 
 def grade(scenario: Scenario) -> str:
-    """How hard an edited scenario is, of `GRADES`; empty where it is not in the way or unavoidable.
-
-    That is the least of their decelerations with which a driver who brakes hits nothing; the
-    hardest where PDM-Closed hits nothing, though such braking does. It is in the way where a driver
-    who does not react hits something that the edit made.
-    """
+    """How hard an edited scenario is, of `GRADES`; empty where nobody hits anything, or all do."""
     edited = set(scenario.script.tokens if scenario.script else ())
     if not hits(scenario, Braking(scenario, 0.0)) & edited:
         return ""
@@ -48,11 +43,7 @@ def is_avoidable(scenario: Scenario) -> bool:
 
 
 def hits(scenario: Scenario, planner: Planner) -> set[str]:
-    """Tokens of the tracks that a planner touches at fault beside replayed traffic.
-
-    A contact at the side counts as at fault, whatever the lane. It drives on for less than a second
-    after the first one.
-    """
+    """Tokens of the tracks that a planner hits first, at fault or at its side."""
     rollout, found = Rollout(scenario, planner), set[str]()
     while not rollout.done and not found:
         rollout.advance(planner.plan(rollout.observe()))
@@ -71,10 +62,7 @@ def at_fault(log: SimulationLog, count: int) -> list[Collision]:
 
 
 class Braking:
-    """Drives what was recorded, and brakes half a second after it has noticed something.
-
-    What stands is noticed at the start, pedestrians that an edit made when they set off.
-    """
+    """Drives what was recorded, and brakes when it notices what stands, or an edit moves."""
 
     name = "braking"
 
@@ -85,10 +73,7 @@ class Braking:
         *,
         driven: tuple[IntArray, FloatArray] | None = None,
     ) -> None:
-        """For one scenario; a deceleration of 0 [m/s^2] does not react.
-
-        `driven` are times (K,) [us] and states (K, 11) to drive in place of the recorded ones.
-        """
+        """A deceleration of 0 [m/s^2] does not react; `driven`: times (K,) [us], states (K, 11)."""
         rows = slice(int(scenario.iteration_rows[0]), None)
         time_us, states = driven or (scenario.time_us[rows], scenario.ego[rows])
         distinct = np.flatnonzero(np.diff(time_us, prepend=-1) > 0)
@@ -135,8 +120,7 @@ class Braking:
         start = self._recorded(np.array([since]))[0]
         speed = float(np.interp(since, self._time_us, self._speed))
         late = np.clip((time_us - since) * 1e-6, 0.0, speed / self._deceleration)
-        braked: FloatArray = start + speed * late - 0.5 * self._deceleration * late**2
-        return braked
+        return start + speed * late - 0.5 * self._deceleration * late**2
 
     def _recorded(self, time_us: IntArray) -> FloatArray:
         """Where the recording was, and goes on at its last speed [m]."""

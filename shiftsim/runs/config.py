@@ -33,14 +33,12 @@ def parse_seeds(text: str) -> list[int]:
             if len(span) > MAX_SEEDS:
                 raise ConfigError(f"seeds {text!r} are more than {MAX_SEEDS}")
             if not span:
-                raise ConfigError(
-                    f"seeds {text!r} begin behind their end", hint=f"--seeds {last}-{first}"
-                )
+                what = f"seeds {text!r} begin behind their end"
+                raise ConfigError(what, hint=f"--seeds {last}-{first}")
             seeds += span
     except ValueError as error:
-        raise ConfigError(
-            f"seeds {text!r} are not integers", hint="for example --seeds 0,1,2 or --seeds 0-2"
-        ) from error
+        what = f"seeds {text!r} are not integers"
+        raise ConfigError(what, hint="for example --seeds 0,1,2 or --seeds 0-2") from error
     return seeds
 
 
@@ -57,9 +55,8 @@ def parse_workers(text: str) -> int:
     if text == "auto":
         return 0
     if not text.isdecimal() or int(text) < 1:
-        raise ConfigError(
-            f"workers {text!r} is neither auto nor a number from 1 on", hint="--workers auto"
-        )
+        what = f"workers {text!r} is neither auto nor a number from 1 on"
+        raise ConfigError(what, hint="--workers auto")
     return int(text)
 
 
@@ -160,10 +157,8 @@ class RunConfig:
         for name in ("planners", *DRIFT, "metrics", "checkpoints", "seeds"):
             values = labels if name == "planners" else getattr(self, name)
             if len(set(values)) != len(values):
-                raise ConfigError(
-                    f"{name} {list(values)!r}: a value is listed twice",
-                    hint=_LABELS if name == "planners" else "",
-                )
+                what = f"{name} {list(values)!r}: a value is listed twice"
+                raise ConfigError(what, hint=_LABELS if name == "planners" else "")
         if not self.planners:
             raise ConfigError("no planner", hint="name one, for example --planner idm")
         for name in (*DRIFT, "seeds"):
@@ -172,9 +167,8 @@ class RunConfig:
         if any(not 0 <= seed <= MAX_SEED for seed in self.seeds):
             raise ConfigError(f"seeds {list(self.seeds)!r}: a seed is an integer from 0 on")
         if self.executor == "dask" and not self.scheduler:
-            raise ConfigError(
-                "executor 'dask' needs a scheduler", hint="for example --scheduler tcp://head:8786"
-            )
+            what = "executor 'dask' needs a scheduler"
+            raise ConfigError(what, hint="for example --scheduler tcp://head:8786")
         if self.shard:
             parse_shard(self.shard)
         for planner in self.planner_args:
@@ -213,11 +207,7 @@ def make_config(values: Mapping[str, Any], *, where: str = "run") -> RunConfig:
 
 
 def split_label(planner: str) -> tuple[str, str]:
-    """Label and source of a planner in settings: `LABEL=SOURCE`, or a source, its own label.
-
-    The label is what tasks, tables and pictures call the planner. It holds neither `:` nor a slash.
-    It is a ConfigError if label or source is empty.
-    """
+    """Label (without `:` and slashes) and source of `LABEL=SOURCE`, or a source, its own label."""
     label, equals, source = planner.partition("=")
     if not equals or any(c in label for c in ":/\\"):
         return planner, planner
@@ -226,27 +216,28 @@ def split_label(planner: str) -> tuple[str, str]:
     return label, source
 
 
-def parse_argument(text: str, planners: tuple[str, ...]) -> tuple[str, str, Value]:
-    """Label, name and value of one `key=value`, or `label.key=value` with several planners.
+def named_checkpoint(config: Mapping[str, Any], planner: str) -> str:
+    """The checkpoint that settings in a manifest name for a planner; empty where they do not."""
+    others = {*config["planners"]} - {planner}
+    given = [t for t in config.get("checkpoints", ()) if t.partition("=")[0] not in others]
+    given += [config.get("planner_args", {}).get(planner, {}).get("checkpoint", "")]
+    return str(given[0]).removeprefix(f"{planner}=")
 
-    The value is read as a TOML value; anything that is none is taken as a string. It is a
-    ConfigError if it has another form, or does not say which planner is meant.
-    """
+
+def parse_argument(text: str, planners: tuple[str, ...]) -> tuple[str, str, Value]:
+    """Label, name and value, of TOML or text, of `key=value`, or `label.key=value` of several."""
     planners = tuple(split_label(planner)[0] for planner in planners)
     key, equals, raw = text.partition("=")
     if not equals or not key:
-        raise ConfigError(
-            f"planner argument {text!r} is not key=value", hint="for example --planner-arg gap=1.0"
-        )
+        what = f"planner argument {text!r} is not key=value"
+        raise ConfigError(what, hint="for example --planner-arg gap=1.0")
     named = [name for name in planners if key.startswith(f"{name}.")]
     owner, dot, _ = key.partition(".")
     if not named and len(planners) != 1:
         if dot:
             one_of(f"argument {text!r}: planner", owner, planners)
-        raise ConfigError(
-            f"planner argument {text!r} does not say which planner is meant",
-            hint=f"write PLANNER.{text}; planners: {', '.join(planners)}",
-        )
+        what = f"planner argument {text!r} does not say which planner is meant"
+        raise ConfigError(what, hint=f"write PLANNER.{text}; planners: {', '.join(planners)}")
     planner = max(named, key=len) if named else planners[0]
     name = key[len(planner) + 1 :] if named else key
     try:

@@ -7,7 +7,7 @@ from contextlib import closing
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from shiftsim._version import __version__
 from shiftsim.data import open_store
@@ -15,7 +15,7 @@ from shiftsim.data.store.tables import digest
 from shiftsim.errors import ConfigError, DataError, one_of
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.metrics.open_loop import NAMES as OPEN_LOOP
-from shiftsim.runs.config import RunConfig, default_workers, make_config, parse_shard
+from shiftsim.runs.config import RunConfig, make_config, parse_shard
 from shiftsim.runs.edited import make_edits
 from shiftsim.runs.execute import ALONE, OnProgress, Progress
 from shiftsim.runs.folder import RunWriter
@@ -31,18 +31,12 @@ from shiftsim.runs.tables import FAILED, MISSING, OK, TaskResult, stored_results
 from shiftsim.runs.task import ScenarioReader, attempt, planner_times, score_rollout
 from shiftsim.runs.workers import map_unordered
 
+Score: TypeAlias = Callable[[Entry], TaskResult]
 ELSEWHERE = "elsewhere"  # what moved ego and others, where nobody says more
 
 
 def merge_runs(runs: Sequence[Run], *, out: str | None = None, allow_partial: bool = False) -> Run:
-    """Write the run folder that shards `1/n` to `n/n` are parts of: the same bytes as without.
-
-    By default it has the name of the shards without their number. With `allow_partial` shards may
-    be missing; their tasks then are `missing`.
-
-    Raises:
-        ConfigError: Something is no shard, of another run, given twice or missing.
-    """
+    """Write the run folder that shards `1/n` to `n/n` are parts of: the same bytes as without."""
     first = runs[0].manifest
     shards = _check_shards(runs, allow_partial=allow_partial)
     name = first["run"].removesuffix(f".{first['shard'].replace('/', '-of-')}")
@@ -73,9 +67,8 @@ def _check_shards(runs: Sequence[Run], *, allow_partial: bool) -> list[str]:
     first, shards = runs[0], [run.manifest["shard"] for run in runs]
     for run, shard in zip(runs, shards, strict=True):
         if not shard:
-            raise ConfigError(
-                f"{str(run.path)!r} is not a shard", hint="merge joins runs made with --shard i/n"
-            )
+            what = f"{str(run.path)!r} is not a shard"
+            raise ConfigError(what, hint="merge joins runs made with --shard i/n")
         differing = difference(run.manifest, first.manifest["determining"], shard)
         if differing or parse_shard(shard)[1] != parse_shard(shards[0])[1]:
             raise ConfigError(
@@ -115,32 +108,26 @@ def _without_result(run: Run) -> Iterator[tuple[Task, str]]:
             yield Task(*key), error
 
 
-class Rescorer:
-    """Scores one stored rollout of a run after the other."""
+def _rescorer(path: Path, store: str, config: RunConfig) -> Score:
+    """What scores one stored rollout of a run after the other."""
+    run = open_run(path)
+    about = run.manifest
+    edits = make_edits(about["edits"], path.name) if about.get("edits") else None
+    scenarios, open_loop = ScenarioReader(store, edits), dict[Task, list[dict[str, Any]]]()
+    for row in run.metrics.to_pylist() if config.open_loop else ():
+        if row["metric"] in OPEN_LOOP:  # no threshold changes it
+            task = Task(*(row.pop(name) for name in Task._fields))
+            open_loop.setdefault(task, []).append(row | {"thresholds": config.thresholds})
 
-    def __init__(self, run: Path, store: str, config: RunConfig) -> None:
-        self.config, self._run = config, open_run(run)
-        edits = self._run.manifest.get("edits")
-        edit_set = make_edits(edits, self._run.path.name) if edits else None
-        self._scenarios = ScenarioReader(store, edit_set)
-        self._open_loop: dict[Task, list[dict[str, Any]]] = {}  # no threshold changes it
-        for row in self._run.metrics.to_pylist() if config.open_loop else ():
-            if row["metric"] in OPEN_LOOP:
-                task = Task(*(row.pop(name) for name in Task._fields))
-                self._open_loop.setdefault(task, []).append(row)
+    def score(entry: Entry) -> TaskResult:
+        scenario = scenarios.read(entry.task.token)
+        log = run.rollout(entry.task, scenario)
+        undefined = about.get("elsewhere", {}).get("undefined", ())
+        scores, metrics = score_rollout(scenario, log, config, undefined)
+        metrics += open_loop.get(entry.task, [])
+        return TaskResult(entry.task, OK, scenario.scenario_type, scores=scores, metrics=metrics)
 
-    def __call__(self, entry: Entry) -> TaskResult:
-        """The result of a task."""
-        return attempt(entry.task, partial(self._score, entry.task))
-
-    def _score(self, task: Task) -> TaskResult:
-        scenario = self._scenarios.read(task.token)
-        log = self._run.rollout(task, scenario)
-        undefined = self._run.manifest.get("elsewhere", {}).get("undefined", ())
-        scores, metrics = score_rollout(scenario, log, self.config, undefined)
-        profile = {"thresholds": self.config.thresholds}
-        metrics += [row | profile for row in self._open_loop.get(task, [])]
-        return TaskResult(task, OK, scenario.scenario_type, scores=scores, metrics=metrics)
+    return score
 
 
 def tasks_with_rollouts(run: Run) -> list[Task]:
@@ -148,10 +135,8 @@ def tasks_with_rollouts(run: Run) -> list[Task]:
     statuses = zip(run.rollout_places.items(), run.tasks["status"].to_pylist(), strict=True)
     done = {task: place for (task, place), status in statuses if status == OK}
     if without := sum(place is None for place in done.values()):
-        raise DataError(
-            f"run {run.path.name!r} holds no rollouts for {without} of {len(done)} tasks",
-            hint="run again with --save-rollouts all",
-        )
+        what = f"run {run.path.name!r} holds no rollouts for {without} of {len(done)} tasks"
+        raise DataError(what, hint="run again with --save-rollouts all")
     return sorted(done, key=lambda task: task.token)
 
 
@@ -166,14 +151,7 @@ def rescore(
     on_progress: OnProgress = lambda progress: None,
     argv: Sequence[str] = (),
 ) -> Run:
-    """Write a run folder (`runs/<id>`) as if the run had been made with other thresholds.
-
-    `metrics` are custom ones by `module:attribute`, `store` says where the store has moved,
-    `workers` of 0 chooses from the cores, `argv` is for the manifest.
-
-    Raises:
-        DataError: Rollouts are missing, or the store is another one.
-    """
+    """Write a run folder as if the run had been made with other thresholds or `metrics`."""
     run = open_run(run.path)  # with its own names
     for metric in metrics:
         load_metric(metric)
@@ -190,14 +168,9 @@ def rescore(
     target = Path(out) if out else RUNS / run_name(config, run.manifest["split"], fingerprint)
     check_target(target, fingerprint)
     done = tasks_with_rollouts(run)
-    statuses = dict(zip(run.rollout_places, run.tasks["status"].to_pylist(), strict=True))
+    place = run.manifest["store"] if store is None else found.source
     manifest = make_manifest(
-        target,
-        config=config,
-        split=run.manifest["split"],
-        store=run.manifest["store"] if store is None else found.source,
-        fingerprint=fingerprint,
-        argv=argv,
+        target, config, fingerprint, split=run.manifest["split"], store=place, argv=argv
     )
     kept = ("edits", "split_size", "elsewhere")
     manifest |= {key: run.manifest[key] for key in kept if key in run.manifest}
@@ -205,15 +178,20 @@ def rescore(
         for result in stored_results(run.path):
             if result.status != OK:  # it stays so
                 writer.add(replace(result, seconds={}))
-        make = partial(Rescorer, run.path.resolve(), found.source, config)
+        make = partial(_rescorer, run.path.resolve(), found.source, config)
         for result in _scored(make, [Entry(task) for task in done], workers, on_progress):
             writer.add(replace(result, location=run.rollout_places[result.task]))
         manifest |= {"state": "finished", "ended": now(), "rescored_from": run.path.name}
-        return writer.finish(manifest, statuses, dict(_without_result(run)))
+        return writer.finish(manifest, run.rollout_places, dict(_without_result(run)))
+
+
+def _attempting(make: Callable[[], Score]) -> Score:
+    score = make()
+    return lambda entry: attempt(entry.task, partial(score, entry))
 
 
 def _scored(
-    make: Callable[[], Callable[[Entry], TaskResult]],
+    make: Callable[[], Score],
     entries: Sequence[Entry],
     workers: int,
     on_progress: OnProgress,
@@ -221,9 +199,9 @@ def _scored(
     """The results of rollouts, which so many processes share, to be put on disk as they come."""
     progress = Progress(0, len(entries), 0)
     outcomes = map_unordered(
-        make,
+        partial(_attempting, make),
         entries,
-        workers=min(workers or default_workers(), len(entries)),
+        workers=workers,
         alone=1,
         group=lambda entry: entry.task.token,
     )
@@ -235,24 +213,17 @@ def _scored(
             on_progress(replace(progress, news=[result]))
 
 
-class ElsewhereScorer:
-    """Scores one rollout after the other that was driven elsewhere."""
+def _elsewhere_scorer(
+    store: str, config: RunConfig, undefined: Sequence[str], given: dict[str, Any]
+) -> Score:
+    """What scores rollouts that were driven elsewhere; arguments of `rollout_of` are given."""
+    scenarios = ScenarioReader(store)
 
-    def __init__(self, store: str, config: RunConfig, undefined: Sequence[str], **given: Any):
-        """`given` are arguments of `rollout_of`."""
-        self.config, self._undefined, self._given = config, undefined, given
-        self._scenarios = ScenarioReader(store)
-
-    def __call__(self, entry: Entry) -> TaskResult:
-        """The result of a rollout."""
-        return attempt(entry.task, partial(self._score, entry))
-
-    def _score(self, entry: Entry) -> TaskResult:
-        scenario, driven = self._scenarios.read(entry.task.token), entry.read()
-        log, remarks = rollout_of(driven, scenario, **self._given)
-        scores, metrics = score_rollout(scenario, log, self.config, self._undefined)
-        is_recorded = driven.boxes is None and not self._undefined
-        rows = rollout_rows(log, with_tracks=not is_recorded, with_kinds=not is_recorded)
+    def score(entry: Entry) -> TaskResult:
+        scenario, driven = scenarios.read(entry.task.token), entry.read()
+        log, remarks = rollout_of(driven, scenario, **given)
+        scores, metrics = score_rollout(scenario, log, config, undefined)
+        has_others = driven.boxes is not None or bool(undefined)
         return TaskResult(
             entry.task,
             OK,
@@ -260,9 +231,11 @@ class ElsewhereScorer:
             seconds=planner_times(log) if "planning_seconds" in driven.fields else {},
             scores=scores,
             metrics=metrics,
-            rollout=encode_rows(rows),
+            rollout=encode_rows(rollout_rows(log, with_tracks=has_others, with_kinds=has_others)),
             remarks=remarks,
         )
+
+    return score
 
 
 def score_elsewhere(
@@ -281,15 +254,7 @@ def score_elsewhere(
     on_progress: OnProgress = lambda progress: None,
     argv: Sequence[str] = (),
 ) -> Run:
-    """Write a run folder (`runs/<id>`) with the scores of rollouts that were driven elsewhere.
-
-    `recorded` and `partial_rollouts` are as in `rollout_of`, and so is `point`, where the source
-    does not say it; `traffic` and `controller` name what moved others and ego there.
-
-    Raises:
-        ConfigError: Settings contradict the source.
-        DataError: A scenario is unknown, or none of the rollouts can be scored.
-    """
+    """Write a run folder with the scores of rollouts; arguments are labels, or of `rollout_of`."""
     if point and one_of("point", point, POINTS) != (source.point or point):
         words = f"--point {point}, but {source.name} says {source.point}"
         raise ConfigError(words, hint="leave --point out")
@@ -314,12 +279,12 @@ def score_elsewhere(
     target = Path(out) if out else RUNS / run_name(config, split, fingerprint)
     is_new = check_target(target, fingerprint) == "new"
     manifest = make_manifest(
-        target, config=config, split=split, store=found.source, fingerprint=fingerprint, argv=argv
+        target, config, fingerprint, split=split, store=found.source, argv=argv
     )
     undefined = () if recorded or source.has_boxes else NEED_BOXES
     remarks, failed = Counter[str](), list[TaskResult]()
     with closing(RunWriter(target, manifest)) as writer:
-        make = partial(ElsewhereScorer, found.source, config, undefined, **given)
+        make = partial(_elsewhere_scorer, found.source, config, undefined, given)
         for result in _scored(make, source.entries, workers, on_progress):
             writer.add(result)
             remarks.update(result.remarks)

@@ -17,7 +17,7 @@ from shiftsim.errors import ConfigError, DataError
 from shiftsim.metrics import SHORT_NAMES
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.rollouts.files import stored_plans, stored_tracks
+from shiftsim.runs.rollouts.files import stack, stored_plans, stored_tracks
 from shiftsim.runs.tables import task_of
 from shiftsim.world.scenario import FULL_DURATION
 
@@ -97,12 +97,7 @@ class Difference:
 def diff_runs(
     first: Run, second: Run, *, limit: int = 10, tolerance: float = TOLERANCE
 ) -> Difference:
-    """Compare two runs, and look into a number of changes, the largest of the score first.
-
-    Rollouts part where a quantity differs by more than the tolerance [m, rad, …]. Planners are
-    paired by name; two runs of one planner each are compared whatever their names. It is a
-    ConfigError if they have no rollout in common.
-    """
+    """Compare two runs by planner, or two of one each; look into the `limit` largest changes."""
     planners = [run.manifest["config"]["planners"] for run in (first, second)]
     single = len(planners[0]) == len(planners[1]) == 1
     names = dict(zip(*planners, strict=True)) if single else {n: n for n in planners[0]}
@@ -144,41 +139,31 @@ def diff_lines(found: Difference) -> list[str]:
     """Two runs compared, in words."""
     means = "– (scenarios of different durations)"
     if found.means is not None:
-        before, after = (100.0 * mean for mean in found.means)
-        means = f"{before:.2f} → {after:.2f}"
+        means = _in_words(*found.means)
     lone = f" · only in one run {found.only_first} and {found.only_second}"
-    lines = [
-        f" same {found.same} · better {found.better} · worse {found.worse}"
-        f"{lone if found.only_first or found.only_second else ''}"
-        f"      CLS of the common ones {means}"
-    ]
+    counts = f" same {found.same} · better {found.better} · worse {found.worse}"
+    counts += lone if found.only_first or found.only_second else ""
+    lines = [f"{counts}      CLS of the common ones {means}"]
     if found.settings:
         lines.append(f" settings that differ: {', '.join(found.settings)}")
     for change in found.changes:
         task = change.task
         seed = "" if task.noise == "none" else f" seed {task.seed}"
-        both = (
-            task.planner if change.planner == task.planner else f"{task.planner}/{change.planner}"
-        )
-        metrics = ", ".join(
-            f"{name} {_score(a)} → {_score(b)}" for name, (a, b) in change.metrics.items()
-        )
-        lines.append(
-            f" {task.token}  {both} {task.noise}{seed}  "
-            f"{100.0 * change.first:.2f} → {100.0 * change.second:.2f}  {metrics}"
-        )
+        both = "/".join(dict.fromkeys((task.planner, change.planner)))
+        metrics = ", ".join(f"{name} {_in_words(*pair)}" for name, pair in change.metrics.items())
+        total = _in_words(change.first, change.second)
+        lines.append(f" {task.token}  {both} {task.noise}{seed}  {total}  {metrics}")
         parts = [f"first difference {change.departure}" if change.departure else change.note]
         if change.largest and change.largest[0]:
-            parts.append(
-                "largest distance of the egos {:.3g} m at {:.1f} s".format(*change.largest)
-            )
+            gap, seconds = change.largest
+            parts.append(f"largest distance of the egos {gap:.3g} m at {seconds:.1f} s")
         lines.append(f"   {'; '.join(parts)}")
     left = found.better + found.worse - len(found.changes)
     return lines + ([f" and {left} more (--limit)"] if left else [])
 
 
-def _score(value: float | None) -> str:
-    return "–" if value is None else f"{100.0 * value:.2f}"
+def _in_words(*scores: float | None) -> str:
+    return " → ".join("–" if score is None else f"{100.0 * score:.2f}" for score in scores)
 
 
 def _change(
@@ -221,10 +206,8 @@ def _change(
 def _largest_distance(first: pa.RecordBatch, second: pa.RecordBatch) -> tuple[float, float]:
     """The largest distance between two egos [m] and its time since the start [s]."""
     rows = min(len(first), len(second))
-    axes = [
-        first[name].to_numpy()[:rows] - second[name].to_numpy()[:rows] for name in ("x_m", "y_m")
-    ]
-    apart, times = np.hypot(*axes), first["time_us"].to_numpy()
+    ours, theirs = (stack(run.slice(0, rows), ("x_m", "y_m")) for run in (first, second))
+    apart, times = np.hypot(*(ours - theirs).T), first["time_us"].to_numpy()
     at = int(np.argmax(apart))
     return float(apart[at]), float((times[at] - times[0]) * 1e-6)
 

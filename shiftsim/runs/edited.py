@@ -15,7 +15,7 @@ import numpy as np
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.edits.apply import NONREACTIVE, apply_edit
 from shiftsim.edits.spec import PROFILES, Edit, digest_of, edited_id, make_edit
-from shiftsim.errors import ConfigError, DataError, beginning, nearest
+from shiftsim.errors import ConfigError, DataError, beginning, one_of
 from shiftsim.files import read_toml
 from shiftsim.kernels import FloatArray
 from shiftsim.metrics.interplan import driven_lanes
@@ -28,7 +28,6 @@ from shiftsim.world.state import Tracks
 FOLDER = "edits"  # below that of a store
 _FORMAT = 1
 _TOP = ("format", "name", "profile", "edit")
-_STORED = (*_TOP, "made")  # as a manifest holds them
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,11 +49,7 @@ class EditSet:
         return digest_of([self.profile, sorted(edit.digest for edit in self.edits)])
 
     def expand(self, store: ScenarioStore, tokens: Iterable[str]) -> "dict[str, Edited]":
-        """The edited scenarios, by id, of those of a store that are given.
-
-        Raises ConfigError: an edit names a scenario that the store does not have, one id occurs
-        twice, or nothing is edited.
-        """
+        """The edited scenarios, by id, of those of a store that are given; one at least."""
         chosen, out = set(tokens), dict[str, Edited]()
         columns = (store.summary()[name].to_pylist() for name in ("token", "type"))
         types = dict(zip(*columns, strict=True))
@@ -66,16 +61,12 @@ class EditSet:
                     continue
                 token = edited_id(base, edit)
                 if token in out or token in types:
-                    raise ConfigError(
-                        f"edits {self.name!r}: two scenarios have the id {token!r}",
-                        hint="give each edit of a scenario a name of its own",
-                    )
+                    what = f"edits {self.name!r}: two scenarios have the id {token!r}"
+                    raise ConfigError(what, hint="give each edit of a scenario a name of its own")
                 out[token] = Edited(base, edit)
         if not out:
-            raise ConfigError(
-                f"edits {self.name!r} are for no scenario of the {len(chosen)} chosen",
-                hint="check tokens, split and types of its edits",
-            )
+            what = f"edits {self.name!r} are for no scenario of the {len(chosen)} chosen"
+            raise ConfigError(what, hint="check tokens, split and types of its edits")
         return out
 
     def named(self, store: ScenarioStore) -> dict[str, str]:
@@ -91,31 +82,21 @@ class EditSet:
         }
 
     def require_traffic(self, traffic: str) -> None:
-        """Refuse traffic that cannot drive what an edit asks for, with a ConfigError.
-
-        Replayed traffic has nothing that a spawned vehicle could do, reactive traffic replays no
-        vehicle, and interPlan's scenarios are for reactive traffic only.
-        """
+        """Refuse traffic that cannot drive what an edit asks for, with a ConfigError."""
         for edit in self.edits:
             where = f"edits {self.name!r}, edit {edit.name!r}"
             if edit.start is not None and edit.start.traffic not in (NONREACTIVE, traffic):
-                raise ConfigError(
-                    f"{where}: it begins in traffic {edit.start.traffic}, not {traffic}",
-                    hint=f"--traffic {edit.start.traffic}",
-                )
+                what = f"{where}: it begins in traffic {edit.start.traffic}, not {traffic}"
+                raise ConfigError(what, hint=f"--traffic {edit.start.traffic}")
             moving = bool(edit.density) or any(
                 spawn.kind == "vehicle" and spawn.behavior != "stopped" for spawn in edit.spawn
             )
             if traffic == "nonreactive" and moving:
-                raise ConfigError(
-                    f"{where}: spawned vehicles that drive have no recording to be replayed",
-                    hint='--traffic reactive, or behavior = "stopped"',
-                )
+                what = f"{where}: spawned vehicles that drive have no recording to be replayed"
+                raise ConfigError(what, hint='--traffic reactive, or behavior = "stopped"')
             if traffic != "reactive" and edit.code:
-                raise ConfigError(
-                    f"{where}: the code {edit.code!r} is for reactive traffic, not {traffic}",
-                    hint="--traffic reactive",
-                )
+                what = f"{where}: the code {edit.code!r} is for reactive traffic, not {traffic}"
+                raise ConfigError(what, hint="--traffic reactive")
             slowed = bool(edit.stop) or any(
                 not slow.kinds or "vehicle" in slow.kinds for slow in edit.slow
             )
@@ -154,10 +135,8 @@ class EditedStore(ScenarioStore):
                     for token, found in made.items()
                 }
             except (KeyError, TypeError) as error:
-                raise DataError(
-                    f"edits {edits.name!r} of the manifest do not make its scenarios",
-                    hint="make the run again",
-                ) from error
+                what = f"edits {edits.name!r} of the manifest do not make its scenarios"
+                raise DataError(what, hint="make the run again") from error
         self.tokens = tuple(self.edited)
 
     def __reduce__(self) -> Any:
@@ -169,10 +148,8 @@ class EditedStore(ScenarioStore):
     def base(self, token: str) -> str:
         """Token of the recorded scenario that an edited one was made of."""
         if token not in self.edited:
-            raise DataError(
-                f"store {self.path.name!r} has no edited scenario {token!r}",
-                hint="its `tokens` are the scenarios it has",
-            )
+            what = f"store {self.path.name!r} has no edited scenario {token!r}"
+            raise DataError(what, hint="its `tokens` are the scenarios it has")
         return self.edited[token].base
 
     def read(self, token: str, *, validate: bool = True) -> Scenario:
@@ -205,33 +182,21 @@ def edit_words(manifest: Mapping[str, Any], token: str) -> list[str]:
 
 
 def make_edits(table: Mapping[str, Any], name: str) -> EditSet:
-    """Edits from the table of a file; `name` is for messages, and theirs where they have none.
-
-    Raises ConfigError: something in it is unknown, missing or contradictory.
-    """
+    """Edits from the table of a file, or a ConfigError; `name` is theirs where they have none."""
     where = f"edits {name!r}"
-    for key in table:
-        if key not in _STORED:
-            near = nearest(key, _TOP)
-            hint = f"did you mean {near!r}? " if near else ""
-            raise ConfigError(
-                f"{where}: key {key!r} unknown", f"{hint}available: {', '.join(_TOP)}"
-            )
+    for key in {*table} - {"made"}:  # a manifest says what was made
+        one_of(f"{where}: key", key, _TOP)
     if table.get("format", _FORMAT) != _FORMAT:
         raise ConfigError(f"{where}: format {table['format']!r} is not {_FORMAT}")
-    profile = table.get("profile", PROFILES[0])
-    if profile not in PROFILES:
-        raise ConfigError(f"{where}: profile {profile!r} is not one of {', '.join(PROFILES)}")
+    profile = one_of(f"{where}: profile", table.get("profile", PROFILES[0]), PROFILES)
     listed = table.get("edit", [])
     if not isinstance(listed, list) or not listed:
         raise ConfigError(f"{where} holds no edits", hint="write one or more [[edit]] tables")
     edits = tuple(make_edit(item, f"{where}, edit {i}") for i, item in enumerate(listed, 1))
     codes = [edit for edit in edits if edit.code]
     if codes and profile != "interplan":
-        raise ConfigError(
-            f"{where}: the code of edit {codes[0].name!r} is interPlan's",
-            hint='write profile = "interplan" at the top of the file',
-        )
+        what = f"{where}: the code of edit {codes[0].name!r} is interPlan's"
+        raise ConfigError(what, hint='write profile = "interplan" at the top of the file')
     return EditSet(str(table.get("name", name)), profile, edits)
 
 
@@ -240,13 +205,8 @@ def read_edits(name: str, store: Path | None = None) -> EditSet:
     path = Path(name)
     if path.suffix != ".toml":
         folder = (store or Path()) / FOLDER
-        path = folder / f"{name}.toml"
-        if not path.is_file():
-            known = sorted(found.stem for found in folder.glob("*.toml"))
-            raise ConfigError(
-                f"edits {name!r} unknown",
-                hint=f"available: {', '.join(known) or 'none'}, or the path of a .toml file",
-            )
+        known = [found.stem for found in folder.glob("*.toml")] or ["none"]
+        path = folder / f"{one_of('edits', name, known, ', or the path of a .toml file')}.toml"
     return make_edits(read_toml(path), path.stem)
 
 

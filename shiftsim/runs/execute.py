@@ -38,13 +38,8 @@ class Progress:
     def __add__(self, other: "Progress") -> "Progress":
         names = {**self.seconds, **other.seconds}
         seconds = {n: self.seconds.get(n, 0.0) + other.seconds.get(n, 0.0) for n in names}
-        return Progress(
-            self.done + other.done,
-            self.total + other.total,
-            self.failed + other.failed,
-            seconds,
-            other.news,
-        )
+        counts = self.done + other.done, self.total + other.total, self.failed + other.failed
+        return Progress(*counts, seconds, other.news)
 
 
 OnProgress: TypeAlias = Callable[[Progress], None]
@@ -53,12 +48,7 @@ OnProgress: TypeAlias = Callable[[Progress], None]
 def execute(
     plan: RunPlan, *, on_progress: OnProgress = lambda progress: None, argv: Sequence[str] = ()
 ) -> Run:
-    """Do all tasks and write the run folder; a DataError where it cannot be written.
-
-    Whatever happens, what is finished is on disk and can be resumed. An interrupt writes the tables
-    with the other tasks `missing`, and `KeyboardInterrupt` is raised again; a complete run is never
-    replaced by an incomplete one. `argv` is for the manifest.
-    """
+    """Do all tasks and write the run folder; an interrupt leaves the others missing in it."""
     try:
         if plan.config.resumes and plan.before == "complete":
             return _bundled(open_run(plan.folder), plan)
@@ -75,12 +65,7 @@ def execute(
 def _execute(plan: RunPlan, argv: Sequence[str], on_progress: OnProgress) -> Run:
     config, selection = plan.config, plan.selection
     manifest = make_manifest(
-        plan.folder,
-        config=config,
-        split=selection.split,
-        store=plan.store,
-        fingerprint=plan.fingerprint,
-        argv=argv,
+        plan.folder, config, plan.fingerprint, split=selection.split, store=plan.store, argv=argv
     )
     manifest |= {"workers": plan.workers, "split_size": selection.size}
     if selection.edits is not None:
@@ -130,11 +115,7 @@ def _do_tasks(plan: RunPlan, writer: RunWriter, on_progress: OnProgress) -> None
 
 
 def remaining(batches: Iterable[Batch], ended: Mapping[Task, str], *, retry: bool) -> list[Batch]:
-    """What is left to do of a run, by the status of the tasks that have ended.
-
-    A batch that is not finished is done as a whole again: its results may depend on one another in
-    the last digits. `retry` does those that failed again, too.
-    """
+    """Batches that are left, each as a whole: its results may depend on one another."""
     out: list[Batch] = []
     for batch in batches:
         failed = tuple(task for task in batch if ended.get(task) in (FAILED, TIMEOUT))

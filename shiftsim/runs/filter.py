@@ -22,7 +22,6 @@ from shiftsim.data.store.tables import Table, digest, write_blocks
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.files import safe_join
 from shiftsim.metrics import METRIC_VERSION, MetricResult, compute_metrics, thresholds_of
-from shiftsim.runs.config import default_workers
 from shiftsim.runs.journal import Journal
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.tables import TaskResult
@@ -91,8 +90,7 @@ class FilterResults:
     @property
     def config(self) -> Mapping[str, Any]:
         """What a scenario had to satisfy."""
-        config: Mapping[str, Any] = self.conditions["config"]
-        return config
+        return self.conditions["config"]
 
     @property
     def accepted(self) -> tuple[str, ...]:
@@ -125,36 +123,27 @@ def _read(store: Path) -> FilterResults:
 
 
 def read_filter_results(store: str | Path, store_hash: str) -> FilterResults | None:
-    """The results for a store, whose content has a hash; None where it was not filtered.
-
-    Raises DataError: the file is damaged, or of another content of the store.
-    """
+    """The results for a store of a hash, or a DataError; None where it was not filtered."""
     path = Path(store)
     if not (path / RESULTS).is_file():
         return None
     found = _read(path)
     if found.conditions.get("store") != store_hash:
-        raise DataError(
-            f"{found.path}: the verdicts are of another content of the store",
-            hint=f"shiftsim filter {path}, or --all to use every scenario",
-        )
+        what = f"{found.path}: the verdicts are of another content of the store"
+        raise DataError(what, hint=f"shiftsim filter {path}, or --all to use every scenario")
     return found
 
 
-class Playback:
-    """Finds the verdict on one scenario after the other."""
+def _judge(store: Path, config: FilterConfig) -> Callable[[str], dict[str, Any]]:
+    """What finds the verdict on one scenario after the other, also where it cannot be driven."""
+    scenarios = ScenarioReader(str(store))
 
-    def __init__(self, store: Path, config: FilterConfig) -> None:
-        self.config = config
-        self._scenarios = ScenarioReader(str(store))
-
-    def __call__(self, token: str) -> dict[str, Any]:
-        """The row of the verdict, also where the scenario cannot be driven."""
-        found = attempt(
-            Task("log-playback", "none", 0, token),
-            lambda: judge_scenario(self._scenarios.read(token), self.config),
-        )
+    def row(token: str) -> dict[str, Any]:
+        task = Task("log-playback", "none", 0, token)
+        found = attempt(task, lambda: judge_scenario(scenarios.read(token), config))
         return _failed(token, found.error) if isinstance(found, TaskResult) else found
+
+    return row
 
 
 def judge_scenario(scenario: Scenario, config: FilterConfig) -> dict[str, Any]:
@@ -202,17 +191,10 @@ def filter_store(
     workers: int = 0,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> FilterResults:
-    """Find the verdict on every scenario of a store, and write them into it.
-
-    A filter that was interrupted goes on where it stopped. Verdicts that were found with the same
-    settings on the same scenarios are kept. The file has the same bytes for any number of workers,
-    of which 0 chooses from the cores. `on_progress` is told scenarios done and in all. It is a
-    DataError if the store is missing or damaged.
-    """
+    """Find the verdicts on all scenarios, but those found before, and write them into the store."""
     path, config = Path(store), config or FilterConfig()
     opened = open_store(path)
     conditions = _conditions(config, opened.hash, opened.reviews.route_hash)
-    number = max(1, min(workers or default_workers(), len(opened)))
     unfinished = safe_join(path, _UNFINISHED)
     unfinished.parent.mkdir(exist_ok=True)
     journal = Journal(unfinished, keep=True)
@@ -227,8 +209,8 @@ def filter_store(
         done = {row["token"]: row for row in rows if row["verdict"] != FAILED}
         waiting = [token for token in opened.tokens if token not in done]
         on_progress(len(done), len(opened))
-        make = partial(Playback, path.resolve(), config)
-        with closing(map_unordered(make, waiting, workers=number, alone=1)) as outcomes:
+        make = partial(_judge, path.resolve(), config)
+        with closing(map_unordered(make, waiting, workers=workers, alone=1)) as outcomes:
             for outcome in outcomes:
                 row = outcome.result or _failed(outcome.task, outcome.death)
                 journal.put(f"{conditions['hash']} {outcome.task}", row)

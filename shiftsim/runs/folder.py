@@ -8,7 +8,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -51,12 +51,7 @@ class RunWriter:
     """The folder of a run under way; what has `ended` so far includes an earlier attempt."""
 
     def __init__(self, path: Path, manifest: dict[str, Any], *, resume: bool = False) -> None:
-        """Begin a run, or `resume` one: keep what is finished.
-
-        The manifest is written as `running`, unless a complete run is there, which stays as it is
-        until this one has finished as well. It is a ConfigError if another process works on the
-        folder.
-        """
+        """Begin a run, or `resume` one; a complete one stays until this one has finished."""
         self.path = path
         path.mkdir(parents=True, exist_ok=True)
         self.rollouts = safe_join(path, files.FOLDER)
@@ -121,16 +116,16 @@ class RunWriter:
         reasons: Mapping[Task, str] = MappingProxyType({}),
         default: str = "the run was interrupted",
     ) -> Run:
-        """Write tables and manifest, whose `counts` are filled in.
-
-        `expected` are all tasks of a complete run; `reasons`, or the `default`, say why one has no
-        result.
-        """
+        """Write tables and manifest; `reasons`, or the `default`, say why a task has no result."""
         counts = {"expected": 0, **dict.fromkeys(STATUSES, 0)}
         locations = self._write_rollouts()
         tasks = iter(sorted(expected))
         with ExitStack() as stack:
-            tables = {name: stack.enter_context(self._table(name)) for name in TABLES}
+            tables = {}
+            for name, schema in TABLES.items():
+                path = stack.enter_context(atomic_write(self.path / f"{name}.parquet"))
+                table = pq.ParquetWriter(path, schema, **_WRITE_OPTIONS)
+                tables[name] = stack.enter_context(table)
             while chunk := list(islice(tasks, _ROW_GROUP)):
                 rows: dict[str, list[dict[str, Any]]] = {name: [] for name in TABLES}
                 for task in chunk:
@@ -152,46 +147,28 @@ class RunWriter:
                 path.unlink()
         return open_run(self.path)
 
-    @contextmanager
-    def _table(self, name: str) -> Iterator[pq.ParquetWriter]:
-        with (
-            atomic_write(self.path / f"{name}.parquet") as partial,
-            pq.ParquetWriter(partial, TABLES[name], **_WRITE_OPTIONS) as table,
-        ):
-            yield table
-
     def close(self) -> None:
         """Let another process work on the folder."""
         self._journal.close()
 
     def _write_rollouts(self) -> dict[Task, RolloutLocation]:
-        """Put the rollouts of a run that ends into files, those of a scenario together.
-
-        A file from an earlier attempt stays as it is, unless some of its rollouts have been made
-        again: then the others move. Returns where they are.
-        """
+        """Put rollouts into files by scenario; one that others have left is written anew."""
         order = sorted(self.ended, key=lambda task: (task.token, task))
-        records = [(task, self.ended[task]) for task in order]
         locations = {
-            task: record.location
-            for task, record in records
-            if record.location and record.location.file not in self._outdated
+            task: location
+            for task in order
+            if (location := self.ended[task].location) and location.file not in self._outdated
         }
         reader = files.RolloutReader()
-        written = files.write_rollouts(
-            self.rollouts,
-            (
-                (
-                    task,
-                    reader.read(record.location)
-                    if record.location
-                    else decode_rows(self._journal.data(record.number)),
-                )
-                for task, record in records
-                if task not in locations and (record.location or record.has_rollout)
-            ),
-        )
-        return locations | written
+
+        def moved() -> Iterator[tuple[Task, pa.RecordBatch]]:
+            for task, record in ((task, self.ended[task]) for task in order):
+                if task not in locations and record.location:
+                    yield task, reader.read(record.location)
+                elif task not in locations and record.has_rollout:
+                    yield task, decode_rows(self._journal.data(record.number))
+
+        return locations | files.write_rollouts(self.rollouts, moved())
 
 
 def _entry(result: TaskResult) -> tuple[str, dict[str, Any]]:

@@ -39,10 +39,8 @@ class Journal:
         try:
             self._lock = lock(path)
         except BlockingIOError as error:
-            raise ConfigError(
-                f"another process is working on {str(path.parent)!r}",
-                hint="wait until it has finished",
-            ) from error
+            what = f"another process is working on {str(path.parent)!r}"
+            raise ConfigError(what, hint="wait until it has finished") from error
         if not keep:
             self._appended.unlink(missing_ok=True)
             self._lock.truncate(0)
@@ -125,9 +123,8 @@ class Journal:
             yield
         except sqlite3.DatabaseError as error:
             if error.sqlite_errorcode & 0xFF in _DAMAGED:
-                raise DataError(
-                    f"{str(self.path)!r} is damaged: {error}", hint="remove it, and start again"
-                ) from error
+                what = f"{str(self.path)!r} is damaged: {error}"
+                raise DataError(what, hint="remove it, and start again") from error
             full = error.sqlite_errorcode == sqlite3.SQLITE_FULL
             number = errno.ENOSPC if full else errno.EIO
             text = os.strerror(number) if full else str(error)

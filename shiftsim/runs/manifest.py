@@ -6,6 +6,7 @@ import platform
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cache
@@ -37,17 +38,14 @@ _NAMES = {"tokens": "scenarios", "review": "reviews"}  # in messages
 
 def make_manifest(
     folder: Path,
-    *,
     config: RunConfig,
+    fingerprint: Any,
+    *,
     split: str,
     store: str,
-    fingerprint: dict[str, Any],
     argv: Sequence[str],
 ) -> dict[str, Any]:
-    """What a run folder says about how its results were made; state and counts come later.
-
-    The run fingerprint, `determining` in the file, is everything that scores depend on.
-    """
+    """What a run folder says of how it was made; state and counts come later."""
     return {
         "format": FORMAT_VERSION,
         "run": folder.name,
@@ -89,10 +87,8 @@ def versions() -> dict[str, str]:
     """Versions of Python, shiftsim and the packages that results could depend on."""
     out = {"shiftsim": __version__, "python": sys.version.split()[0]}
     for name in _PACKAGES:
-        try:
+        with suppress(metadata.PackageNotFoundError):
             out[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
     return out
 
 
@@ -107,11 +103,7 @@ def _git_state() -> str:
 
 
 def state_of(folder: Path) -> State:
-    """How far the run in a folder is, or a DataError if the folder holds something else.
-
-    That is `new` when there is nothing to lose, `unfinished` when it was interrupted or killed,
-    `failed` when it ended with failed or missing tasks, else `complete`.
-    """
+    """How far the run in a folder is; `failed` has ended with failed tasks, `new` loses nothing."""
     if not folder.exists() or (folder.is_dir() and not _has_content(folder)):
         return "new"
     manifest = read_manifest(folder)
@@ -125,33 +117,24 @@ def state_of(folder: Path) -> State:
 
 
 def _has_content(folder: Path) -> bool:
-    """Whether there is more than what a process leaves that was killed before it had begun.
-
-    These are halves of files, whose names begin with a dot, and a journal without entries.
-    """
+    """Whether there is more than what a process leaves that was killed before it had begun."""
     names = {path.name for path in folder.iterdir() if not path.name.startswith(".")}
     return names != {JOURNAL} or has_entries(folder / JOURNAL) if names else False
 
 
 def check_target(folder: Path, fingerprint: dict[str, Any], *, shard: str = "") -> State:
-    """How far the run in a folder is, to which another one is to be written: the same, or none yet.
-
-    Raises ConfigError: the folder holds something else; the message says what differs.
-    """
+    """How far the run in a folder is; a ConfigError where that is another one or something else."""
     try:
         state = state_of(folder)
     except (DataError, KeyError) as error:
-        raise ConfigError(
-            f"{str(folder)!r} exists and is not a run folder", hint="choose another --out"
-        ) from error
+        what = f"{str(folder)!r} exists and is not a run folder"
+        raise ConfigError(what, hint="choose another --out") from error
     if state == "new":
         return state
     differs = difference(read_manifest(folder), fingerprint, shard)
     if differs:
-        raise ConfigError(
-            f"{str(folder)!r} holds another run: {differs}",
-            hint="choose another --out, or remove that folder",
-        )
+        what = f"{str(folder)!r} holds another run: {differs}"
+        raise ConfigError(what, hint="choose another --out, or remove that folder")
     return state
 
 
@@ -174,7 +157,5 @@ def check_resumable(folder: Path, fingerprint: dict[str, Any], *, shard: str = "
         except (DataError, KeyError):
             continue
         differs = difference(manifest, fingerprint, shard)
-        raise ConfigError(
-            f"no unfinished run with these settings; {str(other)!r} is another one: {differs}",
-            hint="give its settings, or leave out --resume to begin anew",
-        )
+        what = f"no unfinished run with these settings; {str(other)!r} is another one: {differs}"
+        raise ConfigError(what, hint="give its settings, or leave out --resume to begin anew")

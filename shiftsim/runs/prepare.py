@@ -78,11 +78,7 @@ def prepare(
     noises: Sequence[Drift] = (),
     edits: "EditSet | None" = None,
 ) -> RunPlan:
-    """Resolve every name and check everything that a run needs.
-
-    Classes or instances of planners, drifts, and edits take the place of the names in the settings.
-    It is a ShiftsimError if something is unknown, missing or contradictory.
-    """
+    """Resolve every name, but those of objects that are given, and check what a run needs."""
     models = list(noises) or make_drifts(*(getattr(config, name) for name in DRIFT))
     values: dict[str, Any] = {one.name: one.default for one in fields(config) if one.name in DRIFT}
     values["noise"] = tuple(model.name for model in models)  # of all that drifts
@@ -160,10 +156,8 @@ def _traffic(config: RunConfig) -> tuple[RunPlanner | None, dict[str, Any], bool
     try:
         model = make_traffic(config.traffic, config.device)
     except (ImportError, AttributeError, TypeError) as error:
-        raise ConfigError(
-            f"traffic {config.traffic!r} is not available: {error}",
-            hint="use --traffic nonreactive",
-        ) from error
+        what = f"traffic {config.traffic!r} is not available: {error}"
+        raise ConfigError(what, hint="use --traffic nonreactive") from error
     fingerprint = getattr(model, "fingerprint", None)
     in_batches = isinstance(model, BatchTraffic) and config.batch_size > 1
     return None, {"traffic_made_of": dict(fingerprint)} if fingerprint else {}, in_batches
@@ -193,10 +187,8 @@ def _planners(config: RunConfig, given: Sequence[Any]) -> list[RunPlanner]:
         isolated = _isolated(config, source, arguments) if isolates else source
         entry = registry.run_planner(isolated, arguments, name)
         if size and not entry.in_batches:
-            raise ConfigError(
-                f"planner {name!r} takes no batch_size: it answers for one scenario at a time",
-                hint="leave it out",
-            )
+            what = f"planner {name!r} takes no batch_size: it answers for one scenario at a time"
+            raise ConfigError(what, hint="leave it out")
         if size:
             entry.batch_size, entry.fingerprint = size, {**entry.fingerprint, "batch_size": size}
         entries.append(entry)
@@ -248,10 +240,8 @@ def _checkpoints(config: RunConfig, takers: Sequence[str]) -> dict[str, str]:
         if not equals or name not in labels:
             name, path = (takers[0], text) if len(takers) == 1 else ("", text)
         if not name and not takers:
-            raise ConfigError(
-                f"checkpoint {text!r}: {', '.join(labels)} takes none",
-                hint="leave --checkpoint out",
-            )
+            what = f"checkpoint {text!r}: {', '.join(labels)} takes none"
+            raise ConfigError(what, hint="leave --checkpoint out")
         if not name:
             raise ConfigError(
                 f"checkpoint {text!r} does not say which planner is meant",
@@ -270,10 +260,8 @@ def _check_folder(config: RunConfig, folder: Path, fingerprint: dict[str, Any]) 
         if before == "new" and not config.out:
             check_resumable(folder, fingerprint, shard=config.shard)
     elif before == "unfinished":
-        raise ConfigError(
-            f"{str(folder)!r} holds an unfinished run with these settings",
-            hint="--resume finishes it; remove the folder to begin anew",
-        )
+        what = f"{str(folder)!r} holds an unfinished run with these settings"
+        raise ConfigError(what, hint="--resume finishes it; remove the folder to begin anew")
     return before
 
 
@@ -300,11 +288,7 @@ def _workers(
 
 
 def _batches(grouped: Mapping[str, int], tasks: list[Task]) -> list[Batch]:
-    """The tasks, those of planners whose scenarios are driven in lock step by their batch size.
-
-    The groups depend on the whole run only, not on workers, shards or what is finished already. The
-    first is a single task: other workers wait until it has compiled the planner's kernels.
-    """
+    """The tasks in batches, which depend on the whole run only; a planner's first is one task."""
     batches: list[Batch] = [(task,) for task in tasks if task.planner not in grouped]
     for name, size in sorted(grouped.items()):
         of_planner = tuple(task for task in tasks if task.planner == name)
@@ -347,8 +331,7 @@ def _fingerprint(
         "metrics": config.added_metrics,
         "strict": config.strict,
     }
-    plain: dict[str, Any] = json.loads(json.dumps(values, sort_keys=True, default=str))
-    return plain
+    return json.loads(json.dumps(values, sort_keys=True, default=str))
 
 
 def run_name(config: RunConfig, split: str, fingerprint: dict[str, Any]) -> str:

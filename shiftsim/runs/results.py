@@ -12,9 +12,9 @@ import pyarrow.compute as pc
 
 from shiftsim.errors import ConfigError, DataError, listed, one_of
 from shiftsim.files import write_text
-from shiftsim.runs.rollouts import Task, describe
+from shiftsim.runs.rollouts import Task, damaged, describe
 from shiftsim.runs.rollouts.files import FOLDER, RolloutLocation, RolloutReader, complete_rollout
-from shiftsim.runs.tables import LOCATION, OK, damaged, read_table, stored_location
+from shiftsim.runs.tables import LOCATION, OK, read_table, stored_location
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.scenario import Scenario
 
@@ -40,19 +40,14 @@ class Run:
     labels: Mapping[str, str] = field(default_factory=dict, repr=False)
 
     def labelled(self, labels: Mapping[str, str]) -> Self:
-        """The same run with planners called otherwise, new names by own ones; the disk stays.
-
-        Raises ConfigError: the run has no such planner, or two would have one name.
-        """
+        """The same run with planners called otherwise, new names by own ones; or a ConfigError."""
         config, determining = self.manifest["config"], self.manifest["determining"]
         for name in labels:
             one_of(f"run {self.path.name!r}: planner", name, config["planners"])
         new = {name: labels.get(name, name) for name in config["planners"]}
         if len({*new.values()}) < len(new):
-            raise ConfigError(
-                f"run {self.path.name!r}: two planners would be called the same",
-                hint=f"its planners: {', '.join(new)}",
-            )
+            what = f"run {self.path.name!r}: two planners would be called the same"
+            raise ConfigError(what, hint=f"its planners: {', '.join(new)}")
         given = (text.partition("=") for text in config.get("checkpoints", ()))
         config = config | {
             "planners": [*new.values()],
@@ -105,10 +100,7 @@ class Run:
         }
 
     def rollout(self, task: Task, scenario: Scenario) -> SimulationLog:
-        """One stored rollout; its scenario is that of the store the run was made with.
-
-        Raises DataError: it was not stored, cannot be read, or the scenario is another one.
-        """
+        """One stored rollout; the scenario is that of the run's store, else it is a DataError."""
         rows, is_partial = self.rollout_rows(task), "elsewhere" in self.manifest
         return complete_rollout(rows, scenario, task, is_partial=is_partial)
 
@@ -116,10 +108,8 @@ class Run:
         """One stored rollout as it lies on disk, a row per sample; or a DataError."""
         location = self.rollout_places.get(task)
         if location is None:
-            raise DataError(
-                f"run {self.path.name!r} holds no rollout of {describe(task)}",
-                hint="run again with --save-rollouts all",
-            )
+            what = f"run {self.path.name!r} holds no rollout of {describe(task)}"
+            raise DataError(what, hint="run again with --save-rollouts all")
         return self._reader.read(location)
 
     @cached_property
@@ -146,18 +136,13 @@ def open_run(path: str | Path) -> Run:
         raise ConfigError(f"no run folder {str(folder)!r}", hint)
     manifest = read_manifest(folder)
     if manifest["state"] == "running":
-        raise DataError(
-            f"run {str(folder)!r} is not finished, or still under way",
-            hint="the command that started it, with --resume, finishes it",
-        )
+        what = f"run {str(folder)!r} is not finished, or still under way"
+        raise DataError(what, hint="the command that started it, with --resume, finishes it")
     return Run(folder, manifest)
 
 
 def label_runs(runs: Sequence[Run], labels: Iterable[str]) -> list[Run]:
-    """Runs with planners called otherwise: `NAME=LABEL`, or `RUN/NAME=LABEL` in one of them.
-
-    Raises ConfigError: no run has such a planner, or two of one would have one name.
-    """
+    """Runs with planners called otherwise: `NAME=LABEL`, or `RUN/NAME=LABEL` in one of them."""
     wanted: list[dict[str, str]] = [{} for _ in runs]
     named = [
         (run.path.name, name, new)
@@ -189,29 +174,21 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         manifest: dict[str, Any] = json.loads(path.read_text("utf-8"))
         version, _ = manifest["format"], manifest["state"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise DataError(
-            f"{str(folder)!r} is not a run folder: manifest.json is missing or broken",
-            hint="name a folder that `shiftsim run` wrote",
-        ) from error
+        what = f"{str(folder)!r} is not a run folder: manifest.json is missing or broken"
+        raise DataError(what, hint="name a folder that `shiftsim run` wrote") from error
     if version != FORMAT_VERSION:
-        raise DataError(
-            f"{str(path)!r} has format {version!r}, this version reads {FORMAT_VERSION}",
-            hint=f"python tools/upgrade.py {folder}, or make the run again",
-        )
+        what = f"{str(path)!r} has format {version!r}, this version reads {FORMAT_VERSION}"
+        raise DataError(what, hint=f"python tools/upgrade.py {folder}, or make the run again")
     counts = {"counts.ok": int, "counts.expected": int} if manifest["state"] == "finished" else {}
     for key, kind in {**_MANIFEST, **counts}.items():
         value: Any = manifest
         for name in key.split("."):
             value = value.get(name) if isinstance(value, dict) else None
         if not isinstance(value, kind):
-            raise DataError(
-                f"{str(path)!r} cannot be read: {key!r} is missing or no {kind.__name__}",
-                hint="make the run again",
-            )
+            raise damaged(path, f"{key!r} is missing or no {kind.__name__}")
     named, found = manifest["config"]["planners"], manifest["determining"]["planners"]
     if not all(isinstance(name, str) for name in named) or not all(
         isinstance(about, (dict, str)) for about in found.values()
     ):
-        what = f"{str(path)!r} cannot be read: its planners are no names with what they are"
-        raise DataError(what, hint="make the run again")
+        raise damaged(path, "its planners are no names with what they are")
     return manifest

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from shiftsim.data.store.reading import ScenarioStore, open_store
 from shiftsim.data.store.tables import REVIEW
-from shiftsim.errors import ConfigError, DataError, listed, nearest, one_of
+from shiftsim.errors import ConfigError, DataError, listed, one_of
 from shiftsim.files import DEFAULT_STORE, read_toml, safe_join, store_path
 from shiftsim.runs.config import RunConfig
 from shiftsim.runs.results import Run, read_manifest, write_manifest
@@ -30,11 +30,7 @@ _DEMO_SPLIT = "demo-mini"  # of the generated store, where no split is named
 
 
 def open_run_store(run: Run, store: str | None = None) -> ScenarioStore:
-    """The store that a run was made with, or its bundle, which then has the hash of that store.
-
-    `store` says where the store has moved. Edits of the run are in its manifest. It is a DataError
-    if the store is not there, or another one.
-    """
+    """The store of a run, or its bundle with that store's hash; `store` is where it has moved."""
     found = _recorded(run, store)
     if edits := run.manifest.get("edits"):
         from shiftsim.runs.edited import EditedStore, make_edits
@@ -57,17 +53,13 @@ def _recorded(run: Run, store: str | None) -> ScenarioStore:
             )
         found = open_store(place)
     elif not (path := store_path(place)).exists():
-        raise DataError(
-            f"the store of run {run.path.name!r} is not at {str(path)!r}",
-            hint=f"say where it is with --store; or, where it is, {_REMEDY}",
-        )
+        what = f"the store of run {run.path.name!r} is not at {str(path)!r}"
+        raise DataError(what, hint=f"say where it is with --store; or, where it is, {_REMEDY}")
     else:
         found = open_store(path)
     if found.hash != wanted:
-        raise DataError(
-            f"store {str(found.path)!r} is not the one run {run.path.name!r} was made with",
-            hint="name the right one with --store, or run again",
-        )
+        what = f"store {str(found.path)!r} is not the one run {run.path.name!r} was made with"
+        raise DataError(what, hint="name the right one with --store, or run again")
     found.hash = recorded
     return found
 
@@ -78,11 +70,7 @@ def is_bundled(run: Run) -> bool:
 
 
 def bundle_run(run: Run, store: str | None = None) -> ScenarioStore:
-    """Copy the scenarios of a run, with recordings and maps, into its folder; the copy's store.
-
-    `store` says where the store has moved; it is a DataError if it is not there, or another one. Of
-    a run that holds them already they are checked.
-    """
+    """Copy the scenarios of a run into its folder, unless they are there; the copy's store."""
     from shiftsim.data.store.writing import StoreWriter, window_row
 
     target, partial = (safe_join(run.path, name) for name in (BUNDLE, f".{BUNDLE}.tmp"))
@@ -154,10 +142,7 @@ class Selection(NamedTuple):
 def select_scenarios(
     config: RunConfig, store: ScenarioStore, given: "EditSet | None" = None
 ) -> Selection:
-    """The scenarios of a run; edits that are `given` take the place of those in the settings.
-
-    Raises ShiftsimError: a split or edits are unknown or wrong, or scenarios are missing.
-    """
+    """The scenarios of a run; edits that are `given` take the place of those in the settings."""
     edits = given or (open_edits(config.edits, store) if config.edits else None)
     whole, fingerprint = len(store.tokens), {"store": store.hash}
     default = "" if config.split or config.all_scenarios else default_split(store, edits)
@@ -185,10 +170,8 @@ def select_scenarios(
     if not config.allow_partial:
         require_scenarios(split.name, tokens, config.store, held)
     if len(missing) == len(tokens):
-        raise DataError(
-            f"split {split.name!r}: store {config.store!r} holds none of its scenarios",
-            hint="name the store that was converted for this split",
-        )
+        what = f"split {split.name!r}: store {config.store!r} holds none of its scenarios"
+        raise DataError(what, hint="name the store that was converted for this split")
     fingerprint["tokens"] = token_hash(tokens)
     if store.is_reviewed and store.reviews.hash:
         fingerprint["review"] = store.reviews.hash
@@ -197,10 +180,7 @@ def select_scenarios(
 
 
 def default_split(store: ScenarioStore, edits: "EditSet | None" = None) -> str:
-    """The split that is meant where none is named; empty for the whole store.
-
-    Of the generated demo it is the one that every page shows, unless edits name other scenarios.
-    """
+    """The split where none is named: of the demo that of every page; empty for the whole store."""
     path = Path(store.path) / "splits" / f"{_DEMO_SPLIT}.toml"
     if store.generator.get("name") != DEFAULT_STORE or not path.is_file():
         return ""
@@ -211,11 +191,7 @@ def default_split(store: ScenarioStore, edits: "EditSet | None" = None) -> str:
 
 
 def open_split(store: ScenarioStore, name: str, *, whole: bool = False) -> "tuple[Split, str]":
-    """The split of a name, and the hash of the filter's results, empty where they did not choose.
-
-    Of a store without a name of a split it is what filter and review accept, or the `whole` store.
-    It is a ShiftsimError if there is no such split, or the filter accepts nothing.
-    """
+    """The split of a name, or all that filter and review accept; the filter's hash if it chose."""
     from shiftsim.runs.filter import read_filter_results
 
     usable, digest = tuple(store.tokens), ""
@@ -263,35 +239,19 @@ def token_hash(tokens: Iterable[str]) -> str:
 
 
 def find_split(name: str, store: Path, tokens: tuple[str, ...]) -> Split:
-    """The split of a name; `tokens` are all scenarios of the store in a folder.
-
-    The name is that of a file (`.toml`, or `.txt` with one token per line), one below `splits/` of
-    the store, or the store's own (or nothing) for all its scenarios; anything else is a
-    ConfigError.
-    """
+    """The split in a file, below `splits/` of the store, or of its own name: all its `tokens`."""
     if name in ("", store.name):
         return Split(store.name, tokens)
     path = Path(name)
-    if path.suffix in (".toml", ".txt"):
-        return read_split(path)
-    path = store / "splits" / f"{name}.toml"
-    if path.is_file():
-        return read_split(path)
-    known = sorted([store.name, *(found.stem for found in (store / "splits").glob("*.toml"))])
-    near = nearest(name, known)
-    hint = f"did you mean {near!r}? " if near else ""
-    raise ConfigError(
-        f"split {name!r} unknown",
-        hint=f"{hint}available: {', '.join(known)}, or a .toml or .txt file",
-    )
+    if path.suffix not in (".toml", ".txt"):
+        known = [store.name, *(found.stem for found in (store / "splits").glob("*.toml"))]
+        one_of("split", name, known, ", or a .toml or .txt file")
+        path = store / "splits" / f"{name}.toml"
+    return read_split(path)
 
 
 def read_split(path: Path) -> Split:
-    """A split from a file: TOML with `tokens`, or text with one token per line.
-
-    Raises ConfigError: the file cannot be read, names no tokens or a token twice, or its `count` or
-    `hash` says otherwise.
-    """
+    """A split from TOML with `tokens`, or text with one token per line; or a ConfigError."""
     table: dict[str, object] = {}
     if path.suffix == ".toml":
         table = read_toml(path)
@@ -300,9 +260,8 @@ def read_split(path: Path) -> Split:
         try:
             listed = path.read_text("utf-8").split()
         except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(
-                f"cannot read split {str(path)!r}: {error}", hint="check the path"
-            ) from error
+            what = f"cannot read split {str(path)!r}: {error}"
+            raise ConfigError(what, hint="check the path") from error
     if not isinstance(listed, list) or not listed or not all(isinstance(t, str) for t in listed):
         raise ConfigError(f"split {str(path)!r} lists no tokens", hint='write tokens = ["…", "…"]')
     split = Split(str(table.get("name", path.stem)), tuple(listed))
@@ -312,10 +271,8 @@ def read_split(path: Path) -> Split:
     actual = {"count": len(listed), "hash": split.hash}
     for name, value in actual.items():
         if table.get(name, value) != value:
-            raise ConfigError(
-                f"split {str(path)!r} says {name} = {table[name]!r}, but it is {value!r}",
-                hint="the file was edited or cut off; fetch or write it again",
-            )
+            what = f"split {str(path)!r} says {name} = {table[name]!r}, but it is {value!r}"
+            raise ConfigError(what, hint="the file was edited or cut off; fetch or write it again")
     return split
 
 
@@ -336,11 +293,7 @@ def choose_scenarios(
     per_type: int | None = None,
     limit: int | None = None,
 ) -> tuple[str, ...]:
-    """Tokens of some scenarios of a store, sorted: the first ones up to the limits.
-
-    The rows hold `token`, `type` and `city` of every scenario, `usable` the tokens to choose from,
-    and `wanted` values by column, none for any; one that no scenario has is a ConfigError.
-    """
+    """Tokens of usable scenarios with the `wanted` values by column, sorted, up to the limits."""
     table = sorted(rows, key=itemgetter("token"))
     for column, values in wanted.items():
         known = sorted({row[column] for row in table})
@@ -359,11 +312,7 @@ def choose_scenarios(
 
 
 def write_split(path: Path, tokens: tuple[str, ...]) -> Split:
-    """Write a split that `read_split` reads: TOML with count and hash, or text for `.txt`.
-
-    It is named after the file. Raises ConfigError: there are no tokens, the file ends otherwise, or
-    it cannot be written.
-    """
+    """Write a split that `read_split` reads: TOML with count and hash, or text for `.txt`."""
     split = Split(path.stem, tokens)
     if not tokens:
         raise ConfigError(f"split {split.name!r} would be empty", hint="ask for less")

@@ -5,7 +5,7 @@ fixed settings, so that the same run gives the same bytes for any number of work
 Timings are in `tasks.parquet`.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
@@ -14,16 +14,14 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from shiftsim.errors import DataError
 from shiftsim.metrics import SHORT_NAMES
-from shiftsim.runs.rollouts import Task, describe
-from shiftsim.runs.rollouts.files import FOLDER, RolloutLocation, part_file
+from shiftsim.runs.rollouts import Task, damaged, describe
+from shiftsim.runs.rollouts.files import FOLDER, KEY, RolloutLocation, part_file
 from shiftsim.world.ranges import RUN, require
 
 OK, FAILED, TIMEOUT, MISSING = STATUSES = ("ok", "failed", "timeout", "missing")
 
 _TEXT, _NUMBER, _INTEGER = pa.string(), pa.float64(), pa.int64()
-_KEY = {"planner": _TEXT, "noise": _TEXT, "seed": _INTEGER, "token": _TEXT}
 _PROFILE = {"thresholds": _TEXT, "metric_version": _TEXT}
 _TEXTS = ("scenario_type", "status", "error", "hint", "traceback")
 _DURATIONS = (
@@ -38,11 +36,11 @@ _DURATIONS = (
 LOCATION = {"rollout": _TEXT, "rollout_row": _INTEGER, "rollout_rows": _INTEGER}
 TABLES = {
     "tasks": pa.schema(
-        _KEY | dict.fromkeys(_TEXTS, _TEXT) | dict.fromkeys(_DURATIONS, _NUMBER) | LOCATION
+        KEY | dict.fromkeys(_TEXTS, _TEXT) | dict.fromkeys(_DURATIONS, _NUMBER) | LOCATION
     ),
     "scores": pa.schema(
         {
-            **_KEY,
+            **KEY,
             **dict.fromkeys(("scenario_type", "city", "log_name", "traffic"), _TEXT),
             "duration_class": _TEXT,
             "cls": _NUMBER,
@@ -53,7 +51,7 @@ TABLES = {
     ),
     "metrics": pa.schema(
         {
-            **_KEY,
+            **KEY,
             "metric": _TEXT,
             "value": _NUMBER,
             "unit": _TEXT,
@@ -92,9 +90,7 @@ class TaskResult:
     # the rows of `metrics.parquet` beyond the key
     metrics: list[dict[str, Any]] = field(default_factory=list)
     rollout: bytes = b""  # the rollout, encoded; empty where it is not stored, or stored elsewhere
-    location: RolloutLocation | None = (
-        None  # where the rollout is stored, where it is in a file already
-    )
+    location: RolloutLocation | None = None  # of the rollout, where it is in a file already
     warning: str = ""  # why the first plan is most likely not what was meant
     remarks: tuple[str, ...] = ()  # what a reader must know of a rollout that was driven elsewhere
 
@@ -124,7 +120,7 @@ class TaskResult:
         )
 
 
-def task_of(row: dict[str, Any]) -> Task:
+def task_of(row: Mapping[str, Any]) -> Task:
     """The task of a row of any table."""
     return Task(*(row[name] for name in Task._fields))
 
@@ -186,8 +182,3 @@ def _batches(path: Path) -> Iterator[pa.RecordBatch]:
             yield batch
     except (OSError, ValueError, pa.ArrowException) as error:
         raise damaged(path, str(error)) from error
-
-
-def damaged(path: Path, what: str) -> DataError:
-    """The error that a file of a run cannot be read."""
-    return DataError(f"{str(path)!r} cannot be read: {what}", hint="make the run again")

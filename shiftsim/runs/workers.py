@@ -23,6 +23,7 @@ from uuid import uuid4
 from shiftsim.errors import ConfigError, import_extra
 from shiftsim.kernels import machine_code
 from shiftsim.processes import Process, ProcessEndedError, close, packed, start
+from shiftsim.runs.config import default_workers
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -52,7 +53,7 @@ def map_unordered(
     make: MakeFunction[T, R],
     tasks: Iterable[T],
     *,
-    workers: int,
+    workers: int = 0,
     alone: int = 0,
     limit: float = 0.0,
     in_batches: bool = False,
@@ -61,25 +62,19 @@ def map_unordered(
     """Apply a function to every task, in whatever order they finish.
 
     Args:
-        make: Called once per worker; returns the function. Must pickle when `workers` is above 1
-            or there is a limit, and so must the tasks and results. A `close` attribute of the
-            function is called at the end.
+        make: Called once per worker; returns the function, whose `close` is called at the end. It,
+            tasks and results must pickle, but for a single worker, this process, without a limit.
         tasks: The tasks.
-        workers: Number of worker processes; with 1 and no limit everything happens in this process.
-        alone: So many leading tasks are done one at a time before the others, so that kernels
-            which are not in the disk cache yet are compiled once.
-        limit: Time that each task, or each part of a batch, may take [s]; 0 for any. What a worker
-            has to load, or to compile, does not count.
-        in_batches: Whether the tasks are tuples of several in one; when the worker of one dies,
-            its parts are done one by one, so that only one of them is lost.
+        workers: Number of worker processes, no more than tasks; 0 chooses from the cores.
+        alone: So many leading tasks are done one by one, so that kernels are compiled once.
+        limit: Time per task or part of a batch [s]; 0 for any. Loading, compiling do not count.
+        in_batches: Whether tasks are tuples of several; those of a dead worker are done one by one.
         group: What a worker should stay with, as it has read it already; neighbours only.
 
-    Yields:
-        One outcome per task, or per part of a batch whose worker died.
-
-    Raises:
-        ConfigError: Workers cannot be started.
+    Yields an outcome per task, or per part of such a batch. ConfigError: workers cannot be started.
     """
+    tasks = list(tasks)
+    workers = min(workers or default_workers(), len(tasks))
     if workers <= 1 and not limit:
         function = make()
         try:
@@ -215,9 +210,8 @@ class Pool:
                 return Outcome(worker.task, None, death)
             self.failed_starts += 1
             if self.failed_starts >= _MAX_START_FAILURES:
-                raise ConfigError(
-                    f"workers cannot start: {death}", hint="run with --workers 1 to see why"
-                ) from end
+                what = f"workers cannot start: {death}"
+                raise ConfigError(what, hint="run with --workers 1 to see why") from end
             return None
         worker.state, worker.deadline = "idle", inf
         self.failed_starts = 0
@@ -242,10 +236,7 @@ def map_on_cluster(
     limit: float = 0.0,
     in_batches: bool = False,
 ) -> Generator[Outcome[T, R], None, None]:
-    """As `map_unordered`, on the cluster whose scheduler is at an address.
-
-    Raises MissingExtraError: dask.distributed is not installed. ConfigError: no scheduler is there.
-    """
+    """As `map_unordered`, on the dask cluster of a scheduler; a ConfigError if none is there."""
     distributed: Any = import_extra("distributed", "cluster")
     try:
         client = distributed.Client(scheduler, timeout=_CONNECT, set_as_default=False)

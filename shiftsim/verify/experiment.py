@@ -85,12 +85,7 @@ class Run:
 
 
 def verify_experiment(folder: Path, find: FindScenario, mode: str | None = None) -> Report:
-    """Compare every result folder of nuPlan in a folder with what shiftsim computes.
-
-    The folder is what `run_simulation.py` made, or one of such folders; `find` gives the scenario
-    of a token, None where there is none; `mode` chooses a challenge (`NR`, `R` or `PT`), None all.
-    It is a DataError if there is no result folder, or nothing says what was simulated.
-    """
+    """Compare all that `run_simulation.py` made in a folder; `find` gives scenarios by token."""
     folders = {path.parent for name in _PARTS for path in folder.rglob(name) if path.is_dir()}
     if not folders:
         raise DataError(
@@ -113,10 +108,8 @@ def _challenge(path: Path, mode: str | None) -> str:
             if part.startswith(name):
                 return challenge
     if mode is None:
-        raise DataError(
-            f"{path}: its name says neither {' nor '.join(_CHALLENGES)}",
-            hint="say what was simulated: --mode NR or --mode R",
-        )
+        what = f"{path}: its name says neither {' nor '.join(_CHALLENGES)}"
+        raise DataError(what, hint="say what was simulated: --mode NR or --mode R")
     return mode
 
 

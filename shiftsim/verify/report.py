@@ -196,11 +196,7 @@ class Source:
     def match(
         self, where: str, ours: Named, atol: Tolerances = EXACT, *, quantity: str | None = None
     ) -> bool:
-        """Compare values of ours with those of the same names; a missing one is a mismatch.
-
-        `quantity` begins the names of the quantities, instead of the name of the file. Returns
-        whether all agree.
-        """
+        """Compare values of ours with those of the same names; returns whether all agree."""
         prefix, agree = self.name if quantity is None else quantity, True
         for name, value in ours.items():
             label = f"{prefix} {name}".strip()

@@ -155,9 +155,8 @@ def find_simulation_logs(folder: Path) -> dict[tuple[str, str], Path]:
 
 def _require_msgpack(files: Iterable[Path]) -> None:
     if any(_PACKED in path.suffixes for path in files) and not find_spec("msgpack"):
-        raise MissingExtraError(
-            "simulation logs of nuPlan need msgpack", hint="pip install 'shiftsim[nuplan]'"
-        )
+        what = "simulation logs of nuPlan need msgpack"
+        raise MissingExtraError(what, hint="pip install 'shiftsim[nuplan]'")
 
 
 def log_source(path: Path) -> Rollouts | None:

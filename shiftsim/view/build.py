@@ -18,6 +18,7 @@ from shiftsim.report import words
 from shiftsim.report.palette import planner_styles
 from shiftsim.runs.results import Run
 from shiftsim.runs.rollouts import Task
+from shiftsim.sim.perception import drift_order
 from shiftsim.view.page import MAX_ROLLOUTS, Page, framed, replay_page
 from shiftsim.view.scene import ShownRollout
 from shiftsim.view.thumbnails import thumbnails
@@ -73,19 +74,13 @@ class Gallery:
     """
 
     def __init__(self, runs: Sequence[Run], store: Any, choice: Choice | None = None) -> None:
-        """Index the runs, which were made with this open store; None where nothing is drawn.
-
-        Raises:
-            DataError: A run was made with another store.
-        """
+        """Index runs that were made with this open store; None where nothing is drawn."""
         self.store, self.choice = store, choice or Choice()
         self._rollouts: dict[Task, _Rollout] = {}
         for run, name in zip(runs, _names(runs), strict=True):
             if store is not None and run.manifest["determining"]["store"] != store.hash:
-                raise DataError(
-                    f"run {run.path.name!r} was made with another store than {str(store.path)!r}",
-                    hint="name the store that its manifest.json names",
-                )
+                what = f"run {run.path.name!r} was made with another store than {str(store.path)!r}"
+                raise DataError(what, hint="name the store that its manifest.json names")
             tables = (run.scores, run.metrics, run.tasks.select(_ENDS))
             scores, metrics, ends = map(words.rows_by_task, tables)
             for key, place in run.rollout_places.items():
@@ -135,29 +130,19 @@ class Gallery:
         return shown if here < total or more else ""
 
     def find(self, text: str) -> str:
-        """A scenario by its token or an unambiguous beginning of it.
-
-        Raises:
-            ConfigError: There is none, or there are several.
-        """
+        """A scenario by its token or an unambiguous beginning of it, or a ConfigError."""
         return beginning("what is stored", "scenario", text, self._all)
 
     def tasks(self, token: str, part: int = 0) -> list[Task]:
-        """The rollouts that a page of a scenario shows, the first page or another.
-
-        Raises:
-            ConfigError: There are none.
-        """
+        """The rollouts that a page of a scenario shows, the first or another; or a ConfigError."""
         found = self.parts(token)
         if not found:
             tasks = self._all.get(token, [])
             there = zip(*sorted(t for t in tasks if self._rollouts[t].is_drawable), strict=True)
             names = zip(("planners", "noise", "seeds"), there, strict=False)
             available = (f"{n}: {', '.join(map(str, dict.fromkeys(v)))}" for n, v in names)
-            raise ConfigError(
-                f"scenario {token!r} has no stored rollout with {self.choice}",
-                hint="; ".join(available) or "--save-rollouts all keeps them",
-            )
+            what = f"scenario {token!r} has no stored rollout with {self.choice}"
+            raise ConfigError(what, hint="; ".join(available) or "--save-rollouts all keeps them")
         return found[part]
 
     def shown(
@@ -190,13 +175,7 @@ class Gallery:
     def pages(
         self, token: str, *, back: str = "", fork: bool = False, alone: bool = False
     ) -> dict[str, Page]:
-        """The replays of one scenario as HTML by file name, all rollouts that can be drawn.
-
-        The first page `alone` has no links to others.
-
-        Raises:
-            ConfigError: There are none, or their forks cannot be driven.
-        """
+        """The replays of one scenario as HTML by file name; `alone` has no links to others."""
         self.tasks(token)
         scenario, links, first = self.store.read(token), [], 1
         for part, tasks in enumerate(self.parts(token)):
@@ -272,10 +251,7 @@ class Gallery:
 
 
 def page_name(token: str, part: int = 0) -> str:
-    """File name of a scenario's page: its token, other characters than letters and digits coded.
-
-    Further pages of the scenario have a number, from 2.
-    """
+    """File name of a scenario's page, further ones with a number: letters, digits, others coded."""
     safe = re.sub(r"[^A-Za-z0-9_-]", lambda found: f"~{ord(found[0]):x}", token)
     return f"{safe}.{part + 1}.html" if part else f"{safe}.html"
 
@@ -283,15 +259,11 @@ def page_name(token: str, part: int = 0) -> str:
 def list_page(
     title: str, rows: Sequence[Mapping[str, Any]], *, above: str = "", shown: str = ""
 ) -> Page:
-    """The page that lists rows of `Gallery.rows`, sortable and filterable, the worst of them first.
-
-    The worst are ranked as by `worst_of`. `above` is HTML between heading and list, whose caller
-    escapes what comes from data; `shown` are words.
-    """
+    """The page that lists rows of `Gallery.rows`, the worst first; `above` is HTML before them."""
     scenes = {one: n for n, one in enumerate(dict.fromkeys(row.get("scene") for row in rows))}
     looks = {
         "multipliers": [SHORT_NAMES[name] for name in MULTIPLIERS],
-        "noises": words.noise_order(row["noise"] for row in rows),
+        "noises": drift_order(row["noise"] for row in rows),
         "styles": planner_styles(sorted({row["planner"] for row in rows})),
         "scenes": list(scenes),
     }
@@ -310,12 +282,7 @@ def write_site(
     above: str = "",
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> int:
-    """Write the pages of scenarios and `index.html`; returns of how many scenarios.
-
-    The list, of all rollouts, goes to the folder; the pages of at most `limit` scenarios (0 for
-    all), failures and the lowest scores first, to its subfolder `replay`. `above` is as in
-    `list_page`; `on_progress` gets how many of how many scenarios.
-    """
+    """Write the list, and pages of at most `limit` scenarios (0 for all); returns of how many."""
     pages = safe_join(folder, "replay")
     pages.mkdir(parents=True, exist_ok=True)
     drawable = [(gallery, token) for gallery in galleries for token in gallery.tokens]
@@ -366,10 +333,7 @@ def galleries(runs: Sequence[Run], stores: Sequence[Any], choice: Choice) -> lis
 
 
 def _names(runs: Sequence[Run]) -> list[str]:
-    """What tells the rollouts of each run from those of the others: traffic, or the run's name.
-
-    Nothing where the names of the planners do already, in the same traffic.
-    """
+    """What tells rollouts of runs apart beside planners: nothing, traffic, or the run's name."""
     planners = [name for run in runs for name in run.manifest["config"]["planners"]]
     traffic = [str(run.manifest["determining"]["traffic"]) for run in runs]
     if len(set(traffic)) == 1 and len({*planners}) == len(planners):

@@ -182,10 +182,7 @@ def draw_scale(axes: Any, view: View) -> None:
 
 
 def caption(item: ShownRollout, shown: Sequence[ShownRollout]) -> str:
-    """Planner, noise, score, and what cost most of it, as "… at-fault collision (NCR) at 4.3 s".
-
-    The seed is named where several of them are shown.
-    """
+    """Planner, noise, seed of several, score, and its cause, as "… at-fault collision at 4.3 s"."""
     name = item.planner if item.noise == "none" else f"{item.planner}, {item.noise}"
     alike = [one for one in shown if (one.planner, one.noise) == (item.planner, item.noise)]
     name += f", seed {item.seed}" if len({one.seed for one in alike}) > 1 else ""
@@ -237,11 +234,7 @@ def show_from(mark: Mark, time: float) -> None:
 def spread_labels(
     figure: Any, axes: Any, marks: Sequence[Mark], *, keep_inside: bool = True
 ) -> None:
-    """Move the labels of marks to where they cover neither one another nor other words.
-
-    Nor marks and paths, and, if wanted, where they are inside the picture. Each takes the best of
-    some places around its mark, the nearest one where several are as good.
-    """
+    """Move the labels of marks to the nearest places around them that cover little else."""
     from matplotlib.transforms import Bbox
 
     figure.draw_without_rendering()
@@ -277,13 +270,7 @@ def spread_labels(
 
 
 def save_tracks_picture(path: Path, inspection: "TracksReader", store: Path | None) -> None:
-    """Draw map, tracks and, if a store has scenarios of them, their egos.
-
-    Where the tracks are far from the map, or hardly seen beside it, both are also drawn alone.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-    """
+    """Draw map, tracks and egos of a store; tracks alone as well where the map is far or large."""
     road, table = inspection.road, inspection.table
     egos = {} if store is None else _read_egos(store, f"{road.name}_{table.name}")
     bounds = road.edges.polygons.bounds

@@ -31,22 +31,11 @@ _AFTER = 20  # iterations that are driven beyond the collision
 
 
 def find_fork(scenario: Scenario, item: ShownRollout, manifest: Mapping[str, Any]) -> Fork | None:
-    """The fork of a rollout; None where it hits nothing at fault.
-
-    Args:
-        scenario: The scenario that it drives.
-        item: The rollout.
-        manifest: Of its run, whose planners drive on from the fork.
-
-    Raises:
-        ConfigError: The run's controller has no commands, or one of its planners cannot be made.
-    """
+    """The fork of a rollout, by planners of its run; None where it hits nothing at fault."""
     made_with = manifest["determining"]
     if made_with["controller"] != "lqr":
-        raise ConfigError(
-            f"a fork repeats commands, and controller {made_with['controller']!r} has none",
-            hint="run with --controller lqr",
-        )
+        what = f"a fork repeats commands, and controller {made_with['controller']!r} has none"
+        raise ConfigError(what, hint="run with --controller lqr")
     first = next((row for row in item.metrics if row["metric"] == COLLISIONS), None)
     if first is None or first["first_violation_iteration"] is None:
         return None
@@ -69,10 +58,7 @@ class _Search:
     iteration: int  # at which it collides
 
     def fork(self, planners: Mapping[str, Callable[[], Planner]]) -> Fork:
-        """The last moment at which braking or PDM-Closed avoids the collision, and all branches.
-
-        Without such a moment within the last five seconds there are none.
-        """
+        """The last moment within five seconds at which the collision is avoided, and branches."""
         makers = {BRAKING: self._braking, **planners}
         makers.setdefault(PDM, PdmClosed)
 

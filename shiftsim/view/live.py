@@ -16,10 +16,11 @@ import numpy as np
 
 from shiftsim.report.palette import planner_styles
 from shiftsim.report.statistics import bootstrap_interval, cluster_codes
-from shiftsim.report.words import noise_order, violations
+from shiftsim.report.words import violations
 from shiftsim.runs.execute import Progress
 from shiftsim.runs.rollouts.files import complete_rollout, decode_rows
 from shiftsim.runs.tables import OK, TaskResult
+from shiftsim.sim.perception import drift_order
 from shiftsim.view.page import framed, replay_page
 from shiftsim.view.scene import ShownRollout
 from shiftsim.view.serving import LocalServer
@@ -96,7 +97,7 @@ class LiveRun:
             left = elapsed / done * (progress.total - progress.done) if done > 0 else None
             for group in self._scores.keys() - self._summaries.keys():
                 self._summaries[group] = _statistics(self._scores[group])
-            noises = noise_order(noise for _, noise, _ in self._scores)
+            noises = drift_order(noise for _, noise, _ in self._scores)
             ranks = {name: rank for rank, name in enumerate((*self._styles, *noises))}
             groups = sorted(self._scores, key=lambda one: (ranks[one[0]], ranks[one[1]], one[2]))
             return {
@@ -127,11 +128,7 @@ class LiveRun:
             }
 
     def replay(self, number: int | str) -> str | None:
-        """The replay of one of the worst rollouts; None where it is none of them any more.
-
-        Raises:
-            ShiftsimError: Its scenario cannot be read.
-        """
+        """The replay of one of the worst rollouts; None where it is none of them any more."""
         with self._lock:
             worst = self._worst.values()
             found = (r for _, n, r in worst if str(n) == str(number) and r.rollout)
@@ -155,10 +152,7 @@ def _statistics(scores: Sequence[tuple[str, float]]) -> dict[str, Any]:
 
 
 def _describe(result: TaskResult) -> dict[str, Any]:
-    """A finished rollout as JSON values, with the violations that cost most, the earliest first.
-
-    That is those of multipliers, else all.
-    """
+    """A finished rollout as JSON values, with the violations of multipliers, else all."""
     found = violations(result.metrics)
     costly = [one for one in found if one.is_multiplier] or found
     return {

@@ -89,15 +89,7 @@ def replay_page(
     back: str = "",
     more: Mapping[str, Any] | None = None,
 ) -> Page:
-    """One self-contained HTML page of rollouts, the first six; `back` is the address of the list.
-
-    `seeds` are all rollouts of the scenario, where other pages show more of them; `more` are
-    `shown`, what is shown of how much, and `parts`, words and names of all pages of the scenario,
-    of which `part` is this one.
-
-    Raises:
-        ValueError: There are no rollouts.
-    """
+    """A self-contained page of six rollouts; `back` is the list, `more` and `part` the others."""
     if not shown:
         raise ValueError("a replay shows at least one rollout")
     drawn = shown[:MAX_ROLLOUTS]
@@ -116,15 +108,7 @@ def replay_page(
 def framed(
     name: str, *, title: str, images: str = "", data: Mapping[str, Any] | None = None, **parts: str
 ) -> Page:
-    """A whole page of the name, with one head for all pages.
-
-    Args:
-        name: The page, as in `_FILES`.
-        title: Its title, also within the page.
-        images: Where the images of a page that is a file may come from.
-        data: What its script reads, packed text or JSON values, of the elements `data-name`.
-        parts: What else its file leaves open, as HTML.
-    """
+    """A page of `_FILES` with the head of all pages: its script reads `data`, `parts` are HTML."""
     styles, scripts = _FILES[name]
     elements = []
     for key, value in (data or {}).items():

@@ -39,11 +39,7 @@ class ReviewService:
     """
 
     def __init__(self, store: Path, reviewer: str = "") -> None:
-        """Open the store of a folder; an empty `reviewer` is the user's login name.
-
-        Raises:
-            DataError: There is no store, or its filter results or reviews are damaged.
-        """
+        """Open the store of a folder, or a DataError; an empty `reviewer` is the login name."""
         self.store = open_store(store)
         self.reviewer = reviewer
         with suppress(OSError, KeyError):  # there may be no login name
@@ -103,11 +99,7 @@ class ReviewService:
         return thumbnails(recorded, {token: (recorded.expert[:, :2], None)})[token]
 
     def check_route(self, token: str, route: Any) -> dict[str, Any]:
-        """A route with what is wrong with it.
-
-        Raises:
-            ConfigError: It is no list of names.
-        """
+        """A route with what is wrong with it; a ConfigError if it is no list of names."""
         if not isinstance(route, list) or not all(isinstance(name, str) for name in route):
             raise ConfigError("a route is a list of roadblocks")
         return self._checked_route(self.store.read_recorded(token), route)
@@ -125,17 +117,7 @@ class ReviewService:
         return {"current": list(route), "problems": problems}
 
     def keep(self, token: str, values: Any) -> dict[str, Any]:
-        """Put a review on disk; returns what is kept.
-
-        Args:
-            token: The scenario.
-            values: `decision`, `comment` and `route` (null for the recorded one); those missing
-                stay as they are.
-
-        Raises:
-            ConfigError: The page may not write a field, or a comment is too long.
-            DataError: A value is none of those possible, or the store has no such scenario.
-        """
+        """Put the given fields of a review on disk; returns what is kept, or a ShiftsimError."""
         recorded = self.store.read_recorded(token)
         if not isinstance(values, dict) or not set(values) <= _CHANGED:
             raise ConfigError(f"the fields of a review are {', '.join(sorted(_CHANGED))}")

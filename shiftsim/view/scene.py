@@ -128,10 +128,7 @@ class Replay:
 
 
 def scene_fields(replay: Replay) -> Fields:
-    """Map, expert, lights and recorded tracks: what all rollouts of a scenario share.
-
-    Tracks are left out when every rollout carries its own.
-    """
+    """Map, expert, lights and recorded tracks, unless rollouts have their own."""
     origin = replay.origin
     road, nothing = replay.scenario.map, np.zeros((0, 2))
     layers = map_lines(road, replay.scenario.route, replay.box)
@@ -155,11 +152,7 @@ def scene_fields(replay: Replay) -> Fields:
 
 
 def _tube_fields(name: str, paths: Sequence[FloatArray]) -> Fields:
-    """The area between paths (T, 2) of several seeds, and how far these are apart at each sample.
-
-    `across` is the largest distance of one seed from the path of another, as far as that reaches;
-    `along` is the difference of the distances driven [m].
-    """
+    """The area between paths (T, 2), their distances `across`, and `along` as driven [m]."""
     count = min(map(len, paths))
     lines = [shapely.LineString(path[:count]) for path in paths]
     across, areas = np.zeros(count), []
@@ -403,11 +396,7 @@ def _lines(lines: list[FloatArray], box: FloatArray) -> list[FloatArray]:
 
 
 def pack(fields: Fields, base: Fields | None = None) -> str:
-    """One section: quantised arrays, and byte arrays (bool or uint8) as they are.
-
-    What is quantised is stored as its difference from the array of its name and shape in `base`,
-    the fields of the first rollout, where that is shorter.
-    """
+    """One section: quantised arrays, or what they differ by from `base`, and byte arrays."""
     header, chunks = [], []
     for name, value in fields.items():
         about = {"name": name, "step": 0.0}

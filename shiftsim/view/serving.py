@@ -47,10 +47,7 @@ class LocalServer(ThreadingHTTPServer):
     daemon_threads = True
 
     def __init__(self, routes: Mapping[str, Route], port: int = 0) -> None:
-        """Bind to a port of the loopback interface; 0 chooses a free one.
-
-        `routes` answer by method and path, as in `GET /` and `POST /api/review`.
-        """
+        """Bind to a port, 0 for a free one; `routes` are by method and path, as in `GET /`."""
         self.routes, self.turn = routes, Lock()
         self.token = secrets.token_urlsafe(24)
         super().__init__((HOST, port), _Handler)

@@ -47,17 +47,10 @@ def save_figure(
     speed: float = 1.0,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
-    """A picture, or a film of all samples that is so much faster, by the ending of the file's name.
-
-    Raises:
-        ConfigError: The ending, a time or the speed is none of those possible.
-        MissingExtraError: matplotlib, or for mp4 ffmpeg, is missing.
-    """
+    """A picture, or a film of all samples that is so much faster, by the ending of the file."""
     if path.suffix.lower() not in STILLS + FILMS:
-        raise ConfigError(
-            f"{str(path)!r} ends in {path.suffix!r}",
-            hint=f"pictures: {' '.join(STILLS)}; films: {' '.join(FILMS)}",
-        )
+        what = f"{str(path)!r} ends in {path.suffix!r}"
+        raise ConfigError(what, hint=f"pictures: {' '.join(STILLS)}; films: {' '.join(FILMS)}")
     if not 0.1 <= speed <= 100.0:
         raise ConfigError(f"speed {speed:g} is not within 0.1 … 100", hint="--speed 2")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -101,10 +94,7 @@ def picture(
 def _scene(
     scenario: Scenario, shown: Sequence[ShownRollout], view: View, whole: View, form: FigureFormat
 ) -> tuple[Any, Any, list[Any], list[drawing.Mark]]:
-    """Figure and axes with all that does not move, the paths, and the marks of violations.
-
-    `whole` is the view of all that will be seen.
-    """
+    """Figure and axes with all that does not move, in the view `whole`, and marks of violations."""
     styles = _styles(shown)
     figure, (axes,) = _panels(1, view, form)
     drawing.draw_map(axes, scenario.map, scenario.route, whole)
@@ -190,11 +180,7 @@ def map_picture(thing: VectorMap, *, form: FigureFormat = DEFAULT_FORM) -> Any:
 
 
 def before_and_after(recorded: Scenario, edited: Scenario) -> Any:
-    """A matplotlib figure: both at the first iteration, tracks of the edit outlined.
-
-    Raises:
-        MissingExtraError: matplotlib is missing.
-    """
+    """A matplotlib figure: both at the first iteration, tracks of the edit outlined."""
     tracks, row = edited.tracks, int(edited.iteration_rows[0])
     names, words = (edited.script.tokens, edited.script.words) if edited.script else ((), ())
     is_edited = np.array([name in names for name in tracks.tokens], np.bool_)
@@ -312,10 +298,7 @@ def _film(
     speed: float,
     on_progress: Callable[[int, int], None],
 ) -> None:
-    """The samples, one after the other; paths grow, a violation is marked from its moment on.
-
-    The view has the size and direction that it needs to follow all egos.
-    """
+    """The samples in a view that follows all egos; paths grow, violations are marked in turn."""
     view, centres = _following(scenario, shown)
     whole = view._replace(box=box_around([centres]) + view.box)
     figure, axes, lines, marks = _scene(scenario, shown, view, whole, form)
@@ -353,10 +336,7 @@ def _following(scenario: Scenario, shown: Sequence[ShownRollout]) -> tuple[View,
 
 
 def _writer(path: Path, speed: float) -> tuple[Any, int]:
-    """What writes a film, and every how many samples it has a picture.
-
-    The ffmpeg of an mp4 is the system's, or that of the package imageio-ffmpeg.
-    """
+    """What writes a film (of mp4 by any ffmpeg there is), and samples from picture to picture."""
     from matplotlib import rcParams
     from matplotlib.animation import FFMpegWriter, PillowWriter
 

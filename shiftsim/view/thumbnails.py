@@ -97,5 +97,4 @@ def _steps(points: FloatArray) -> str:
 
 
 def _whole(values: FloatArray) -> list[int]:
-    found: list[int] = np.rint(values).astype(int).tolist()
-    return found
+    return np.rint(values).astype(int).tolist()

@@ -96,8 +96,7 @@ class RolloutEvents:
     @property
     def stopped(self) -> BoolArray:
         """(N,) tracks that stand whatever happens."""
-        stands: BoolArray = self.behaviors == STOPPED
-        return stands
+        return self.behaviors == STOPPED
 
     @property
     def has_pedestrians(self) -> bool:

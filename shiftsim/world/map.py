@@ -136,8 +136,7 @@ class VectorMap:
         return self._layer(layer).meeting(area)
 
     def _layer(self, name: str) -> layers.Layer:
-        found: layers.Layer = getattr(self, one_of("map layer", name, LAYERS))
-        return found
+        return getattr(self, one_of("map layer", name, LAYERS))
 
     def progress_on(self, edge: int, x: float, y: float) -> float:
         """Arc length of the projection of a point on the baseline of an edge [m]."""

@@ -358,9 +358,8 @@ class Trajectory:
         seconds = np.asarray(times, np.float64)
         pose = np.asarray(poses, np.float64)
         if seconds.ndim != 1 or pose.shape != (len(seconds), 3):
-            raise ValueError(
-                f"need times (H,) and poses (H, 3), got {seconds.shape} and {pose.shape}"
-            )
+            what = f"need times (H,) and poses (H, 3), got {seconds.shape} and {pose.shape}"
+            raise ValueError(what)
         states = np.zeros((len(seconds), NUM_STATE))
         states[:, :3] = pose
         if len(seconds) > 1:

@@ -139,17 +139,15 @@ def convert_tracks(
     """
     errors, road = reader.diagnostics.errors, reader.road
     if errors:
-        raise ConversionError(
-            "; ".join(error.what for error in errors), "; ".join(error.remedy for error in errors)
-        )
+        what = "; ".join(error.what for error in errors)
+        raise ConversionError(what, "; ".join(error.remedy for error in errors))
     path = map_file(store, road.name)
     if (store / MANIFEST).is_file() and path.is_file():
         other, edges = read_map_file(path).edges, road.edges
         if other.ids != edges.ids or not np.array_equal(
             other.polygons.bounds, edges.polygons.bounds
         ):
-            raise ConversionError(
-                f"store {store} has another map named {road.name!r}", "name this one: --city NAME"
-            )
+            what = f"store {store} has another map named {road.name!r}"
+            raise ConversionError(what, "name this one: --city NAME")
     reader.egos = reader.settings["egos"] = egos
     return convert(reader, store)

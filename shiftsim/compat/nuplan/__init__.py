@@ -40,24 +40,16 @@ def wrap(planner: Any, **arguments: Any) -> "NuplanPlanner":
     kind = planner if inspect.isclass(planner) else type(planner)
     _check(kind)
     if kind is not planner and arguments:
-        raise ConfigError(
-            f"arguments {', '.join(arguments)} were given for an instance of {kind.__name__}",
-            hint=f"wrap({kind.__name__}, …) or wrap({kind.__name__}(…))",
-        )
+        what = f"arguments {', '.join(arguments)} were given for an instance of {kind.__name__}"
+        raise ConfigError(what, hint=f"wrap({kind.__name__}, …) or wrap({kind.__name__}(…))")
     return NuplanPlanner(planner, arguments)
 
 
 def from_spec(spec: str) -> Callable[..., "NuplanPlanner"]:
-    """What makes the planner `nuplan:package.module:Class`.
-
-    Raises ConfigError: there is no such class, or it is none of nuPlan planners. MissingExtraError:
-    it needs more of nuPlan's devkit than the shims have.
-    """
+    """What makes the planner `nuplan:package.module:Class`; a ShiftsimError if it is none."""
     if spec.count(":") != 2:
-        raise ConfigError(
-            f"planner {spec!r} is not of the form nuplan:package.module:Class",
-            hint="for example nuplan:my_package.my_module:MyPlanner",
-        )
+        what = f"planner {spec!r} is not of the form nuplan:package.module:Class"
+        raise ConfigError(what, hint="for example nuplan:my_package.my_module:MyPlanner")
     install()
     inner = spec.removeprefix("nuplan:")
     try:
@@ -67,15 +59,10 @@ def from_spec(spec: str) -> Callable[..., "NuplanPlanner"]:
 
 
 def factory(kind: Any) -> Callable[..., "NuplanPlanner"]:
-    """What makes wrapped planners of a class; it takes the arguments of the class's constructor.
-
-    Raises ConfigError: it is no class of nuPlan planners, or asks for what shiftsim does not have.
-    """
+    """What makes wrapped planners of a class, by its arguments; a ConfigError if it is none."""
     if not inspect.isclass(kind):
-        raise ConfigError(
-            f"{getattr(kind, '__name__', kind)!r} is not a class",
-            hint="nuplan:package.module:Class",
-        )
+        what = f"{getattr(kind, '__name__', kind)!r} is not a class"
+        raise ConfigError(what, hint="nuplan:package.module:Class")
     _check(kind)
 
     def make(**arguments: Any) -> "NuplanPlanner":

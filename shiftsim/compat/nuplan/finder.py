@@ -5,6 +5,7 @@ import logging
 import re
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
@@ -77,10 +78,7 @@ class ShimFinder(MetaPathFinder, Loader):
         raise MissingExtraError(_missing(name), hint=_HINT)
 
     def find_missing(self, module_name: str) -> list[str]:
-        """All names that the import of a module asks for and that have no shim, sorted.
-
-        The module is imported with empty classes in their place, and forgotten again.
-        """
+        """All names without a shim that the import of a module asks for; it is forgotten again."""
         before, self.missing = set(sys.modules), set[str]()
         try:
             import_module(Path(module_name).stem if module_name[-3:] == ".py" else module_name)
@@ -120,20 +118,12 @@ class ShimFinder(MetaPathFinder, Loader):
 
 
 def install() -> bool:
-    """Make `import nuplan…` work in this process; call it before importing a planner's module.
-
-    Returns whether the shims are used: false where nuPlan's devkit is there.
-    """
+    """Make `import nuplan…` work in this process, and return whether the shims are used."""
     if any(isinstance(finder, ShimFinder) for finder in sys.meta_path):
         return True
-    try:
-        if (
-            importlib.util.find_spec("nuplan.planning.simulation.planner.abstract_planner")
-            is not None
-        ):
+    with suppress(ModuleNotFoundError):
+        if importlib.util.find_spec("nuplan.planning.simulation.planner.abstract_planner"):
             return False
-    except ModuleNotFoundError:
-        pass
     # a folder named nuplan, of data for instance, counts as an empty package: drop it
     for name in [name for name in sys.modules if name.partition(".")[0] == "nuplan"]:
         del sys.modules[name]

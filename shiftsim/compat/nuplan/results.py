@@ -29,7 +29,6 @@ from shiftsim.errors import ConfigError, DataError
 from shiftsim.files import atomic_write, safe_join
 from shiftsim.metrics import evaluate, measure
 from shiftsim.metrics.score import closed_loop_score, nuplan_columns
-from shiftsim.runs.config import default_workers
 from shiftsim.runs.derive import tasks_with_rollouts
 from shiftsim.runs.results import Run, open_run
 from shiftsim.runs.rollouts import Task, describe
@@ -68,11 +67,7 @@ def export_results(
     workers: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> ResultsExport:
-    """Write the results of a run as nuPlan's own simulation would have written them.
-
-    Settings and errors are those of `shiftsim.Run.export_results`; without simulation logs nuBoard
-    shows tables only.
-    """
+    """Write a run as nuPlan's own simulation would have; see `shiftsim.Run.export_results`."""
     out, tasks, rows = Path(out), tasks_with_rollouts(run), run.tasks.to_pylist()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"{str(out)!r} is there and not empty", hint="name another folder")
@@ -82,16 +77,10 @@ def export_results(
         raise ConfigError(what, hint="run them with other names")
     opened, found = open_run_store(run, store), dict[Task, Row]()
     folders = {task_of(row): _folder(out, run, task_of(row)) for row in rows}
-    exporter = partial(
-        _Exporter,
-        run=run.path.resolve(),
-        store=opened,
-        folders=folders if simulation_logs else {},
-        recordings=Path(logs).expanduser().resolve(),
-        maps=Path(maps).expanduser().resolve(),
-    )
-    number = min(workers or default_workers(), len(tasks))
-    with closing(map_unordered(exporter, tasks, workers=number, alone=1)) as outcomes:
+    places = (Path(place).expanduser().resolve() for place in (logs, maps))
+    written_to = folders if simulation_logs else {}
+    exporter = partial(_exporter, run.path.resolve(), opened, written_to, *places)
+    with closing(map_unordered(exporter, tasks, workers=workers, alone=1)) as outcomes:
         for outcome in outcomes:
             result = outcome.result or TaskResult(outcome.task, FAILED, error=outcome.death)
             if isinstance(result, TaskResult):
@@ -118,42 +107,24 @@ def _folder(out: Path, run: Run, task: Task) -> Path:
     return out / CHALLENGES[not is_replayed] / plain_name(name)
 
 
-class _Exporter:
-    """Scores stored rollouts in nuPlan's words, and writes their simulation logs."""
+def _exporter(
+    path: Path, store: ScenarioStore, folders: Mapping[Task, Path], recordings: Path, maps: Path
+) -> Callable[[Task], Row | TaskResult]:
+    """What says a rollout in nuPlan's words, and writes its simulation log below `folders`."""
+    run = open_run(path)
+    files = chain.from_iterable(map(recordings.glob, _RECORDINGS if folders else ()))
+    databases = {file.stem: file for file in files}
 
-    def __init__(
-        self,
-        run: Path,
-        store: ScenarioStore,
-        folders: Mapping[Task, Path],
-        recordings: Path,
-        maps: Path,
-    ) -> None:
-        """`folders` are those of the simulation logs to write."""
-        self.run, self.store, self.folders = open_run(run), store, folders
-        self.recordings, self.maps = recordings, maps
-        found = chain.from_iterable(map(recordings.glob, _RECORDINGS if folders else ()))
-        self.databases = {path.stem: path for path in found}
-
-    def __call__(self, task: Task) -> Row | TaskResult:
-        """What the tables say of a rollout, or why there is nothing."""
-        return attempt(task, partial(self._export, task))
-
-    def _export(self, task: Task) -> Row:
-        scenario = self.store.read(task.token)
-        log, planner = self.run.rollout(task, scenario), plain_name(task.planner)
-        result = evaluate(measure(log, scenario.map), self.run.manifest["config"]["thresholds"])
+    def export(task: Task) -> Row:
+        scenario = store.read(task.token)
+        log, planner = run.rollout(task, scenario), plain_name(task.planner)
+        result = evaluate(measure(log, scenario.map), run.manifest["config"]["thresholds"])
         name, kind = plain_name(scenario.log_name), plain_name(scenario.scenario_type)
-        if self.folders:
+        if folders:
             place = "/".join((_LOGS, planner, kind, name, task.token, f"{task.token}.msgpack.xz"))
-            write_simulation_log(
-                safe_join(self.folders[task], place),
-                task,
-                scenario,
-                log,
-                database=self.databases.get(name, self.recordings / f"{name}.db"),
-                maps=self.maps,
-            )
+            database = databases.get(name, recordings / f"{name}.db")
+            target = safe_join(folders[task], place)
+            write_simulation_log(target, task, scenario, log, database=database, maps=maps)
         key = {"log_name": name, "scenario_name": task.token, "scenario_type": kind}
         key |= {"planner_name": planner}
         seconds = {n: float(of(log.planning_seconds)) for n, of in _RUNTIMES.items()}
@@ -168,6 +139,8 @@ class _Exporter:
             for metric in result.scores
         }
         return {"key": key, "metrics": rows, "runtimes": seconds}
+
+    return lambda task: attempt(task, partial(export, task))
 
 
 def _write_tables(folder: Path, found: Mapping[Task, Row], began: datetime) -> None:

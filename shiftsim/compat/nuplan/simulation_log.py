@@ -145,13 +145,7 @@ def _without_collector() -> Iterator[None]:
 def write_simulation_log(
     path: Path, task: Task, scenario: Scenario, log: SimulationLog, *, database: Path, maps: Path
 ) -> None:
-    """Write a rollout as a simulation log, packed with msgpack and xz.
-
-    Velocities of plans are derived from their poses. The planner is a stand-in: it has the name and
-    the run times, and `shiftsim` says what was run. In `database`, the recording (.db), and in the
-    folder `maps` nuPlan's tools look for the rest of the scenario. It is a ConversionError if a
-    light belongs to a connector without an integer id.
-    """
+    """Write a rollout as a simulation log; nuPlan's tools look in `database` and `maps`."""
     with _without_collector():
         planner = _DEVKIT.SimplePlanner(
             _compute_trajectory_runtimes=log.planning_seconds.tolist(),
@@ -337,10 +331,7 @@ def _grouped(pieces: Iterable[T], lengths: IntArray) -> Iterator[list[T]]:
 
 
 def _planned(log: SimulationLog) -> tuple[IntArray, FloatArray, IntArray]:
-    """Times and ego states of all plans one after the other, and the length of each.
-
-    A plan begins with the state of the ego. Where there is none, the ego stands.
-    """
+    """Times and ego states of all plans, and their lengths; where there is none, the ego stands."""
     poses, is_bare = log.plans.copy(), np.isnan(log.plans[:, 1, 0])
     poses[is_bare, :2] = log.ego[is_bare, None, :3]
     known = np.isfinite(poses[..., 0])

@@ -35,9 +35,8 @@ def parse_code(code: str) -> dict[str, Any]:
         if not value:
             raise ConfigError(f"code {code!r}: letter {letter!r} has no value")
         if letter not in LETTERS:
-            raise ConfigError(
-                f"code {code!r}: letter {letter!r} unknown", f"there are: {', '.join(LETTERS)}"
-            )
+            what = f"code {code!r}: letter {letter!r} unknown"
+            raise ConfigError(what, f"there are: {', '.join(LETTERS)}")
         if letter == "a" and not value.isdigit():
             raise ConfigError(f"code {code!r}: share {value!r} is no digit")
         out[LETTERS[letter]] = int(value) if letter == "a" else value
@@ -51,10 +50,7 @@ def edits_agents(changes: Mapping[str, Any]) -> bool:
 
 
 def changes_of(code: str, details: Mapping[str, Any]) -> dict[str, Any]:
-    """What a code asks for; a special scenario may have a code of its own, which replaces all.
-
-    Raises ConfigError: the code is wrong, or the special scenario is not described.
-    """
+    """What a code asks for; that of a special scenario, if any, replaces all. Or a ConfigError."""
     changes = parse_code(code)
     number = changes.get("special_scenario")
     if number is None:
@@ -72,8 +68,7 @@ def special_of(changes: Mapping[str, Any], details: Mapping[str, Any]) -> Mappin
     if number not in known:
         what = f"special scenario {number!r} is not described in the modifications"
         raise ConfigError(what, f"there are: {', '.join(known) or 'none'}")
-    found: Mapping[str, Any] = known[number]
-    return found
+    return known[number]
 
 
 def scenario_type(changes: Mapping[str, Any], details: Mapping[str, Any]) -> str:
@@ -119,12 +114,7 @@ def manners_in_force(names: Iterable[str], details: Mapping[str, Any]) -> dict[s
 def import_names(
     names: Mapping[str, Any], modifications: Mapping[str, Any], window: float = 30.0
 ) -> dict[str, Any]:
-    """The table of an `edits.toml` for a list of interPlan's names and its modifications.
-
-    Both are what the files of interPlan's repository hold, which are not part of this package. The
-    `window` is the duration of the scenarios [s], 0 for the recorded one. It is a ConfigError if
-    the files do not hold it, or a code is wrong.
-    """
+    """The table of an `edits.toml` for a list of interPlan's names; `window` [s], 0 as recorded."""
     listed, details = names.get("scenario_tokens"), modifications.get(DETAILS)
     if not isinstance(listed, list) or not isinstance(details, dict):
         raise ConfigError(

@@ -3,7 +3,10 @@
 `files` says what a row holds and how many rollouts share files; `branches` drives others from one.
 """
 
+from pathlib import Path
 from typing import NamedTuple
+
+from shiftsim.errors import DataError
 
 
 class Task(NamedTuple):
@@ -19,3 +22,8 @@ def describe(task: Task) -> str:
     """A task in words."""
     seed = "" if task.noise == "none" else f" seed {task.seed}"
     return f"{task.planner} {task.noise}{seed} {task.token}"
+
+
+def damaged(path: Path, what: str) -> DataError:
+    """The error that a file of a run cannot be read."""
+    return DataError(f"{str(path)!r} cannot be read: {what}", hint="make the run again")

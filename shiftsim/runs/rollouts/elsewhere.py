@@ -23,7 +23,7 @@ from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.metrics import MetricResult, Thresholds, compute_metrics
 from shiftsim.metrics.score import without
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.rollouts.files import KINDS, SEEN, STATES, TRACKS
+from shiftsim.runs.rollouts.files import KEY, KINDS, SEEN, STATES, TRACKS
 from shiftsim.runs.rollouts.poses import NEED_BOXES, POINTS, REAR_AXLE, Boxes, Driven, rollout_of
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.scenario import Scenario
@@ -35,16 +35,15 @@ _SAME = {  # other names of columns, those of our own rollouts among them
     **{"yaw_acceleration": "yaw_accel", "planning_seconds": "seconds", "scenario": "token"},
     **{"length_m": "length", "width_m": "width"},
 }
-_KEY = {"planner": pa.string(), "noise": pa.string(), "seed": pa.int64(), "token": pa.string()}
 _TIMES, _POSE = {"time_us": 1.0, "time_s": 1e6}, ("x", "y", "heading")
 _BOX = (*STATE_COLUMNS[:5], "length", "width")
-_KNOWN = {*_KEY, *_TIMES, *STATE_COLUMNS, *_BOX, "seconds", "track_token", "type"}
+_KNOWN = {*KEY, *_TIMES, *STATE_COLUMNS, *_BOX, "seconds", "track_token", "type"}
 _KNOWN |= {*STATES.names, *TRACKS.names, *SEEN.names, KINDS, "iteration"}  # of rollouts of our own
+_EGO = -2  # in place of an AgentKind
 _NO_ROWS = np.zeros(0, np.int64)
-_TEXTS = dict.fromkeys(
-    ("planner", "noise", "token", "scenario", "track_token", "type"), pa.string()
-)
+_NAMES = ("planner", "noise", "token", "scenario", "track_token", "type")
 _HINT = "needed are token, time_us (or time_s from 0 on), x, y, heading; docs/score_elsewhere.md"
+_EVERY = "give it in every row"
 _BOX_HINT = f"boxes have token, time_us, track_token, type, {', '.join(_BOX)}"
 
 
@@ -73,10 +72,7 @@ class Source:
         return sorted({entry.task.token for entry in self.entries})
 
     def in_store(self, store: ScenarioStore) -> "Source":
-        """The rollouts whose scenarios a store has.
-
-        Raises DataError: it lacks all of them, or one where the source is to be scored as a whole.
-        """
+        """The rollouts whose scenarios a store has: all of them, or some of what may be in part."""
         known = [entry for entry in self.entries if entry.task.token in store]
         lost = [entry.task.token for entry in self.entries if entry.task.token not in store]
         if lost and (self.is_whole or not known):
@@ -168,11 +164,7 @@ def _as_table(given: Any, scenario: Scenario) -> pa.Table:
 
 
 def read_source(path: Path, tracks: str = "") -> Source:
-    """The rollouts of a table of poses, or of the tables in a folder.
-
-    `tracks` is the path of a table of boxes; empty or `RECORDED` without one. It is a DataError if
-    a file cannot be read, or a column is missing or holds something else.
-    """
+    """Rollouts in tables of poses, a file or a folder; `tracks` is one of boxes, or `RECORDED`."""
     files = tuple(sorted([*path.glob("*.parquet"), *path.glob("*.csv")])) or (path,)
     table = pa.concat_tables(map(_read_table, files), promote_options="default")
     if tracks == RECORDED and TRACKS.names[0] in table.column_names:
@@ -191,7 +183,7 @@ def _read_table(path: Path) -> pa.Table:
         )
     try:
         if ".csv" in path.suffixes:
-            texts = pyarrow.csv.ConvertOptions(column_types=_TEXTS)
+            texts = pyarrow.csv.ConvertOptions(column_types=dict.fromkeys(_NAMES, pa.string()))
             return pyarrow.csv.read_csv(path, convert_options=texts)
         return pq.ParquetFile(path).read()
     except (OSError, pa.ArrowException) as error:
@@ -210,7 +202,8 @@ def table_source(
     _require(table, where, ("token", *_POSE), _HINT)
     if boxes is None and TRACKS.names[0] in table.column_names:
         boxes, where_boxes = _nested(table), where
-    others = None if boxes is None else _Others(_renamed(boxes, where_boxes), where_boxes)
+    boxes = None if boxes is None else _renamed(boxes, where_boxes)
+    boxes_of = None if boxes is None else _read_boxes(boxes, where_boxes)
     time_us, states = _times(table, where), _numbers(table, STATE_COLUMNS, where)
     seconds = _numbers(table, ["seconds"], where)[:, 0] if "seconds" in table.column_names else None
     entries = []
@@ -218,14 +211,14 @@ def table_source(
         task = Task(**{"planner": where.partition(".")[0], "noise": "none", "seed": 0, **dict(key)})
         fields = {} if seconds is None else {"planning_seconds": seconds[rows]}
         driven = Driven(where, time_us[rows], states[rows], rows, fields=fields)
-        read = partial(_with_boxes, driven, others.of(task) if others else None)
-        entries.append(Entry(task, read))
+        entries.append(Entry(task, partial(_with_boxes, driven, boxes_of and boxes_of(task))))
     if not entries:
         raise DataError(f"{where} has no rows", hint=_HINT)
-    unused = sorted({*table.column_names, *(others.columns if others else ())} - _KNOWN)
-    remarks = [f"columns not used: {listed(unused)}"] if unused else []
+    names = {*table.column_names, *(boxes.column_names if boxes is not None else ())}
+    unused = listed(sorted(names - _KNOWN))
+    remarks = (f"columns not used: {unused}",) if unused else ()
     entries.sort(key=lambda entry: (entry.task.token, entry.task))
-    return Source(where, (), tuple(entries), others is not None, point, tuple(remarks))
+    return Source(where, (), tuple(entries), boxes is not None, point, remarks)
 
 
 def _with_boxes(driven: Driven, make: Callable[[], Boxes] | None) -> Driven:
@@ -247,15 +240,23 @@ def _require(table: pa.Table, where: str, needed: Sequence[str], hint: str) -> N
         raise DataError(f"{where}: column {', '.join(map(repr, missing))} is missing", hint)
 
 
+def _refuse(
+    bad: BoolArray, where: str, words: str, hint: str = _BOX_HINT, rows: IntArray | None = None
+) -> None:
+    """Refuse the first row of a table, or of some `rows` of it, that is bad."""
+    if bad.any():
+        row = np.argmax(bad) if rows is None else rows[np.argmax(bad)]
+        raise DataError(f"{where}, row {row}: {words}", hint)
+
+
 def _column(table: pa.Table, name: str, kind: pa.DataType, where: str) -> pa.Array:
     """A column of a type."""
     try:
         column = table[name].cast(kind).combine_chunks()
     except pa.ArrowException as error:
         raise DataError(f"{where}: column {name!r} is no {kind}: {error}", hint=_HINT) from error
-    if column.null_count and kind != pa.float64():
-        row = column.is_null().index(True).as_py()
-        raise DataError(f"{where}, row {row}: {name} is missing", hint="give it in every row")
+    if kind != pa.float64():
+        _refuse(column.is_null().to_numpy(False), where, f"{name} is missing", _EVERY)
     return column
 
 
@@ -273,26 +274,20 @@ def _times(table: pa.Table, where: str) -> IntArray:
     """(A,) times [us]."""
     name = next(name for name in _TIMES if name in table.column_names)
     times = _numbers(table, [name], where)[:, 0]  # microseconds since 1970 are exact
-    if (missing := ~np.isfinite(times)).any():
-        words = f"{where}, row {np.argmax(missing)}: {name} is missing"
-        raise DataError(words, hint="give it in every row")
+    _refuse(~np.isfinite(times), where, f"{name} is missing", _EVERY)
     return np.rint(times * _TIMES[name]).astype(np.int64)
 
 
 def _groups(table: pa.Table, where: str) -> dict[tuple[tuple[str, Any], ...], IntArray]:
     """The rows of each rollout, by the names and values of the key columns there are."""
-    names = [name for name in _KEY if name in table.column_names]
-    codes, columns = np.zeros(len(table), np.int64), []
-    for name in names:
-        column = _column(table, name, _KEY[name], where).dictionary_encode()
-        columns.append(column)
-        codes = codes * len(column.dictionary) + column.indices.to_numpy()
-    order = np.argsort(codes, kind="stable")
-    starts = np.flatnonzero(np.diff(codes[order], prepend=-1))
-    parts = np.split(order, starts[1:]) if len(order) else []
+    names = [name for name in KEY if name in table.column_names]
+    columns = {name: _column(table, name, KEY[name], where) for name in names}
+    numbered = pa.table(columns | {"row": np.arange(len(table))})
+    found = numbered.group_by(names, use_threads=False).aggregate([("row", "list")])
+    keys = zip(*(found[name].to_pylist() for name in names), strict=True)
     return {
-        tuple((n, c[int(rows[0])].as_py()) for n, c in zip(names, columns, strict=True)): rows
-        for rows in parts
+        tuple(zip(names, key, strict=True)): rows.values.to_numpy()
+        for key, rows in zip(keys, found["row_list"], strict=True)
     }
 
 
@@ -300,7 +295,7 @@ def _nested(table: pa.Table) -> pa.Table:
     """The boxes in rollouts as a run stores them, a row per box."""
     tokens = table[TRACKS.names[0]].combine_chunks()
     owner = np.repeat(np.arange(len(table)), tokens.value_lengths().to_numpy())
-    kept = [name for name in (*_KEY, "time_us") if name in table.column_names]
+    kept = [name for name in (*KEY, "time_us") if name in table.column_names]
     columns = {name: table[name].take(pa.array(owner)) for name in kept}
     nested = {"track_token": TRACKS.names[0], "type": KINDS, **{n: f"track_{n}" for n in BOX}}
     for name, of in nested.items():
@@ -309,77 +304,58 @@ def _nested(table: pa.Table) -> pa.Table:
     return pa.table(columns)
 
 
-class _Others:
-    """A table of boxes. B rows."""
+def _read_boxes(table: pa.Table, where: str) -> Callable[[Task], Callable[[], Boxes]]:
+    """By a rollout, what makes its boxes; those of its scenario where no column says more."""
+    _require(table, where, ("token", "track_token", *_POSE, "length", "width"), _BOX_HINT)
+    groups, time_us = _groups(table, where), _times(table, where)
+    values, kinds = _numbers(table, _BOX, where), _kinds(table, where)
+    tracks = _column(table, "track_token", pa.string(), where)
+    names = [name for name, _ in next(iter(groups), ())]
+    broken = ~np.isfinite(values[:, [0, 1, 2, 5, 6]])
+    _refuse(np.logical_or.reduce(broken, axis=1), where, "a number is missing")
+    _refuse(values[:, 5:].min(axis=1) <= 0.0, where, "length and width must be above 0")
 
-    def __init__(self, table: pa.Table, where: str) -> None:
-        _require(table, where, ("token", "track_token", *_POSE, "length", "width"), _BOX_HINT)
-        self.where, self.columns = where, table.column_names
-        self._groups = _groups(table, where)
-        self._time_us, self._values = _times(table, where), _numbers(table, _BOX, where)
-        tokens = _column(table, "track_token", pa.string(), where).dictionary_encode()
-        self._names, self._tracks = tokens.dictionary, tokens.indices.to_numpy()
-        self._kinds, self._is_ego = np.full(len(table), -1), np.zeros(len(table), np.bool_)
-        if "type" in table.column_names:
-            self._read_kinds(_column(table, "type", pa.string(), where).dictionary_encode())
-        broken = ~np.isfinite(self._values[:, [0, 1, 2, 5, 6]])
-        _refuse(
-            np.logical_or.reduce(broken, axis=1),
-            where,
-            np.arange(len(table)),
-            "a number is missing",
-        )
-        flat = self._values[:, 5:].min(axis=1) <= 0.0
-        _refuse(flat, where, np.arange(len(table)), "length and width must be above 0")
+    def of(task: Task) -> Callable[[], Boxes]:
+        rows = groups.get(tuple((name, getattr(task, name)) for name in names), _NO_ROWS)
+        rows = rows[kinds[rows] != _EGO]
+        tokens = tracks.take(pa.array(rows))
+        return partial(_boxes, where, rows, time_us[rows], kinds[rows], values[rows], tokens)
 
-    def _read_kinds(self, types: pa.DictionaryArray) -> None:
-        known = {word: kind.value for kind in AgentKind for word in (kind.name, str(kind.value))}
-        codes = types.indices.to_numpy()
-        for code, name in enumerate(types.dictionary.to_pylist()):
-            if name.upper() == "EGO":
-                self._is_ego |= codes == code
-                continue
-            if name.upper() not in known:
-                words = f"type {name!r} is none of {', '.join(k.name for k in AgentKind)} and EGO"
-                _refuse(codes == code, self.where, np.arange(len(codes)), words)
-            self._kinds[codes == code] = known[name.upper()]
+    return of
 
-    def of(self, task: Task) -> Callable[[], Boxes]:
-        """Makes the boxes of a rollout; those of its scenario where no column says more."""
-        names = [name for name, _ in next(iter(self._groups), ())]
-        rows = self._groups.get(tuple((name, getattr(task, name)) for name in names), _NO_ROWS)
-        rows = rows[~self._is_ego[rows]]
-        tracks = np.unique(self._tracks[rows])
-        tokens = dict(zip(tracks.tolist(), self._names.take(tracks).to_pylist(), strict=True))
-        times, numbers, kinds = self._time_us[rows], self._tracks[rows], self._kinds[rows]
-        return partial(_boxes, self.where, rows, times, numbers, kinds, self._values[rows], tokens)
+
+def _kinds(table: pa.Table, where: str) -> IntArray:
+    """(A,) AgentKind codes, that of the ego among them; -1 where no type is given."""
+    if "type" not in table.column_names:
+        return np.full(len(table), -1)
+    known = {word: kind.value for kind in AgentKind for word in (kind.name, str(kind.value))}
+    known["EGO"] = _EGO
+    types = _column(table, "type", pa.string(), where).dictionary_encode()
+    codes, names = types.indices.to_numpy(), types.dictionary.to_pylist()
+    for code, name in enumerate(names):
+        if name.upper() not in known:
+            words = f"type {name!r} is none of {', '.join(k.name for k in AgentKind)} and EGO"
+            _refuse(codes == code, where, words)
+    return np.array([known[name.upper()] for name in names], np.int64)[codes]
 
 
 def _boxes(
-    where: str,  # the table
-    rows: IntArray,  # (B,) of it
-    time_us: IntArray,  # (B,) [us]
-    tracks: IntArray,  # (B,) numbers
-    kinds: IntArray,  # (B,) AgentKind codes, -1 where not given
-    values: FloatArray,  # (B, 7) columns of `_BOX`
-    tokens: Mapping[int, str],  # by number
+    where: str,
+    rows: IntArray,
+    time_us: IntArray,
+    kinds: IntArray,
+    values: FloatArray,
+    tokens: pa.Array,
 ) -> Boxes:
-    """The tracks at all times that have rows, in order of appearance."""
-    _, first, track = np.unique(tracks, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    first, track = first[order], np.argsort(order)[track]
+    """The tracks at all times that have rows of a table, in order of appearance."""
+    numbered = tokens.dictionary_encode()
+    track = numbered.indices.to_numpy()
+    _, first = np.unique(track, return_index=True)
     times, frame = np.unique(time_us, return_inverse=True)
     is_first = np.zeros(len(rows), np.bool_)
     is_first[np.unique(frame * len(first) + track, return_index=True)[1]] = True
-    _refuse(~is_first, where, rows, "its track is there twice at one time")
-    _refuse(kinds[first][track] != kinds, where, rows, "its track changes its type")
+    _refuse(~is_first, where, "its track is there twice at one time", rows=rows)
+    _refuse(kinds[first][track] != kinds, where, "its track changes its type", rows=rows)
     dense = np.full((len(times), len(first), len(_BOX)), np.nan)
     dense[frame, track] = values
-    names = [tokens[number] for number in tracks[first].tolist()]
-    return Boxes(times, tracks_of_boxes(dense, kinds[first], names))
-
-
-def _refuse(bad: BoolArray, where: str, rows: IntArray, words: str) -> None:
-    """Refuse the first of some rows of boxes that is bad."""
-    if bad.any():
-        raise DataError(f"{where}, row {rows[np.argmax(bad)]}: {words}", hint=_BOX_HINT)
+    return Boxes(times, tracks_of_boxes(dense, kinds[first], numbered.dictionary.to_pylist()))

@@ -27,8 +27,8 @@ import pyarrow.parquet as pq
 from shiftsim.data.store.schema import BOX, EGO_COLUMNS, list_of
 from shiftsim.data.store.tables import write_blocks
 from shiftsim.errors import DataError
-from shiftsim.runs.rollouts import Task
-from shiftsim.sim.log import NUM_KEPT, Seen, SimulationLog
+from shiftsim.runs.rollouts import Task, damaged
+from shiftsim.sim.log import NUM_KEPT, Seen, SimulationLog, as_recorded
 from shiftsim.sim.noise import sample_noise
 from shiftsim.sim.perception import noise_of
 from shiftsim.world.ranges import RUN, require
@@ -83,11 +83,7 @@ def rollout_rows(
     with_kinds: bool = False,
     with_seen: bool = False,
 ) -> pa.RecordBatch:
-    """Columns of `STATES`, of `TRACKS` where tracks are not the recorded ones, and of `SEEN`.
-
-    Noise that `complete_rollout` can make again from the task is left out: null. Kinds are needed
-    of tracks that the scenario has not.
-    """
+    """Columns of `STATES`, and of `TRACKS` and `SEEN` where asked; without noise it is null."""
     columns = [pa.array(log.time_us)]
     for values in (log.ego, log.commands):
         columns += map(pa.array, np.ascontiguousarray(values.T))
@@ -132,28 +128,20 @@ def _lists(lengths: np.ndarray, items: np.ndarray | pa.Array) -> pa.Array:
 def complete_rollout(
     rows: pa.RecordBatch, scenario: Scenario, task: Task, *, is_partial: bool = False
 ) -> SimulationLog:
-    """The stored rollout of a task, completed by its noise and what its scenario holds already.
-
-    The rows have columns of `STATES`, and of `TRACKS` where they are not those of the log. Where
-    they may end before the scenario, the expert ends with them. Raises DataError: the scenario is
-    not the one that was driven, or the rows are damaged.
-    """
+    """The stored rollout of a task, completed by its noise and scenario; or a DataError."""
     time_us = rows["time_us"].to_numpy()
     if is_partial:
         shown = scenario.iteration_rows[: len(time_us) + 1]
         scenario = replace(scenario, iteration_rows=shown)
-    samples = scenario.iteration_rows[:-1]
-    if scenario.script is not None and scenario.script.termination is not None:
-        samples = samples[: len(time_us)]  # it may have ended before its time
-    if not np.array_equal(time_us, scenario.time_us[samples]):
-        raise DataError(
-            f"scenario {scenario.token!r} in the store is not the one that was driven",
-            hint="use the store that the manifest names",
-        )
+    log, may_end = as_recorded(scenario), scenario.script and scenario.script.termination
+    samples = slice(len(time_us) if may_end else None)  # it may have ended before its time
+    if not np.array_equal(time_us, log.time_us[samples]):
+        what = f"scenario {scenario.token!r} in the store is not the one that was driven"
+        raise DataError(what, hint="use the store that the manifest names")
     ego = stack(rows, EGO_COLUMNS)
     where = f"the rollout of scenario {scenario.token!r}"
     require(RUN, "state", ego, f"{where}: an ego")
-    tracks = scenario.tracks.rows(samples)
+    tracks = log.tracks.rows(samples)
     try:
         plans = stored_plans(rows)
         if KINDS in rows.schema.names:
@@ -168,20 +156,16 @@ def complete_rollout(
     except ValueError as error:
         raise DataError(f"{where} is damaged: {error}", hint="make the run again") from error
     if rows[NOISE_COLUMNS[0]].null_count:
-        noise = sample_noise(
-            noise_of(task.noise), seed=task.seed, token=task.token, num_steps=len(rows)
-        )
+        key: dict[str, Any] = {"seed": task.seed, "token": task.token, "num_steps": len(rows)}
+        noise = sample_noise(noise_of(task.noise), **key)
     else:
         noise = stack(rows, NOISE_COLUMNS)
-    return SimulationLog(
-        token=scenario.token,
-        time_us=scenario.time_us[samples],
+    return replace(
+        log,
+        time_us=log.time_us[samples],
         ego=ego,
         tracks=tracks,
-        traffic_lights=scenario.traffic_lights.rows(samples),
-        expert_time_us=scenario.iteration_times,
-        expert_ego=scenario.expert,
-        route=scenario.route,
+        traffic_lights=log.traffic_lights.rows(samples),
         commands=stack(rows, COMMAND_COLUMNS),
         noise=noise,
         plans=plans,
@@ -228,11 +212,7 @@ def stored_plans(rows: pa.RecordBatch) -> np.ndarray:
 def stored_tracks(
     rows: pa.RecordBatch, tokens: Sequence[str], prefix: str = "track_"
 ) -> dict[str, np.ndarray]:
-    """Fields `valid`, `poses`, `velocities`, `sizes` of N stored tracks, by their `tokens`.
-
-    Columns are those of `TRACKS`, or of what was seen with its prefix. Raises ValueError: they are
-    damaged, or of other tracks.
-    """
+    """Fields `valid`, `poses`, `velocities`, `sizes` of N stored tracks, or a ValueError."""
     names = rows[f"{prefix}tokens"]
     lengths = np.diff(names.offsets.to_numpy())
     found = pc.index_in(names.flatten(), pa.array(tokens, pa.string()))
@@ -260,8 +240,7 @@ def encode_rows(rows: pa.RecordBatch) -> bytes:
     options = pa.ipc.IpcWriteOptions(compression="lz4")
     with pa.ipc.new_stream(sink, rows.schema, options=options) as stream:
         stream.write_batch(rows)
-    encoded: bytes = sink.getvalue().to_pybytes()
-    return encoded
+    return sink.getvalue().to_pybytes()
 
 
 def decode_rows(data: bytes) -> pa.RecordBatch:
@@ -277,13 +256,8 @@ def stack(rows: pa.RecordBatch, names: Iterable[str]) -> np.ndarray:
 FOLDER = "rollouts"
 _PART = re.compile(r"part-(\d+)\.parquet")
 _GROUP, _FILE = 16, 1024  # rollouts of a row group and of a file
-_KINDS = {"planner": pa.string(), "noise": pa.string(), "seed": pa.int64(), "token": pa.string()}
-_KEY = pa.schema(
-    [
-        pa.field(name, kind, nullable=False)
-        for name, kind in (_KINDS | {"iteration": pa.int64()}).items()
-    ]
-)
+KEY = {"planner": pa.string(), "noise": pa.string(), "seed": pa.int64(), "token": pa.string()}
+_KEY = _schema(KEY | {"iteration": pa.int64()})
 
 
 class RolloutLocation(NamedTuple):
@@ -324,9 +298,7 @@ class RolloutReader:
                     raise ValueError(f"column {name!r} holds {nulls} nulls")
             return batch
         except (OSError, ValueError, TypeError, IndexError, pa.ArrowException) as error:
-            raise DataError(
-                f"{str(location.file)!r} cannot be read: {error}", hint="make the run again"
-            ) from error
+            raise damaged(location.file, str(error)) from error
 
     def _open(self, path: Path) -> None:
         self._file, self._rows = pq.ParquetFile(path), pa.table({})
@@ -341,25 +313,19 @@ class RolloutReader:
     def _read_group(self, row: int) -> None:
         """Read the row group that holds a row."""
         assert self._file is not None
-        first = 0
-        for group in range(self._file.num_row_groups):
-            end = first + self._file.metadata.row_group(group).num_rows
-            if first <= row < end:
-                self._rows = self._file.read_row_group(group, use_threads=False)
-                self._first = first
-                return
-            first = end
-        raise IndexError(f"it has no row {row}")
+        about = self._file.metadata
+        ends = np.cumsum([about.row_group(i).num_rows for i in range(about.num_row_groups)])
+        group = int(np.searchsorted(ends, row, "right"))
+        if row < 0 or group == len(ends):
+            raise IndexError(f"it has no row {row}")
+        self._rows = self._file.read_row_group(group, use_threads=False)
+        self._first = int(ends[group]) - len(self._rows)
 
 
 def write_rollouts(
     folder: Path, rollouts: Iterable[tuple[Task, pa.RecordBatch]]
 ) -> dict[Task, RolloutLocation]:
-    """Write rollouts into new files of a folder, and say where they are.
-
-    They have columns of `STATES`, and of `TRACKS` and `SEEN` in all or in none. Columns that name a
-    task already are written anew.
-    """
+    """Write rollouts, of the same columns, into new files of a folder, and say where they are."""
     rollouts, locations = iter(rollouts), dict[Task, RolloutLocation]()
     for first in rollouts:
         path, of_file = new_file(folder), chain([first], islice(rollouts, _FILE - 1))
@@ -391,7 +357,7 @@ def _keys(rollouts: list[tuple[Task, pa.RecordBatch]]) -> list[pa.Array]:
     owner = pa.array(np.repeat(np.arange(len(rollouts)), lengths))
     columns = [
         pa.array([getattr(task, name) for task, _ in rollouts], kind).take(owner)
-        for name, kind in _KINDS.items()
+        for name, kind in KEY.items()
     ]
     return [*columns, pa.array(np.concatenate([np.arange(length) for length in lengths]))]
 
@@ -399,9 +365,8 @@ def _keys(rollouts: list[tuple[Task, pa.RecordBatch]]) -> list[pa.Array]:
 def part_file(folder: Path, name: str) -> Path:
     """The file of rollouts in a folder that a table or a journal names, or a DataError."""
     if not _PART.fullmatch(name):
-        raise DataError(
-            f"{str(folder)!r}: {name!r} is no file of rollouts", hint="make the run again"
-        )
+        what = f"{str(folder)!r}: {name!r} is no file of rollouts"
+        raise DataError(what, hint="make the run again")
     return folder / name
 
 

@@ -82,12 +82,7 @@ def rollout_of(
     recorded: bool = False,
     partial: bool = False,
 ) -> tuple[SimulationLog, tuple[str, ...]]:
-    """The rollout that poses in a scenario are, and what a reader of its score must know.
-
-    The poses are of one of `POINTS`; `recorded`: the others did what was recorded, if no boxes are
-    given; `partial`: it may end before the scenario, and the expert then ends as well. Raises
-    DataError: something cannot be right; the message names the row.
-    """
+    """The rollout that poses in a scenario are, and remarks; a DataError names the row."""
     _check_rows(driven)
     states, remarks = np.array(driven.states), [*driven.remarks]
     if point == CENTER:
@@ -303,10 +298,7 @@ def _fill(ego: FloatArray, times: IntArray, driven: Driven, samples: _Samples) -
 def _others(
     driven: Driven, boxes: Boxes, shift: int, log: SimulationLog
 ) -> tuple[Tracks, list[str]]:
-    """The given boxes at the samples of a log, which has the recorded ones; what was done to them.
-
-    A box between two times is there if it is at both.
-    """
+    """The given boxes at the samples of a log, and what was done; between two times if at both."""
     times, given, remarks = log.time_us, boxes.tracks, list[str]()
     lost = np.ones(len(times), np.bool_)
     tracks = Tracks.empty(len(times))

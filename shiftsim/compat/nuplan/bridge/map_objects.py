@@ -109,8 +109,7 @@ class _Mapped:
 
     @property
     def _source(self) -> VectorMap:
-        source: VectorMap = self._map.source
-        return source
+        return self._map.source
 
     @cached_property
     def polygon(self) -> shapely.Polygon:

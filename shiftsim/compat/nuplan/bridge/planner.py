@@ -154,10 +154,8 @@ def to_trajectory(plan: Any, now_us: int, next_us: int, planner: str) -> Traject
         states = plan.get_state_at_times(times)
     wrong = next((state for state in states if not isinstance(state, EgoState)), None)
     if wrong is not None:
-        raise PlannerError(
-            f"planner {planner!r}: its trajectory has states of class {type(wrong).__name__}",
-            hint="return a trajectory of EgoStates",
-        )
+        what = f"planner {planner!r}: its trajectory has states of class {type(wrong).__name__}"
+        raise PlannerError(what, hint="return a trajectory of EgoStates")
     times_us = np.array([int(state.time_us) for state in states], np.int64)
     rows = np.array([_row(state) for state in states], np.float64)
     return Trajectory(times_us, rows.reshape(-1, NUM_STATE))

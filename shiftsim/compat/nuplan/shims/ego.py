@@ -309,8 +309,7 @@ def _get_fixed_timesteps(
 ) -> list[float]:
     """Times of a plan [s]: one interval after a state, and so on to the horizon."""
     steps = np.arange(0.0, future_horizon, step_interval) + step_interval
-    times: list[float] = (steps + state.time_point.time_s).tolist()
-    return times
+    return (steps + state.time_point.time_s).tolist()
 
 
 def _se2_vel_acc_to_ego_state(

@@ -182,8 +182,7 @@ class InterpolatedPath(AbstractPath):
 def calculate_progress(path: Sequence[Point2D]) -> list[float]:
     """Distances along a path, 0 at its first point [m]."""
     steps = np.linalg.norm(np.diff([(point.x, point.y) for point in path], axis=0), axis=1)
-    found: list[float] = np.cumsum(np.r_[0.0, steps]).tolist()
-    return found
+    return np.cumsum(np.r_[0.0, steps]).tolist()
 
 
 def convert_se2_path_to_progress_path(path: Sequence[StateSE2]) -> list[ProgressStateSE2]:
@@ -219,8 +218,7 @@ def approximate_derivatives(
     if not (steps > 0).all():
         raise RuntimeError("the abscissa does not increase")
     order = {"polyorder": poly_order, "deriv": deriv_order}
-    found: FloatArray = savgol_filter(y, window, **order, delta=steps.mean(), axis=axis)
-    return found
+    return savgol_filter(y, window, **order, delta=steps.mean(), axis=axis)
 
 
 def extract_ego_time_point(ego_states: Sequence[Any]) -> IntArray:
