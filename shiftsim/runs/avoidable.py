@@ -26,7 +26,12 @@ _AHEAD: IntArray = np.arange(0, 2_100_000, 100_000)  # us, times of a plan
 
 
 def grade(scenario: Scenario) -> str:
-    """How hard an edited scenario is, of `GRADES`; empty where nobody hits anything, or all do."""
+    """How hard an edited scenario is, of `GRADES`; empty where it is not in the way or unavoidable.
+
+    That is the least of their decelerations with which a driver who brakes hits nothing; the
+    hardest where PDM-Closed hits nothing, though such braking does. It is in the way where a driver
+    who does not react hits something that the edit made.
+    """
     edited = set(scenario.script.tokens if scenario.script else ())
     if not hits(scenario, Braking(scenario, 0.0)) & edited:
         return ""
@@ -62,7 +67,10 @@ def at_fault(log: SimulationLog, count: int) -> list[Collision]:
 
 
 class Braking:
-    """Drives what was recorded, and brakes when it notices what stands, or an edit moves."""
+    """Drives what was recorded, and brakes half a second after it has noticed something.
+
+    What stands is noticed at the start, pedestrians that an edit made when they set off.
+    """
 
     name = "braking"
 

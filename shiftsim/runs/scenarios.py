@@ -244,9 +244,10 @@ def find_split(name: str, store: Path, tokens: tuple[str, ...]) -> Split:
         return Split(store.name, tokens)
     path = Path(name)
     if path.suffix not in (".toml", ".txt"):
-        known = [store.name, *(found.stem for found in (store / "splits").glob("*.toml"))]
-        one_of("split", name, known, ", or a .toml or .txt file")
-        path = store / "splits" / f"{name}.toml"
+        folder = store / "splits"
+        known = [str(file.relative_to(folder))[:-5] for file in folder.rglob("*.toml")]
+        one_of("split", name, [store.name, *known], ", or a .toml or .txt file")
+        path = folder / f"{name}.toml"
     return read_split(path)
 
 
