@@ -181,10 +181,10 @@ class StoredRecording:
         track = place[track]
         boxes = np.where(inside & (track >= 0), row * len(order) + track, -1)
         valid, kinds, tokens = valid.take(order, 1), kinds[order], [tokens[i] for i in order]
-        out = [np.full((*valid.shape, width), np.nan) for width in (3, 2, 2)]
-        flat = tuple(values.reshape(-1, values.shape[2]) for values in out)
+        poses, velocities, sizes = (np.full((*valid.shape, n), np.nan) for n in (3, 2, 2))
+        flat = tuple(values.reshape(-1, values.shape[2]) for values in (poses, velocities, sizes))
         _place(boxes, tuple(tables.column(found, name) for name in schema.BOX), flat)
-        return Tracks(valid, *out, kinds, tuple(tokens))
+        return Tracks(valid, poses, velocities, sizes, kinds, tuple(tokens))
 
 
 @kernel
@@ -206,9 +206,7 @@ def _columns(found: pa.Table, name: str) -> tuple[IntArray, pa.Array]:
     the table for each column. There are few runs of equal numbers, as files are written.
     """
     numbers = tables.column(found, name)
-    begins = np.ones(len(numbers), np.bool_)
-    begins[1:] = numbers[1:] != numbers[:-1]
-    starts = np.flatnonzero(begins)
+    starts = np.flatnonzero(np.diff(numbers, prepend=numbers[:1] - 1))
     _, each, place = np.unique(numbers[starts], return_index=True, return_inverse=True)
     lengths = np.diff(starts, append=len(numbers))
     return np.repeat(place, lengths), starts[each]

@@ -285,9 +285,8 @@ def observe_log(
     rows = past_rows(scenario, iteration, samples)
     states = scenario.ego[rows] if ego is None else np.array(ego, np.float64, ndmin=2)
     seen = scenario.tracks.rows(rows) if tracks is None else tracks
-    lights = scenario.traffic_lights.rows(rows)
-    builder = ObservationBuilder(scenario.time_us[rows], states, seen, lights)
-    return builder.at(iteration, len(rows) - 1)
+    arrays = scenario.time_us[rows], states, seen, scenario.traffic_lights.rows(rows)
+    return ObservationBuilder(*arrays).at(iteration, len(rows) - 1)
 
 
 class ObservationBuilder:
@@ -309,8 +308,8 @@ class ObservationBuilder:
     def at(self, iteration: int, row: int) -> Observation:
         """What a planner sees at an iteration, which is a row of the arrays."""
         past = slice(max(row + 1 - HISTORY_SAMPLES, 0), row + 1)
-        time_us, ego, *boxes = [readonly(array[past]) for array in self._arrays]
-        history = History(time_us, ego, Tracks(*boxes, *self._whose))
+        time_us, ego, valid, poses, velocities, sizes = [readonly(a[past]) for a in self._arrays]
+        tracks = Tracks(valid, poses, velocities, sizes, *self._whose)
         status = readonly(self._lights.status[row : row + 1])
         lights = TrafficLights(self._lights.connector_ids, status)
-        return Observation(iteration, int(time_us[-1]), history, lights)
+        return Observation(iteration, int(time_us[-1]), History(time_us, ego, tracks), lights)

@@ -60,7 +60,7 @@ def find_lead(
         is_near &= other != agent and other != ignored
         apart[other] = max(apart_x, apart_y) if is_near else np.inf
     while True:  # the nearest first, so that few are looked at closely
-        other = apart.argmin()
+        other = int(apart.argmin())
         if apart[other] == np.inf or apart[other] > best:
             return lead, best, lead_y
         apart[other] = np.inf
