@@ -51,12 +51,18 @@ class ConstantVelocity:
     def plan(self, observation: Observation) -> Trajectory:
         """Poses every 0.1 s along the present heading."""
         ego, states = observation.ego, np.zeros((len(_TIMES), NUM_STATE))
-        x, y, heading = ego.pose.tolist()
-        distance = ego.speed * 0.1 * np.arange(len(states))
-        states[:, X] = x + distance * math.cos(heading)
-        states[:, Y] = y + distance * math.sin(heading)
-        states[:, HEADING], states[:, VX] = heading, ego.speed
+        heading = ego.heading
+        _straight(states, ego.values, ego.speed, math.cos(heading), math.sin(heading))
         return Trajectory(_TIMES.copy(), states, relative=True)
+
+
+@kernel
+def _straight(states: FloatArray, start: FloatArray, speed: float, cos: float, sin: float) -> None:
+    """Write the states (H, 11) every 0.1 s from one on."""
+    for row in range(len(states)):
+        distance = speed * 0.1 * row
+        states[row, X], states[row, Y] = start[X] + distance * cos, start[Y] + distance * sin
+        states[row, HEADING], states[row, VX] = start[HEADING], speed
 
 
 class Simple:

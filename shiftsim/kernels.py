@@ -28,7 +28,7 @@ IntArray: TypeAlias = NDArray[np.int64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 
 _CACHES_KEPT = 3  # versions of the kernels whose machine code stays on disk
-_KEEPS_READ_ONLY = np.lib.NumpyVersion(np.__version__) >= "2.1.0"  # what NumPy's DLPack can pass on
+KEEPS_READ_ONLY = np.lib.NumpyVersion(np.__version__) >= "2.1.0"  # what NumPy's DLPack can pass on
 
 
 def kernel_hash() -> str:
@@ -130,8 +130,9 @@ def readonly(array: Any) -> Any:
 
     NumPy before 2.1 is given a copy of what could be written.
     """
-    if not (array.flags.writeable or array.base is None or isinstance(array.base, np.ndarray)):
+    if array.flags.writeable:
+        array = array.view() if KEEPS_READ_ONLY else array.copy()
+        array.flags.writeable = False
+    elif array.base is not None and not isinstance(array.base, np.ndarray):
         return array  # it is one
-    view = array.view() if _KEEPS_READ_ONLY or not array.flags.writeable else array.copy()
-    view.flags.writeable = False
-    return np.from_dlpack(view) if _KEEPS_READ_ONLY else np.asarray(memoryview(view))
+    return np.from_dlpack(array) if KEEPS_READ_ONLY else np.asarray(memoryview(array))

@@ -152,13 +152,11 @@ class ScenarioStore:
     def read_recorded(self, token: str, *, validate: bool = True) -> Scenario:
         """As `read`, without the review."""
         window = self.window(token)
-        first, last = window.first_row, window.last_row
-        stored = self.recording(window.log_name)
+        log, first, last = window.log_name, window.first_row, window.last_row
+        stored, table = self.recording(log), self.ego(log, window.ego)
         recording = stored.read_window(window, validate=validate)
-        table = self.ego(window.log_name, window.ego)
-        # The span starts at the window's first row, and so do the ego states.
-        states = ego_states(table, first, last, validate=validate)
-        ego = EgoTrace(window.log_name, window.ego, 0, states)
+        # the span starts at the window's first row, and so do the ego states
+        ego = EgoTrace(log, window.ego, 0, ego_states(table, first, last, validate=validate))
         road = self.map(recording.city)
         scene = make_scenario(recording, ego, window, road, offset=first, is_chosen=True)
         if validate and (np.diff(scene.iteration_times) <= 0).any():

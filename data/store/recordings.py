@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import TypeAlias
 
@@ -13,7 +12,7 @@ from shiftsim.data.recording import EgoTrace, Recording, Window, visible_columns
 from shiftsim.data.store import schema, tables
 from shiftsim.data.store.tables import require_ranges
 from shiftsim.errors import DataError
-from shiftsim.kernels import BoolArray, FloatArray, IntArray
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.world.state import NUM_STATE, LightStatus, Tracks, TrafficLights
 
 # which of some tracks are wanted, in order, from when they are there, their kinds and tokens
@@ -158,7 +157,8 @@ class StoredRecording:
     def _lights(self, first: int, last: int, validate: bool) -> TrafficLights:
         found = self.lights.read(self.lights.blocks(first, last), validate=validate)
         row = tables.column(found, "row")
-        found = found.filter(pa.array((row >= first) & (row < last)))
+        inside = (row >= first) & (row < last)  # row groups hold more than the window
+        found = found if inside.all() else found.filter(pa.array(inside))
         light, each = _columns(found, "light")
         status = np.full((last - first, len(each)), LightStatus.ABSENT, np.int8)
         status[tables.column(found, "row") - first, light] = tables.column(found, "status")
@@ -176,15 +176,25 @@ class StoredRecording:
         order = choose(valid, kinds, tokens)
         place = np.full(len(each), -1)
         place[order] = np.arange(len(order))
-        if len(order) < len(each) or (order != np.arange(len(each))).any():
-            inside &= place[track] >= 0
-            valid, kinds, tokens = valid.take(order, 1), kinds[order], [tokens[i] for i in order]
-        boxes = row[inside] * len(order) + place[track[inside]]
+        track = place[track]
+        boxes = np.where(inside & (track >= 0), row * len(order) + track, -1)
+        valid, kinds, tokens = valid.take(order, 1), kinds[order], [tokens[i] for i in order]
         poses, velocities, sizes = (np.full((*valid.shape, n), np.nan) for n in (3, 2, 2))
-        axes = [(x.reshape(-1, x.shape[2]).T) for x in (poses, velocities, sizes)]
-        for name, values in zip(schema.BOX, chain(*axes), strict=True):
-            values[boxes] = tables.column(found, name)[inside]
+        flat = tuple(values.reshape(-1, values.shape[2]) for values in (poses, velocities, sizes))
+        _place(boxes, tuple(tables.column(found, name) for name in schema.BOX), flat)
         return Tracks(valid, poses, velocities, sizes, kinds, tuple(tokens))
+
+
+@kernel
+def _place(at: IntArray, boxes: tuple[FloatArray, ...], out: tuple[FloatArray, ...]) -> None:
+    """Write the columns of `schema.BOX` into rows `at` of the arrays of tracks; none if -1."""
+    x, y, heading, vx, vy, length, width = boxes
+    poses, velocities, sizes = out
+    for box, row in enumerate(at):
+        if row >= 0:
+            poses[row, 0], poses[row, 1], poses[row, 2] = x[box], y[box], heading[box]
+            velocities[row, 0], velocities[row, 1] = vx[box], vy[box]
+            sizes[row, 0], sizes[row, 1] = length[box], width[box]
 
 
 def _columns(found: pa.Table, name: str) -> tuple[IntArray, pa.Array]:
@@ -194,9 +204,7 @@ def _columns(found: pa.Table, name: str) -> tuple[IntArray, pa.Array]:
     the table for each column. There are few runs of equal numbers, as files are written.
     """
     numbers = tables.column(found, name)
-    begins = np.ones(len(numbers), np.bool_)
-    begins[1:] = numbers[1:] != numbers[:-1]
-    starts = np.flatnonzero(begins)
+    starts = np.flatnonzero(np.diff(numbers, prepend=numbers[:1] - 1))
     _, each, place = np.unique(numbers[starts], return_index=True, return_inverse=True)
     lengths = np.diff(starts, append=len(numbers))
     return np.repeat(place, lengths), starts[each]

@@ -254,10 +254,9 @@ class Table:
 
 def require_ranges(table: pa.Table, where: str) -> None:
     """Refuse a table with a number outside of the range that `STORE` has for its column."""
-    named = next((name for name in _NAMED if {name, "row"} <= {*table.column_names}), "")
-    for name in table.column_names:
-        if name not in STORE:
-            continue
+    names = table.column_names
+    named = next((name for name in _NAMED if name in names and "row" in names), "")
+    for name in filter(STORE.__contains__, names):
         values, may_be_nan = column(table, name), named == "token" and name in schema.MAY_BE_NAN
         bad = STORE[name].outside(values, may_be_nan=may_be_nan)
         if not len(bad):

@@ -294,11 +294,9 @@ def vector_env(
     makers: Sequence[Make], num_workers: int, timeout: float = 600.0, **settings: Any
 ) -> "VectorEnv[Any, Any, Any]":
     """Environments side by side, in this process or in one each; `settings` as in Gymnasium."""
-    return (
-        SyncVectorEnv(makers, **settings)
-        if num_workers == 1
-        else ProcessVectorEnv(makers, timeout, **settings)
-    )
+    if num_workers == 1:
+        return SyncVectorEnv(makers, **settings)
+    return ProcessVectorEnv(makers, timeout, **settings)
 
 
 class ProcessVectorEnv(AsyncVectorEnv):

@@ -18,14 +18,7 @@ from shiftsim.planners.routes.graph import deviation
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.layers import Polygons, Polylines, containing
 from shiftsim.world.map import VectorMap
-from shiftsim.world.state import (
-    HEADING,
-    LAST_AGENT_KIND,
-    PACIFICA,
-    VX,
-    VY,
-    center_poses,
-)
+from shiftsim.world.state import HEADING, LAST_AGENT_KIND, PACIFICA, VX, VY, center_poses
 
 FREE_OFFSET = 0.5  # m from the centre line that costs nothing
 MAX_OVERSPEED = NUPLAN.max_overspeed  # m/s, at which the whole term is lost

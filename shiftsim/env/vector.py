@@ -18,13 +18,7 @@ from shiftsim.planners.learned.map_features import LightLookup
 from shiftsim.planners.routes.graph import lane_at
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.layers import Polylines
-from shiftsim.world.state import (
-    LAST_AGENT_KIND,
-    PACIFICA,
-    AgentKind,
-    LightStatus,
-    center_poses,
-)
+from shiftsim.world.state import LAST_AGENT_KIND, PACIFICA, AgentKind, LightStatus, center_poses
 
 METRES, SPEED, ACCEL, LARGEST = 50.0, 20.0, 5.0, 4.0
 ROUTE_POINTS, ROUTE_STEP = 16, 5.0  # m

@@ -82,6 +82,7 @@ class Rollout:
         # rows: the past samples, then the iterations; the ego is filled up to the present, the
         # tracks from the log until the traffic rewrites them
         self._time_us = scenario.time_us[rows]
+        self._clock: list[int] = self._time_us.tolist()
         self._ego = np.full((len(rows), NUM_STATE), np.nan)
         self._ego[: start + 1] = scenario.ego[rows[: start + 1]]
         self._tracks = scenario.tracks.rows(rows)
@@ -99,8 +100,7 @@ class Rollout:
         if late := self._drift.latency:
             from shiftsim.sim.sensing import first_plans  # few runs need it
 
-            now_us = int(self._time_us[start])
-            self._waiting = first_plans(late, self._ego[: start + 1], now_us)
+            self._waiting = first_plans(late, self._ego[: start + 1], self._clock[start])
         arrays = self._time_us, self._ego, self._tracks, self._lights
         self._observations = ObservationBuilder(*arrays)
         self._noise = sample_noise(
@@ -147,7 +147,7 @@ class Rollout:
         if plan is not None and self._waiting:
             from shiftsim.sim.sensing import exchange
 
-            plan = exchange(self._waiting, plan, int(self._time_us[row + 1]))
+            plan = exchange(self._waiting, plan, self._clock[row + 1])
         # nuPlan rule 13: the ego moves first, and the traffic sees where it was before
         self._move_ego(plan)
         return Move(iteration, self._ego[row], self._tracks, row + 1)
@@ -177,8 +177,8 @@ class Rollout:
     def _checked(self, plan: Any) -> Trajectory | Command:
         """The plan in log time; its poses are noted."""
         iteration, row = self.iteration, self._start + self.iteration
-        now_us, next_us = self._time_us[row : row + 2].tolist()
-        plan = executable(plan, now_us, next_us, f"iteration {iteration}: ")
+        now_us = self._clock[row]
+        plan = executable(plan, now_us, self._clock[row + 1], f"iteration {iteration}: ")
         if isinstance(plan, Command):
             return plan
         plan = self._sensing.to_truth(plan, row) if self._sensing else plan
@@ -191,7 +191,7 @@ class Rollout:
     def _move_ego(self, plan: Plan) -> None:
         """Write the next state of the ego, and note the command."""
         iteration, row = self.iteration, self._start + self.iteration
-        now_us, next_us = self._time_us[row : row + 2].tolist()
+        now_us, next_us = self._clock[row : row + 2]
         after, controller = self._ego[row + 1], self.setting.controller
         if plan is None or controller == "log-playback":
             after[:] = self.scenario.ego[self.scenario.iteration_rows[iteration + 1]]
@@ -316,8 +316,8 @@ def executable(plan: Any, now_us: int, next_us: int, where: str = "") -> Traject
         raise InvalidTrajectoryError(f"{where}{fault.message}", fault.hint)
     if isinstance(plan, Command):
         return plan
-    plan = plan.starting_at(now_us)
-    return Trajectory(contiguous(plan.time_us), contiguous(plan.states))
+    times, states = contiguous(plan.time_us), contiguous(plan.states)
+    return Trajectory(times + now_us if plan.relative else times, states)
 
 
 def follow(

@@ -10,7 +10,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import numpy as np
 
 from shiftsim.geometry.boxes import to_frame, turned
-from shiftsim.kernels import FloatArray, IntArray, readonly
+from shiftsim.kernels import KEEPS_READ_ONLY, FloatArray, IntArray, readonly
 from shiftsim.world.line import Lead, Line, RedLight, find_lead, next_red, route_line
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
@@ -285,9 +285,8 @@ def observe_log(
     rows = past_rows(scenario, iteration, samples)
     states = scenario.ego[rows] if ego is None else np.array(ego, np.float64, ndmin=2)
     seen = scenario.tracks.rows(rows) if tracks is None else tracks
-    lights = scenario.traffic_lights.rows(rows)
-    builder = ObservationBuilder(scenario.time_us[rows], states, seen, lights)
-    return builder.at(iteration, len(rows) - 1)
+    arrays = scenario.time_us[rows], states, seen, scenario.traffic_lights.rows(rows)
+    return ObservationBuilder(*arrays).at(iteration, len(rows) - 1)
 
 
 class ObservationBuilder:
@@ -300,14 +299,17 @@ class ObservationBuilder:
         self, time_us: IntArray, ego: FloatArray, tracks: Tracks, lights: TrafficLights
     ) -> None:
         """Arrays of a rollout."""
-        self._arrays = time_us, ego, replace(tracks, kinds=readonly(tracks.kinds)), lights
+        boxes = tracks.valid, tracks.poses, tracks.velocities, tracks.sizes
+        self._arrays, self._lights = [array.view() for array in (time_us, ego, *boxes)], lights
+        for view in self._arrays:
+            view.flags.writeable = not KEEPS_READ_ONLY  # once, not step by step
+        self._whose = readonly(tracks.kinds), tracks.tokens
 
     def at(self, iteration: int, row: int) -> Observation:
         """What a planner sees at an iteration, which is a row of the arrays."""
-        time_us, ego, tracks, lights = self._arrays
         past = slice(max(row + 1 - HISTORY_SAMPLES, 0), row + 1)
-        history = History(
-            readonly(time_us[past]), readonly(ego[past]), tracks.rows(past).readonly()
-        )
-        present = lights.rows(slice(row, row + 1)).readonly()
-        return Observation(iteration, int(time_us[row]), history, present)
+        time_us, ego, valid, poses, velocities, sizes = [readonly(a[past]) for a in self._arrays]
+        tracks = Tracks(valid, poses, velocities, sizes, *self._whose)
+        status = readonly(self._lights.status[row : row + 1])
+        lights = TrafficLights(self._lights.connector_ids, status)
+        return Observation(iteration, int(time_us[-1]), History(time_us, ego, tracks), lights)

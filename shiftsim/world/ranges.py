@@ -30,8 +30,11 @@ class Range(NamedTuple):
 
     def outside(self, values: NDArray[Any], *, may_be_nan: bool = False) -> NDArray[np.int64]:
         """(n, D) indices of the values of an array of D axes that are not in the range."""
-        if not values.size or (values.min() >= self.low and values.max() <= self.high):
-            return np.zeros((0, values.ndim), np.int64)  # quick, and not taken where there is a NaN
+        least, most = (np.fmin, np.fmax) if may_be_nan else (np.minimum, np.maximum)
+        if not values.size or (
+            least.reduce(values, None) >= self.low and most.reduce(values, None) <= self.high
+        ):
+            return np.zeros((0, values.ndim), np.int64)  # quick
         good = self.holds(values)
         return np.argwhere(~(good | np.isnan(values) if may_be_nan else good))
 

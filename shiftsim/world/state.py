@@ -142,9 +142,7 @@ class Tracks:
 
     def readonly(self) -> "Tracks":
         """The same tracks in arrays that cannot be written."""
-        arrays = (self.valid, self.poses, self.velocities, self.sizes, self.kinds)
-        valid, poses, velocities, sizes, kinds = map(readonly, arrays)
-        return Tracks(valid, poses, velocities, sizes, kinds, self.tokens)
+        return replace(self._with(readonly), kinds=readonly(self.kinds))
 
     @staticmethod
     def empty(num_rows: int) -> "Tracks":

@@ -237,7 +237,7 @@ def stored_tracks(
 def encode_rows(rows: pa.RecordBatch) -> bytes:
     """The rows of a rollout as bytes, an Arrow stream."""
     sink = pa.BufferOutputStream()
-    options = pa.ipc.IpcWriteOptions(compression="lz4")
+    options = pa.ipc.IpcWriteOptions(compression="lz4", use_threads=False)
     with pa.ipc.new_stream(sink, rows.schema, options=options) as stream:
         stream.write_batch(rows)
     return sink.getvalue().to_pybytes()

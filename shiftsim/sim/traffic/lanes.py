@@ -32,13 +32,8 @@ class Lanes(NamedTuple):
 
 def lanes_of(road: VectorMap) -> Lanes:
     """What agents read of a map; no light is red yet."""
-    return Lanes(
-        road.edges.polygons,
-        road.baselines,
-        road.outgoing,
-        road.speed_limits,
-        np.zeros(len(road.edges), np.bool_),
-    )
+    nothing = np.zeros(len(road.edges), np.bool_)
+    return Lanes(road.edges.polygons, road.baselines, road.outgoing, road.speed_limits, nothing)
 
 
 @kernel

@@ -19,6 +19,7 @@ FREE = -1  # instead of a footprint: nobody is ahead
 # vertices left out
 _OUTER = 1.02
 _TOUCH = 1e-3  # m, gaps below this are looked at closely
+_TIE = 1.0 + 1e-9  # gaps are looked for a little beyond the best, to see equal ones
 
 
 @kernel
@@ -42,34 +43,37 @@ def find_lead(
     Returns:
         Its index, or FREE; the gap between the footprints, and the middle of its bounds in y [m].
     """
-    present, bounds = footprints.present, footprints.bounds
-    reach = _OUTER * corridor.half_width
+    bounds, apart = footprints.bounds, footprints.apart
+    reach, own = _OUTER * corridor.half_width, bounds[agent]
     low_x, low_y, high_x, high_y = ring_bounds(corridor.xy)
-    own_x, own_y = bounds[agent, 0], bounds[agent, 1]
-    own_end_x, own_end_y = bounds[agent, 2], bounds[agent, 3]
     best, lead, lead_y = np.inf, FREE, np.inf
-    for other in range(len(present)):
+    for other in range(len(bounds)):
         is_near = (
-            present[other]
+            footprints.present[other]
             & (bounds[other, 0] <= high_x + reach)
             & (bounds[other, 1] <= high_y + reach)
             & (bounds[other, 2] >= low_x - reach)
             & (bounds[other, 3] >= low_y - reach)
         )
-        if not is_near or other == agent or other == ignored:
-            continue
-        apart_x = max(own_x - bounds[other, 2], bounds[other, 0] - own_end_x)
-        apart_y = max(own_y - bounds[other, 3], bounds[other, 1] - own_end_y)
-        if max(apart_x, apart_y) <= best and in_corridor(footprints, other, corridor, scratch):
-            gap = max(best, _TOUCH)
+        apart_x = max(own[0] - bounds[other, 2], bounds[other, 0] - own[2])
+        apart_y = max(own[1] - bounds[other, 3], bounds[other, 1] - own[3])
+        is_near &= other != agent and other != ignored
+        apart[other] = max(apart_x, apart_y) if is_near else np.inf
+    while True:  # the nearest first, so that few are looked at closely
+        other = int(apart.argmin())
+        if apart[other] == np.inf or apart[other] > best:
+            return lead, best, lead_y
+        apart[other] = np.inf
+        if in_corridor(footprints, other, corridor, scratch):
+            gap = max(best * _TIE, _TOUCH)
             if other < len(footprints.curve) and footprints.curve_size[other]:
                 curve = footprints.curve[other, : footprints.curve_size[other]]
                 gap = _gap_to(footprints, agent, curve, gap)
             gap = _gap_to(footprints, agent, footprints.box[other], gap)
             middle_y = 0.5 * (bounds[other, 1] + bounds[other, 3])
-            if comes_first(gap, middle_y, best, lead_y):
+            is_tied = gap == best and (gap > 0.0 or middle_y == lead_y) and other < lead
+            if is_tied or comes_first(gap, middle_y, best, lead_y):
                 best, lead, lead_y = gap, other, middle_y
-    return lead, best, lead_y
 
 
 @kernel

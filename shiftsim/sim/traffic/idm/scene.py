@@ -78,6 +78,7 @@ class Footprints(NamedTuple):
     box: FloatArray  # (M, 4, 2) corners [m]
     curve: FloatArray  # (A + 2, V, 2) buffers of the path pieces just ahead of agents and ego [m]
     curve_size: IntArray  # (A + 2,) how many vertices of them count; 0 before the first step
+    apart: FloatArray  # (M,) scratch: least distances to one of them [m]
 
 
 class Scratch(NamedTuple):
@@ -158,6 +159,7 @@ def make_scene(
         box=np.zeros((count, 4, 2)),
         curve=_make_curves(fleet),
         curve_size=np.zeros(len(agents) + 2, np.int64),
+        apart=np.empty(count),
     )
     scratch = _make_scratch(fleet)
     return Scene(parameters, graph, fleet, agents, replayed, footprints, yielding, scratch)

@@ -18,12 +18,7 @@ from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.sim.traffic import Move
 from shiftsim.sim.traffic.lanes import NO_LANE, RED, Lanes, lanes_of, light_flags
-from shiftsim.sim.traffic.learned.features import (
-    NUM_FEATURES,
-    Motion,
-    move_agents,
-    observe_agents,
-)
+from shiftsim.sim.traffic.learned.features import NUM_FEATURES, Motion, move_agents, observe_agents
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import (
     LAST_AGENT_KIND,
