@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shiftsim.geometry.boxes import turned
-from shiftsim.kernels import BoolArray, FloatArray, IntArray
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.sim.planner import History
 from shiftsim.world import state
 
@@ -20,6 +19,8 @@ PLAN_POSES = 80
 _WINDOW = np.arange(-2, 3)  # samples of the derivative filter, a parabola through five
 _SLOPE = _WINDOW / 10.0
 _BEND = (_WINDOW**2 - 2.0) / 7.0
+_LENGTH, _WIDTH = state.PACIFICA.length, state.PACIFICA.width
+_NUM_AGENT_KINDS = int(state.LAST_AGENT_KIND) + 1
 
 NO_ROUTE = "the scenario has no route on the map"
 
@@ -49,47 +50,75 @@ def agent_features(history: History, center: FloatArray, max_agents: int) -> Age
     tracks, ego = history.tracks, history.ego[-SAMPLES:]
     nearest = nearest_agents(tracks, center, max_agents)
     cos, sin, vx, vy = np.cos(ego[:, 2]), np.sin(ego[:, 2]), ego[:, 3], ego[:, 4]
-    own = (
-        ego[:, :3],
-        np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy]),
-        np.full((len(ego), 2), [state.PACIFICA.length, state.PACIFICA.width]),
-        np.ones(len(ego), np.bool_),
-    )
-    others = (tracks.poses, tracks.velocities, tracks.sizes, tracks.valid)
-    poses, velocities, sizes, seen = (
-        np.concatenate([one[:, None], rows[-SAMPLES:].take(nearest, axis=1)], axis=1)
-        for one, rows in zip(own, others, strict=True)
-    )
-
-    def filled(values: np.ndarray, kind: Any = np.float32) -> np.ndarray:
-        """(A, 21, ...) samples of rows (T, A, ...); 0 where nothing was seen."""
-        out = np.zeros((SAMPLES, *values.shape[1:]), kind)
-        part = out[SAMPLES - len(values) :]
-        np.copyto(part.T, values.T, where=seen.T, casting="same_kind")
-        return out.swapaxes(0, 1)
-
+    own = np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy])
+    heading = ego[-1, state.HEADING]
+    frame = (*ego[-1, :2].tolist(), float(heading), float(np.cos(heading)), float(np.sin(heading)))
+    rows = (tracks.poses, tracks.velocities, tracks.sizes, tracks.valid)
     category = np.zeros(len(nearest) + 1, np.int64)
     category[1:] = tracks.kinds[nearest] + 1
-    heading = float(ego[-1, state.HEADING])
-    return AgentFeatures(
-        tracks=nearest,
-        position=filled(turned(poses[..., :2] - ego[-1, :2], heading)),
-        heading=filled(poses[..., 2] - heading),
-        velocity=filled(turned(velocities, heading)),
-        shape=filled(sizes[..., ::-1]),
-        valid=filled(seen, np.bool_),
-        category=category,
-    )
+    seen = _histories(ego, own, *[each[-SAMPLES:] for each in rows], nearest, frame)
+    return AgentFeatures(nearest, *seen, category)
+
+
+@kernel
+def _histories(
+    ego: FloatArray,
+    own: FloatArray,
+    poses: FloatArray,
+    velocities: FloatArray,
+    sizes: FloatArray,
+    valid: BoolArray,
+    nearest: IntArray,
+    frame: tuple[float, float, float, float, float],
+) -> Any:
+    """Fields of `AgentFeatures` of the ego and its own velocities, and of tracks over T samples."""
+    x0, y0, heading, cos, sin = frame
+    shape, first = (len(nearest) + 1, SAMPLES), SAMPLES - len(ego)
+    angle, seen = np.zeros(shape, np.float32), np.zeros(shape, np.bool_)
+    position, velocity, size = np.zeros((3, *shape, 2), np.float32)
+    for row in range(len(seen)):
+        for step in range(len(ego)):
+            at = first + step
+            x, y, turn = ego[step, 0], ego[step, 1], ego[step, 2]
+            vx, vy = own[step, 0], own[step, 1]
+            length, width = _LENGTH, _WIDTH
+            if row > 0:
+                track = nearest[row - 1]
+                if not valid[step, track]:
+                    continue
+                x, y, turn = poses[step, track, 0], poses[step, track, 1], poses[step, track, 2]
+                vx, vy = velocities[step, track, 0], velocities[step, track, 1]
+                length, width = sizes[step, track, 0], sizes[step, track, 1]
+            x, y = x - x0, y - y0
+            position[row, at, 0], position[row, at, 1] = cos * x + sin * y, cos * y - sin * x
+            velocity[row, at, 0], velocity[row, at, 1] = cos * vx + sin * vy, cos * vy - sin * vx
+            size[row, at, 0], size[row, at, 1] = width, length
+            angle[row, at], seen[row, at] = turn - heading, True
+    return position, angle, velocity, size, seen
 
 
 def nearest_agents(tracks: state.Tracks, center: FloatArray, count: int) -> IntArray:
     """Present agents, nearest first."""
+    x, y = float(center[0]), float(center[1])
+    by_kind, away = _present_agents(tracks.valid[-1], tracks.kinds, tracks.poses[-1], x, y)
+    nearest: IntArray = by_kind[np.argsort(away)[:count]]
+    return nearest
+
+
+@kernel
+def _present_agents(
+    present: BoolArray, kinds: IntArray, poses: FloatArray, x: float, y: float
+) -> tuple[IntArray, FloatArray]:
+    """Present agents, and how far each is from a point."""
     # nuPlan rule 300: sorted from a list by kind, by a method that does not keep the order of ties
-    present = np.flatnonzero(tracks.valid[-1] & (tracks.kinds <= state.LAST_AGENT_KIND))
-    by_kind = present[np.argsort(tracks.kinds[present], kind="stable")]
-    away = tracks.poses[-1, by_kind, :2] - center[:2]
-    order = np.argsort(np.sqrt(away[:, 0] ** 2 + away[:, 1] ** 2))
-    return by_kind[order[:count]]
+    found, away, count = np.empty(len(kinds), np.int64), np.empty(len(kinds)), 0
+    for kind in range(_NUM_AGENT_KINDS):
+        for track in range(len(kinds)):
+            if present[track] and kinds[track] == kind:
+                dx, dy = poses[track, 0] - x, poses[track, 1] - y
+                found[count], away[count] = track, np.sqrt(dx * dx + dy * dy)
+                count += 1
+    return found[:count], away[:count]
 
 
 def poses_of(plan: np.ndarray) -> FloatArray:

@@ -4,21 +4,22 @@ Everything that does not depend on the ego is made once per map, in the map fram
 centre line and on either side of every object. A step then selects, moves and turns.
 """
 
-from typing import NamedTuple
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
 
-from shiftsim.geometry.boxes import turned
 from shiftsim.geometry.polylines import point_on_polyline
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.world.layers import Polylines, meeting, square_around
-from shiftsim.world.map import NONE, PerMap, VectorMap
+from shiftsim.world.layers import Polygons, Polylines, meeting, square_around
+from shiftsim.world.map import NONE, VectorMap
 from shiftsim.world.state import LightStatus, TrafficLights
 
 POINTS = 20  # per polyline; their vectors lead to the next one
 _MIDDLE = 10  # point that stands for the whole object
 LANE, CONNECTOR, CROSSWALK = 0, 1, 2
+_NO_LIGHT = int(LightStatus.UNKNOWN)
 
 
 class RoadObjects(NamedTuple):
@@ -71,7 +72,7 @@ def _make_road_objects(road: VectorMap) -> RoadObjects:
     return RoadObjects(lines, steps, angles, kind, block, limit)
 
 
-road_objects = PerMap(_make_road_objects)
+road_objects = lru_cache(256)(_make_road_objects)  # training goes from town to town
 
 
 @kernel
@@ -186,28 +187,65 @@ def road_features(
     `radius` is half the side of the square [m], the rear axle `ego` (3,) the frame of the features,
     `lights` (E,) are of `LightLookup`, `on_route` (B,) blocks. In the order of `RoadObjects`.
     """
-    known = road_objects(road)
+    turn = ego[2]
+    frame = (*ego[:2].tolist(), float(turn), float(np.cos(turn)), float(np.sin(turn)))
     square = square_around(float(center[0]), float(center[1]), radius)
-    edges = meeting(road.edges.polygons, square)
-    near = np.concatenate([edges, len(road.edges) + meeting(road.crosswalks.polygons, square)])
-    heading = float(ego[2])
-    offsets = turned(known.lines[near, :, :-1] - ego[:2], heading)
-    valid: BoolArray = np.all(np.abs(offsets[:, 0]) < radius, axis=-1)
-    seen = valid.any(axis=1)
-    chosen, valid, points = near[seen], valid[seen], offsets[seen].astype(np.float32)
-    vectors = turned(known.steps[chosen], heading).astype(np.float32)
-    orientations = (known.angles[chosen] - heading).astype(np.float32)
-    limit = known.limit[chosen]
-    has_limit = ~np.isnan(limit)
-    light = np.full(len(chosen), int(LightStatus.UNKNOWN))
-    num_edges = int(np.searchsorted(chosen, len(road.edges)))
-    light[:num_edges] = lights[chosen[:num_edges]]
-    block = known.block[chosen]
-    routed = (block != NONE) & on_route[block] if len(on_route) else np.zeros(len(chosen), np.bool_)
-    centers = np.concatenate(
-        [points[:, 0, _MIDDLE], orientations[:, 0, _MIDDLE : _MIDDLE + 1]], axis=1
+    areas = road.edges.polygons, road.crosswalks.polygons
+    return RoadFeatures(*_seen(road_objects(road), *areas, square, radius, frame, lights, on_route))
+
+
+@kernel
+def _seen(
+    known: RoadObjects,
+    edges: Polygons,
+    crosswalks: Polygons,
+    square: FloatArray,
+    radius: float,
+    frame: tuple[float, float, float, float, float],
+    lights: IntArray,
+    on_route: BoolArray,
+) -> Any:
+    """Fields of `RoadFeatures` in a frame x, y, heading, and its cosine and sine."""
+    x0, y0, heading, cos, sin = frame
+    near = np.concatenate((meeting(edges, square), len(lights) + meeting(crosswalks, square)))
+    count, found, single = len(near), 0, np.float32
+    points, vectors = np.empty((2, count, 3, POINTS, 2), single)
+    orientations, centers = np.empty((count, 3, POINTS), single), np.empty((count, 3), single)
+    valid, flags = np.zeros((count, POINTS), np.bool_), np.zeros((2, count), np.bool_)
+    kind, light, limit = (
+        np.empty(count, np.int64),
+        np.empty(count, np.int64),
+        np.zeros(count, single),
     )
-    return RoadFeatures(
-        *(chosen, points, vectors, orientations, centers, valid, known.kind[chosen], routed, light),
-        *(has_limit, np.where(has_limit, limit, 0.0).astype(np.float32)),
+    for row in near:
+        for point in range(POINTS):
+            x, y = known.lines[row, 0, point, 0] - x0, known.lines[row, 0, point, 1] - y0
+            ahead, left = cos * x + sin * y, cos * y - sin * x
+            valid[found, point] = abs(ahead) < radius and abs(left) < radius
+        if not valid[found].any():
+            continue
+        for side in range(3):
+            for point in range(POINTS):
+                at = found, side, point
+                x, y = known.lines[row, side, point, 0] - x0, known.lines[row, side, point, 1] - y0
+                points[at][0], points[at][1] = cos * x + sin * y, cos * y - sin * x
+                x, y = known.steps[row, side, point, 0], known.steps[row, side, point, 1]
+                vectors[at][0], vectors[at][1] = cos * x + sin * y, cos * y - sin * x
+                orientations[at] = known.angles[row, side, point] - heading
+        centers[found, 0], centers[found, 1] = (
+            points[found, 0, _MIDDLE, 0],
+            points[found, 0, _MIDDLE, 1],
+        )
+        centers[found, 2] = orientations[found, 0, _MIDDLE]
+        block, most = known.block[row], known.limit[row]
+        near[found], kind[found] = row, known.kind[row]
+        light[found] = lights[row] if row < len(lights) else _NO_LIGHT
+        flags[0, found] = block != NONE and len(on_route) > 0 and on_route[block]
+        if not np.isnan(most):
+            flags[1, found], limit[found] = True, most
+        found += 1
+    return (
+        *(near[:found], points[:found], vectors[:found], orientations[:found], centers[:found]),
+        *(valid[:found], kind[:found], flags[0, :found], light[:found], flags[1, :found]),
+        limit[:found],
     )
