@@ -51,28 +51,23 @@ def agent_features(history: History, center: FloatArray, max_agents: int) -> Age
     nearest = nearest_agents(tracks, center, max_agents)
     cos, sin, vx, vy = np.cos(ego[:, 2]), np.sin(ego[:, 2]), ego[:, 3], ego[:, 4]
     own = np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy])
-    heading = ego[-1, state.HEADING]
-    frame = (*ego[-1, :2].tolist(), float(heading), float(np.cos(heading)), float(np.sin(heading)))
     rows = (tracks.poses, tracks.velocities, tracks.sizes, tracks.valid)
+    seen = tuple(values[-SAMPLES:] for values in rows)
     category = np.zeros(len(nearest) + 1, np.int64)
     category[1:] = tracks.kinds[nearest] + 1
-    seen = _histories(ego, own, *[each[-SAMPLES:] for each in rows], nearest, frame)
-    return AgentFeatures(nearest, *seen, category)
+    found = *_histories(ego, own, seen, nearest, frame_of(ego[-1])), category
+    return AgentFeatures(nearest, *found)
+
+
+def frame_of(pose: FloatArray) -> tuple[float, ...]:
+    """x, y, heading, its cosine and its sine of a pose: kernels would round these two otherwise."""
+    return (*pose[:3].tolist(), float(np.cos(pose[2])), float(np.sin(pose[2])))
 
 
 @kernel
-def _histories(
-    ego: FloatArray,
-    own: FloatArray,
-    poses: FloatArray,
-    velocities: FloatArray,
-    sizes: FloatArray,
-    valid: BoolArray,
-    nearest: IntArray,
-    frame: tuple[float, float, float, float, float],
-) -> Any:
-    """Fields of `AgentFeatures` of the ego and its own velocities, and of tracks over T samples."""
-    x0, y0, heading, cos, sin = frame
+def _histories(ego: FloatArray, own: FloatArray, rows: Any, nearest: IntArray, frame: Any) -> Any:
+    """Fields of `AgentFeatures`: of the ego and its velocities `own`, and of rows of tracks."""
+    (x0, y0, heading, cos, sin), (poses, velocities, sizes, valid) = frame, rows
     shape, first = (len(nearest) + 1, SAMPLES), SAMPLES - len(ego)
     angle, seen = np.zeros(shape, np.float32), np.zeros(shape, np.bool_)
     position, velocity, size = np.zeros((3, *shape, 2), np.float32)

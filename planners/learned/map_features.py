@@ -12,14 +12,14 @@ import shapely
 
 from shiftsim.geometry.polylines import point_on_polyline
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.world.layers import Polygons, Polylines, meeting, square_around
+from shiftsim.planners.learned.features import frame_of
+from shiftsim.world.layers import Polylines, meeting, square_around
 from shiftsim.world.map import NONE, VectorMap
 from shiftsim.world.state import LightStatus, TrafficLights
 
 POINTS = 20  # per polyline; their vectors lead to the next one
 _MIDDLE = 10  # point that stands for the whole object
 LANE, CONNECTOR, CROSSWALK = 0, 1, 2
-_NO_LIGHT = int(LightStatus.UNKNOWN)
 
 
 class RoadObjects(NamedTuple):
@@ -187,65 +187,41 @@ def road_features(
     `radius` is half the side of the square [m], the rear axle `ego` (3,) the frame of the features,
     `lights` (E,) are of `LightLookup`, `on_route` (B,) blocks. In the order of `RoadObjects`.
     """
-    turn = ego[2]
-    frame = (*ego[:2].tolist(), float(turn), float(np.cos(turn)), float(np.sin(turn)))
-    square = square_around(float(center[0]), float(center[1]), radius)
-    areas = road.edges.polygons, road.crosswalks.polygons
-    return RoadFeatures(*_seen(road_objects(road), *areas, square, radius, frame, lights, on_route))
+    known, areas = road_objects(road), (road.edges.polygons, road.crosswalks.polygons)
+    around = square_around(float(center[0]), float(center[1]), radius), radius
+    seen = _seen_objects(known[:3], areas, around, frame_of(ego))
+    chosen, points, vectors, orientations, valid = seen
+    kind, block, limit = (values[chosen] for values in known[3:])
+    light = np.append(lights, int(LightStatus.UNKNOWN))[np.minimum(chosen, len(lights))]
+    routed = (block != NONE) & on_route[block] if len(on_route) else np.zeros(len(chosen), np.bool_)
+    has_limit = ~np.isnan(limit)
+    limit = np.where(has_limit, limit, 0.0).astype(np.float32)
+    middle = slice(_MIDDLE, _MIDDLE + 1)
+    centers = np.concatenate([points[:, 0, _MIDDLE], orientations[:, 0, middle]], axis=1)
+    lines = points, vectors, orientations, centers, valid
+    return RoadFeatures(chosen, *lines, kind, routed, light, has_limit, limit)
 
 
 @kernel
-def _seen(
-    known: RoadObjects,
-    edges: Polygons,
-    crosswalks: Polygons,
-    square: FloatArray,
-    radius: float,
-    frame: tuple[float, float, float, float, float],
-    lights: IntArray,
-    on_route: BoolArray,
-) -> Any:
-    """Fields of `RoadFeatures` in a frame x, y, heading, and its cosine and sine."""
+def _seen_objects(known: Any, areas: Any, around: Any, frame: Any) -> Any:
+    """Objects of a map around the ego, their lines in its frame, and what is near of them."""
+    (lines, steps, angles), (edges, crosswalks), (square, radius) = known, areas, around
+    near = np.concatenate((meeting(edges, square), len(edges.bounds) + meeting(crosswalks, square)))
+    points, vectors = np.empty((2, len(near), 3, POINTS, 2), np.float32)
+    orientations = np.empty((len(near), 3, POINTS), np.float32)
+    valid, found = np.empty((len(near), POINTS), np.bool_), 0
     x0, y0, heading, cos, sin = frame
-    near = np.concatenate((meeting(edges, square), len(lights) + meeting(crosswalks, square)))
-    count, found, single = len(near), 0, np.float32
-    points, vectors = np.empty((2, count, 3, POINTS, 2), single)
-    orientations, centers = np.empty((count, 3, POINTS), single), np.empty((count, 3), single)
-    valid, flags = np.zeros((count, POINTS), np.bool_), np.zeros((2, count), np.bool_)
-    kind, light, limit = (
-        np.empty(count, np.int64),
-        np.empty(count, np.int64),
-        np.zeros(count, single),
-    )
     for row in near:
-        for point in range(POINTS):
-            x, y = known.lines[row, 0, point, 0] - x0, known.lines[row, 0, point, 1] - y0
-            ahead, left = cos * x + sin * y, cos * y - sin * x
-            valid[found, point] = abs(ahead) < radius and abs(left) < radius
-        if not valid[found].any():
-            continue
-        for side in range(3):
+        for side in range(2, -1, -1):
             for point in range(POINTS):
                 at = found, side, point
-                x, y = known.lines[row, side, point, 0] - x0, known.lines[row, side, point, 1] - y0
-                points[at][0], points[at][1] = cos * x + sin * y, cos * y - sin * x
-                x, y = known.steps[row, side, point, 0], known.steps[row, side, point, 1]
+                x, y = lines[row, side, point, 0] - x0, lines[row, side, point, 1] - y0
+                ahead, left = cos * x + sin * y, cos * y - sin * x
+                points[at][0], points[at][1] = ahead, left
+                valid[found, point] = abs(ahead) < radius and abs(left) < radius  # of the centre
+                x, y = steps[row, side, point, 0], steps[row, side, point, 1]
                 vectors[at][0], vectors[at][1] = cos * x + sin * y, cos * y - sin * x
-                orientations[at] = known.angles[row, side, point] - heading
-        centers[found, 0], centers[found, 1] = (
-            points[found, 0, _MIDDLE, 0],
-            points[found, 0, _MIDDLE, 1],
-        )
-        centers[found, 2] = orientations[found, 0, _MIDDLE]
-        block, most = known.block[row], known.limit[row]
-        near[found], kind[found] = row, known.kind[row]
-        light[found] = lights[row] if row < len(lights) else _NO_LIGHT
-        flags[0, found] = block != NONE and len(on_route) > 0 and on_route[block]
-        if not np.isnan(most):
-            flags[1, found], limit[found] = True, most
-        found += 1
-    return (
-        *(near[:found], points[:found], vectors[:found], orientations[:found], centers[:found]),
-        *(valid[:found], kind[:found], flags[0, :found], light[:found], flags[1, :found]),
-        limit[:found],
-    )
+                orientations[at] = angles[row, side, point] - heading
+        near[found] = row
+        found += valid[found].any()
+    return near[:found], points[:found], vectors[:found], orientations[:found], valid[:found]

@@ -111,6 +111,20 @@ class Batch(NamedTuple):
         return Batch(type(self.inputs)(**moved), *labels)
 
 
+def in_one_piece(batches: Sequence[Batch]) -> list[Batch]:
+    """The same in one piece of memory: processes hand pieces over one after the other."""
+    tensors: list[Tensor] = []
+    for batch in batches:
+        batch._map(lambda value: tensors.append(value) if isinstance(value, Tensor) else value)
+    tensors.sort(key=Tensor.element_size, reverse=True)  # which aligns them
+    # NumPy asks for huge pages
+    piece = np.concatenate([value.reshape(-1).view(torch.uint8).numpy() for value in tensors])
+    parts = torch.split(torch.from_numpy(piece), [value.nbytes for value in tensors])
+    pairs = zip(tensors, parts, strict=True)
+    moved = {id(value): part.view(value.dtype).view(value.shape) for value, part in pairs}
+    return [batch._map(lambda value: moved.get(id(value), value)) for batch in batches]
+
+
 def perturbed_state(state: FloatArray, noise: FloatArray) -> FloatArray:
     """(7,) x, y, heading, speed, acceleration, steering angle, yaw rate moved by noise (7,)."""
     moved = state + noise
@@ -132,12 +146,21 @@ def targets(present: FloatArray, future: FloatArray, frame: FloatArray) -> np.nd
         future: (A, 80, 3) poses after it.
         frame: (3,) rear axle of the ego, whose frame the changes are in.
     """
-    cos, sin = np.cos(frame[2]), np.sin(frame[2])
-    x, y, turn = (future[..., axis] - present[:, None, axis] for axis in range(3))
-    changes = np.empty(future.shape, np.float32)
-    # not wrapped: cosine and sine of the heading are what is learnt
-    changes[..., 0], changes[..., 1], changes[..., 2] = cos * x + sin * y, cos * y - sin * x, turn
-    changes[np.isnan(x)] = 0.0
+    changes: np.ndarray = _changes(present, future, np.cos(frame[2]), np.sin(frame[2]))
+    return changes
+
+
+@kernel
+def _changes(present: FloatArray, future: FloatArray, cos: float, sin: float) -> np.ndarray:
+    """`targets` in a frame whose heading has this cosine and sine."""
+    changes = np.zeros(future.shape, np.float32)
+    for row in range(len(changes)):
+        for step in range(changes.shape[1]):
+            x, y = future[row, step, 0] - present[row, 0], future[row, step, 1] - present[row, 1]
+            if not np.isnan(x):
+                changes[row, step, 0], changes[row, step, 1] = cos * x + sin * y, cos * y - sin * x
+                # not wrapped: cosine and sine of the heading are what is learnt
+                changes[row, step, 2] = future[row, step, 2] - present[row, 2]
     return changes
 
 
@@ -185,22 +208,23 @@ def way_back(speed: float, path: FloatArray) -> FloatArray:
             the B steps before now, if it is late, now, and of the 8 s after it.
     """
     path = path.copy()
-    path[:, 2] = np.unwrap(path[:, 2])
+    if np.abs(np.diff(path[:, 2])).max() > 3.0:
+        path[:, 2] = np.unwrap(path[:, 2])
     steps = np.hypot(*np.diff(path[:, :2], axis=0).T)
     lengths = np.concatenate([[0.0], np.cumsum(steps)])
     lon, lat, turn = to_frame(np.zeros(3), path[0])
     along = caught_up(lengths, np.append(steps, steps[-1]) / STEP, lon, speed)
     poses = np.column_stack([np.interp(along, lengths, column) for column in path.T])
-    outside = along - np.clip(along, 0.0, lengths[-1])  # behind the first pose, beyond the last
-    poses[:, 0] += outside * np.cos(poses[:, 2])
-    poses[:, 1] += outside * np.sin(poses[:, 2])
+    # behind the first pose, beyond the last
+    outside = along - np.minimum(np.maximum(along, 0.0), lengths[-1])
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     reach = max(NEAREST_BACK, TIME_BACK * max(speed, steps[0] / STEP))
     place = np.minimum((along - lon) / reach, 1.0)  # a cubic from the offset and its slope to 0
-    slope, left = np.clip(np.tan(turn), -1.0, 1.0), 1.0 - place
+    slope, left = min(max(np.tan(turn), -1.0), 1.0), 1.0 - place
     aside = left**2 * (lat * (1.0 + 2.0 * place) + slope * reach * place)
     change = left * (slope * (1.0 - 3.0 * place) - 6.0 * lat / reach * place)
-    poses[:, 0] -= aside * np.sin(poses[:, 2])
-    poses[:, 1] += aside * np.cos(poses[:, 2])
+    poses[:, 0] = poses[:, 0] + outside * cos - aside * sin
+    poses[:, 1] = poses[:, 1] + outside * sin + aside * cos
     poses[:, 2] += np.arctan(change)
     return poses
 
@@ -229,14 +253,6 @@ def caught_up(lengths: FloatArray, speeds: FloatArray, place: float, speed: floa
     return out
 
 
-class Future(NamedTuple):
-    """What was recorded in the 8 s after a sample. A rows of agents, the ego first."""
-
-    present: FloatArray  # (A, 3) poses now
-    poses: FloatArray  # (A, 80, 3)
-    valid: BoolArray  # (A, 80) whether there was a row
-
-
 class Moment(NamedTuple):
     """The present of a sample."""
 
@@ -254,38 +270,47 @@ class Moment(NamedTuple):
         step = self.scenario.row_step
         return slice(self.row + step, self.row + step * STEPS + 1, step)
 
-    def future(self, near: IntArray) -> Future:
-        """Of the ego from where it is now, and of some tracks."""
+    def future(self, near: IntArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Poses of the ego and of some tracks: (A, 3) now, (A, 80, 3) later; whether recorded."""
         scenario, tracks, rows = self.scenario, self.scenario.tracks, self.rows
-        poses = np.empty((1 + len(near), STEPS, 3))
+        poses = _recorded(tracks.poses, near, rows.start, rows.step)
         valid = np.ones(poses.shape[:2], np.bool_)
-        # take: indexing with two arrays is slow
-        poses[1:] = tracks.poses[rows].take(near, axis=1).swapaxes(0, 1)
         valid[1:] = tracks.valid[rows].take(near, axis=1).T
         now, poses[0] = self.observation.history.ego[-1:, :3], scenario.ego[rows, :3]
         if self.beside is not None:
             path = scenario.ego[self.beside : rows.stop : rows.step, :3]
             poses[0] = from_frame(way_back(self.state[3], to_frame(path, now[0])), now[0])
-        return Future(np.vstack([now, tracks.poses[self.row, near]]), poses, valid)
+        return np.vstack([now, tracks.poses[self.row, near]]), poses, valid
 
-    def velocities(self, near: IntArray, future: Future) -> FloatArray:
-        """(A, 80, 2) in the frame of the map [m/s], of the same."""
+    def velocities(self, near: IntArray, drive: FloatArray) -> FloatArray:
+        """(A, 80, 2) in the frame of the map [m/s], of the same; `drive` (81, 3) is the ego's."""
         ego, velocities = self.scenario.ego[self.rows], self.scenario.tracks.velocities
         cos, sin, vx, vy = np.cos(ego[:, 2]), np.sin(ego[:, 2]), ego[:, VX], ego[:, VY]
         own = np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy])
         if self.beside is not None:
-            drive = np.vstack([future.present[:1], future.poses[0]])
             own = np.diff(drive[:, :2], axis=0) / STEP
-        others = velocities[self.rows].take(near, axis=1).swapaxes(0, 1)
-        return np.concatenate([own[None], others])
+        motion: FloatArray = _recorded(velocities, near, self.rows.start, self.rows.step)
+        motion[0] = own
+        return motion
+
+
+@kernel
+def _recorded(values: FloatArray, near: IntArray, first: int, step: int) -> FloatArray:
+    """(1 + N, 80, k) of some tracks from a row on, behind a first one that is not yet known."""
+    out = np.empty((1 + len(near), STEPS, values.shape[2]))
+    for track in range(len(near)):
+        for place in range(STEPS):
+            for axis in range(values.shape[2]):
+                out[1 + track, place, axis] = values[first + place * step, near[track], axis]
+    return out
 
 
 def _plantf_sample(planner: plantf.PlanTF, read: plantf.Features, now: Moment) -> Sample | str:
     if not len(read.road.objects):
         return _NO_ROAD
     read.current_state[3:] = now.state[3:]
-    future = now.future(read.agents.tracks)
-    return Sample(read, targets(future.present, future.poses, future.present[0]), future.valid)
+    present, poses, valid = now.future(read.agents.tracks)
+    return Sample(read, targets(present, poses, present[0]), valid)
 
 
 def _pluto_sample(planner: pluto.Pluto, read: pluto.SceneInputs, now: Moment) -> Sample | str:
@@ -293,12 +318,11 @@ def _pluto_sample(planner: pluto.Pluto, read: pluto.SceneInputs, now: Moment) ->
         return _NO_LINE
     read.current_state[3:] = now.state[3:]
     seen = planner.surroundings
-    near = seen.agents.tracks
-    future = now.future(near)
-    future.valid[0, steps_before_red(planner, now, future.poses[0]) :] = False
-    motion = now.velocities(near, future)
-    target = motion_targets(future.present, future.poses, motion, future.present[0])
-    return Sample(read, target, future.valid, projections(seen.lines, future.poses[0]))
+    present, poses, valid = now.future(seen.agents.tracks)
+    valid[0, steps_before_red(planner, now, poses[0]) :] = False
+    motion = now.velocities(seen.agents.tracks, np.vstack([present[:1], poses[0]]))
+    target = motion_targets(present, poses, motion, present[0])
+    return Sample(read, target, valid, projections(seen.lines, poses[0]))
 
 
 def steps_before_red(planner: pluto.Pluto, now: Moment, ego: FloatArray) -> int:
@@ -317,11 +341,11 @@ def _diffusion_sample(
 ) -> Sample | str:
     if not len(read.edges):
         return _NO_LANE
-    future = now.future(read.agents[:NEIGHBOURS])
-    poses = to_frame(future.poses, future.present[0])
+    present, poses, recorded = now.future(read.agents[:NEIGHBOURS])
+    poses = to_frame(poses, present[0])
     target = np.zeros((1 + NEIGHBOURS, STEPS, 3), np.float32)
     valid = np.zeros(target.shape[:2], np.bool_)
-    target[: len(poses)], valid[: len(poses)] = np.nan_to_num(poses), future.valid
+    target[: len(poses)], valid[: len(poses)] = np.nan_to_num(poses), recorded
     return Sample(read, target, valid)
 
 
@@ -395,8 +419,6 @@ def _driven_sample(
 ) -> Sample | str:
     """Of an ego that a planner has driven near the recorded path, maybe late."""
     row, step = int(scenario.iteration_rows[iteration]), scenario.row_step
-    if row + STEPS * step >= len(scenario.time_us):
-        return _SHORT
     ego = scenario.ego[past_rows(scenario, iteration)].copy()
     states = driven[max(iteration + 1 - len(ego), 0) : iteration + 1]
     ego[len(ego) - len(states) :] = states

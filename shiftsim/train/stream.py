@@ -21,7 +21,15 @@ from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.runs.results import Run, open_run
 from shiftsim.runs.rollouts import Task
 from shiftsim.sim.planner import scene_info
-from shiftsim.train.samples import KINDS, STEPS, Batch, Sample, make_batch, make_sample
+from shiftsim.train.samples import (
+    KINDS,
+    STEPS,
+    Batch,
+    Sample,
+    in_one_piece,
+    make_batch,
+    make_sample,
+)
 from shiftsim.world.scenario import Scenario
 
 BATCH, PER_BLOCK = 32, 64  # samples; scenarios, enough that batches differ little
@@ -156,8 +164,9 @@ class Blocks(IterableDataset[Block]):
         """The blocks of this worker, which are every so manyth."""
         info = get_worker_info()
         make, start = BlockMaker(self.stream), self.first + (info.id if info else 0)
-        for block in count(start, info.num_workers if info else 1):
-            yield make(block)
+        for number in count(start, info.num_workers if info else 1):
+            block = make(number)
+            yield block._replace(batches=in_one_piece(block.batches)) if info else block
 
 
 def load_blocks(stream: Stream, first: int, workers: int) -> Iterator[Block]:
