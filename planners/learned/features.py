@@ -20,7 +20,7 @@ _WINDOW = np.arange(-2, 3)  # samples of the derivative filter, a parabola throu
 _SLOPE = _WINDOW / 10.0
 _BEND = (_WINDOW**2 - 2.0) / 7.0
 _LENGTH, _WIDTH = state.PACIFICA.length, state.PACIFICA.width
-_NUM_AGENT_KINDS = int(state.LAST_AGENT_KIND) + 1
+_LAST_KIND = int(state.LAST_AGENT_KIND)
 
 NO_ROUTE = "the scenario has no route on the map"
 
@@ -51,12 +51,8 @@ def agent_features(history: History, center: FloatArray, max_agents: int) -> Age
     nearest = nearest_agents(tracks, center, max_agents)
     cos, sin, vx, vy = np.cos(ego[:, 2]), np.sin(ego[:, 2]), ego[:, 3], ego[:, 4]
     own = np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy])
-    rows = (tracks.poses, tracks.velocities, tracks.sizes, tracks.valid)
-    seen = tuple(values[-SAMPLES:] for values in rows)
-    category = np.zeros(len(nearest) + 1, np.int64)
-    category[1:] = tracks.kinds[nearest] + 1
-    found = *_histories(ego, own, seen, nearest, frame_of(ego[-1])), category
-    return AgentFeatures(nearest, *found)
+    rows = tracks.poses, tracks.velocities, tracks.sizes, tracks.valid, tracks.kinds
+    return AgentFeatures(nearest, *_histories(ego, own, rows, nearest, frame_of(ego[-1])))
 
 
 def frame_of(pose: FloatArray) -> tuple[float, ...]:
@@ -67,53 +63,37 @@ def frame_of(pose: FloatArray) -> tuple[float, ...]:
 @kernel
 def _histories(ego: FloatArray, own: FloatArray, rows: Any, nearest: IntArray, frame: Any) -> Any:
     """Fields of `AgentFeatures`: of the ego and its velocities `own`, and of rows of tracks."""
-    (x0, y0, heading, cos, sin), (poses, velocities, sizes, valid) = frame, rows
+    (x0, y0, heading, cos, sin), (poses, velocities, sizes, valid, kinds) = frame, rows
     shape, first = (len(nearest) + 1, SAMPLES), SAMPLES - len(ego)
     angle, seen = np.zeros(shape, np.float32), np.zeros(shape, np.bool_)
     position, velocity, size = np.zeros((3, *shape, 2), np.float32)
+    category = np.append(np.zeros(1, np.int64), kinds[nearest] + 1)
     for row in range(len(seen)):
         for step in range(len(ego)):
             at = first + step
-            x, y, turn = ego[step, 0], ego[step, 1], ego[step, 2]
-            vx, vy = own[step, 0], own[step, 1]
+            (x, y, turn), (vx, vy) = ego[step, :3], own[step]
             length, width = _LENGTH, _WIDTH
             if row > 0:
-                track = nearest[row - 1]
-                if not valid[step, track]:
+                here = len(valid) - len(ego) + step, nearest[row - 1]
+                if not valid[here]:
                     continue
-                x, y, turn = poses[step, track, 0], poses[step, track, 1], poses[step, track, 2]
-                vx, vy = velocities[step, track, 0], velocities[step, track, 1]
-                length, width = sizes[step, track, 0], sizes[step, track, 1]
+                x, y, turn = poses[here]
+                (vx, vy), (length, width) = velocities[here], sizes[here]
             x, y = x - x0, y - y0
             position[row, at, 0], position[row, at, 1] = cos * x + sin * y, cos * y - sin * x
             velocity[row, at, 0], velocity[row, at, 1] = cos * vx + sin * vy, cos * vy - sin * vx
             size[row, at, 0], size[row, at, 1] = width, length
             angle[row, at], seen[row, at] = turn - heading, True
-    return position, angle, velocity, size, seen
+    return position, angle, velocity, size, seen, category
 
 
 def nearest_agents(tracks: state.Tracks, center: FloatArray, count: int) -> IntArray:
     """Present agents, nearest first."""
-    x, y = float(center[0]), float(center[1])
-    by_kind, away = _present_agents(tracks.valid[-1], tracks.kinds, tracks.poses[-1], x, y)
-    nearest: IntArray = by_kind[np.argsort(away)[:count]]
-    return nearest
-
-
-@kernel
-def _present_agents(
-    present: BoolArray, kinds: IntArray, poses: FloatArray, x: float, y: float
-) -> tuple[IntArray, FloatArray]:
-    """Present agents, and how far each is from a point."""
     # nuPlan rule 300: sorted from a list by kind, by a method that does not keep the order of ties
-    found, away, count = np.empty(len(kinds), np.int64), np.empty(len(kinds)), 0
-    for kind in range(_NUM_AGENT_KINDS):
-        for track in range(len(kinds)):
-            if present[track] and kinds[track] == kind:
-                dx, dy = poses[track, 0] - x, poses[track, 1] - y
-                found[count], away[count] = track, np.sqrt(dx * dx + dy * dy)
-                count += 1
-    return found[:count], away[:count]
+    present = np.flatnonzero(tracks.valid[-1] & (tracks.kinds <= _LAST_KIND))
+    by_kind = present[np.argsort(tracks.kinds[present], kind="stable")]
+    dx, dy = (tracks.poses[-1, by_kind, :2] - center[:2]).T
+    return by_kind[np.argsort(np.sqrt(dx * dx + dy * dy))[:count]]
 
 
 def poses_of(plan: np.ndarray) -> FloatArray:
@@ -137,12 +117,10 @@ def straight_on(history: History) -> state.Trajectory:
     """A fallback where a planner has no plan: heading and speed are kept for 8 s."""
     present = history.ego[-1]
     times = STEP * np.arange(1, PLAN_POSES + 1)
-    speed = present[state.VX] * np.array(
-        [np.cos(present[state.HEADING]), np.sin(present[state.HEADING])]
-    )
-    poses = np.empty((PLAN_POSES, 3))
-    poses[:, :2] = present[:2] + times[:, None] * speed
-    poses[:, state.HEADING] = present[state.HEADING]
+    heading = present[state.HEADING]
+    speed = present[state.VX] * np.array([np.cos(heading), np.sin(heading)])
+    poses = np.tile(present[:3], (PLAN_POSES, 1))
+    poses[:, :2] += times[:, None] * speed
     return plan_of_poses(poses, history)
 
 

@@ -62,12 +62,9 @@ def _make_road_objects(road: VectorMap) -> RoadObjects:
         left = corners[2] + along * (corners[1] - corners[2])
         lines[num_edges + index] = (left + right) / 2.0, left, right
     steps = np.diff(lines, axis=2)
-    kind = np.full(len(lines), CROSSWALK)
-    kind[:num_edges] = np.arange(num_edges) >= road.num_lanes
-    block = np.full(len(lines), NONE)
-    block[:num_edges] = road.block_of
-    limit = np.full(len(lines), np.nan)
-    limit[:num_edges] = road.speed_limits
+    kind = np.append(np.arange(num_edges) >= road.num_lanes, np.full(num_crosswalks, CROSSWALK))
+    block = np.append(road.block_of, np.full(num_crosswalks, NONE))
+    limit = np.append(road.speed_limits, np.full(num_crosswalks, np.nan))
     angles = np.arctan2(steps[..., 1], steps[..., 0])
     return RoadObjects(lines, steps, angles, kind, block, limit)
 
@@ -189,21 +186,19 @@ def road_features(
     """
     known, areas = road_objects(road), (road.edges.polygons, road.crosswalks.polygons)
     around = square_around(float(center[0]), float(center[1]), radius), radius
-    seen = _seen_objects(known[:3], areas, around, frame_of(ego))
-    chosen, points, vectors, orientations, valid = seen
+    chosen, points, vectors, orientations, valid = _select(known[:3], areas, around, frame_of(ego))
     kind, block, limit = (values[chosen] for values in known[3:])
     light = np.append(lights, int(LightStatus.UNKNOWN))[np.minimum(chosen, len(lights))]
     routed = (block != NONE) & on_route[block] if len(on_route) else np.zeros(len(chosen), np.bool_)
     has_limit = ~np.isnan(limit)
     limit = np.where(has_limit, limit, 0.0).astype(np.float32)
-    middle = slice(_MIDDLE, _MIDDLE + 1)
-    centers = np.concatenate([points[:, 0, _MIDDLE], orientations[:, 0, middle]], axis=1)
+    centers = np.concatenate([points[:, 0, _MIDDLE], orientations[:, 0, _MIDDLE, None]], axis=1)
     lines = points, vectors, orientations, centers, valid
     return RoadFeatures(chosen, *lines, kind, routed, light, has_limit, limit)
 
 
 @kernel
-def _seen_objects(known: Any, areas: Any, around: Any, frame: Any) -> Any:
+def _select(known: Any, areas: Any, around: Any, frame: Any) -> Any:
     """Objects of a map around the ego, their lines in its frame, and what is near of them."""
     (lines, steps, angles), (edges, crosswalks), (square, radius) = known, areas, around
     near = np.concatenate((meeting(edges, square), len(edges.bounds) + meeting(crosswalks, square)))

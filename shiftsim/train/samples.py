@@ -50,12 +50,6 @@ NEIGHBOURS = 10  # agents that the ego must not be moved into, and that Diffusio
 # a driven ego is a sample if it is this near to the path [m], and at most so many steps late
 MOST_AHEAD, MOST_ASIDE, MOST_LATE = 2.5, 1.5, 80
 
-_ELSEWHERE = "driven far from the recording"
-_SHORT = "less than 8 s recorded after it"
-_NO_ROAD = "no lane or crosswalk around it"
-_NO_LINE = "no reference line"
-_NO_LANE = "no lane within 100 m"
-
 
 class Sample(NamedTuple):
     """One sample. A rows of agents, the ego first."""
@@ -111,16 +105,13 @@ class Batch(NamedTuple):
         return Batch(type(self.inputs)(**moved), *labels)
 
 
-def in_one_piece(batches: Sequence[Batch]) -> list[Batch]:
-    """The same in one piece of memory: processes hand pieces over one after the other."""
-    tensors: list[Tensor] = []
-    for batch in batches:
-        batch._map(lambda value: tensors.append(value) if isinstance(value, Tensor) else value)
+def pooled(batches: Sequence[Batch]) -> list[Batch]:
+    """The same in one piece of memory, as processes hand over piece by piece."""
+    tensors = [value for batch in batches for value in batch.tensors().values()]
     tensors.sort(key=Tensor.element_size, reverse=True)  # which aligns them
-    # NumPy asks for huge pages
-    piece = np.concatenate([value.reshape(-1).view(torch.uint8).numpy() for value in tensors])
-    parts = torch.split(torch.from_numpy(piece), [value.nbytes for value in tensors])
-    pairs = zip(tensors, parts, strict=True)
+    parts = (value.reshape(-1).view(torch.uint8).numpy() for value in tensors)
+    piece = torch.from_numpy(np.concatenate([np.zeros(0, np.uint8), *parts]))
+    pairs = zip(tensors, torch.split(piece, [value.nbytes for value in tensors]), strict=True)
     moved = {id(value): part.view(value.dtype).view(value.shape) for value, part in pairs}
     return [batch._map(lambda value: moved.get(id(value), value)) for batch in batches]
 
@@ -146,21 +137,12 @@ def targets(present: FloatArray, future: FloatArray, frame: FloatArray) -> np.nd
         future: (A, 80, 3) poses after it.
         frame: (3,) rear axle of the ego, whose frame the changes are in.
     """
-    changes: np.ndarray = _changes(present, future, np.cos(frame[2]), np.sin(frame[2]))
-    return changes
-
-
-@kernel
-def _changes(present: FloatArray, future: FloatArray, cos: float, sin: float) -> np.ndarray:
-    """`targets` in a frame whose heading has this cosine and sine."""
-    changes = np.zeros(future.shape, np.float32)
-    for row in range(len(changes)):
-        for step in range(changes.shape[1]):
-            x, y = future[row, step, 0] - present[row, 0], future[row, step, 1] - present[row, 1]
-            if not np.isnan(x):
-                changes[row, step, 0], changes[row, step, 1] = cos * x + sin * y, cos * y - sin * x
-                # not wrapped: cosine and sine of the heading are what is learnt
-                changes[row, step, 2] = future[row, step, 2] - present[row, 2]
+    cos, sin = np.cos(frame[2]), np.sin(frame[2])
+    x, y, turn = (future[..., axis] - present[:, None, axis] for axis in range(3))
+    changes = np.empty(future.shape, np.float32)
+    # not wrapped: cosine and sine of the heading are what is learnt
+    changes[..., 0], changes[..., 1], changes[..., 2] = cos * x + sin * y, cos * y - sin * x, turn
+    changes[np.isnan(x)] = 0.0
     return changes
 
 
@@ -307,7 +289,7 @@ def _recorded(values: FloatArray, near: IntArray, first: int, step: int) -> Floa
 
 def _plantf_sample(planner: plantf.PlanTF, read: plantf.Features, now: Moment) -> Sample | str:
     if not len(read.road.objects):
-        return _NO_ROAD
+        return "no lane or crosswalk around it"
     read.current_state[3:] = now.state[3:]
     present, poses, valid = now.future(read.agents.tracks)
     return Sample(read, targets(present, poses, present[0]), valid)
@@ -315,7 +297,7 @@ def _plantf_sample(planner: plantf.PlanTF, read: plantf.Features, now: Moment) -
 
 def _pluto_sample(planner: pluto.Pluto, read: pluto.SceneInputs, now: Moment) -> Sample | str:
     if not read.line_valid.any():
-        return _NO_LINE
+        return "no reference line"
     read.current_state[3:] = now.state[3:]
     seen = planner.surroundings
     present, poses, valid = now.future(seen.agents.tracks)
@@ -336,11 +318,9 @@ def steps_before_red(planner: pluto.Pluto, now: Moment, ego: FloatArray) -> int:
     return STEPS
 
 
-def _diffusion_sample(
-    planner: diffusion.DiffusionPlanner, read: DiffusionFeatures, now: Moment
-) -> Sample | str:
+def _diffusion_sample(planner: Any, read: DiffusionFeatures, now: Moment) -> Sample | str:
     if not len(read.edges):
-        return _NO_LANE
+        return "no lane within 100 m"
     present, poses, recorded = now.future(read.agents[:NEIGHBOURS])
     poses = to_frame(poses, present[0])
     target = np.zeros((1 + NEIGHBOURS, STEPS, 3), np.float32)
@@ -393,7 +373,7 @@ def make_sample(
     """
     row, kind = int(scenario.iteration_rows[iteration]), KINDS[planner.name]
     if row + STEPS * scenario.row_step >= len(scenario.time_us):
-        return _SHORT
+        return "less than 8 s recorded after it"
     if driven is not None:
         return _driven_sample(planner, scenario, iteration, driven)
     observation = observe_log(scenario, iteration)
@@ -427,7 +407,7 @@ def _driven_sample(
     near = int(np.hypot(*(scenario.ego[before, :2] - ego[-1, :2]).T).argmin())
     ahead, aside, turn = np.abs(to_frame(ego[-1, :3], scenario.ego[before[near], :3]))
     if ahead > MOST_AHEAD or aside > MOST_ASIDE or turn > NOISE[2]:
-        return _ELSEWHERE
+        return "driven far from the recording"
     state = plantf.current_state(observation.history).astype(np.float64)
     now = Moment(scenario, row, observation, state, int(before[near]))
     return KINDS[planner.name].label(planner, planner.features(observation), now)
@@ -440,9 +420,7 @@ def _perturb(
     ego, tracks = history.ego[-1], history.tracks
     near = features.nearest_agents(tracks, center_poses(ego[:3]), NEIGHBOURS)
     boxes = tracks.poses[-1, near], tracks.sizes[-1, near]
-    return free_state(
-        state, noise, lambda pose: is_free(features.map_poses(pose, ego), *boxes), tries
-    )
+    return free_state(state, noise, lambda at: is_free(features.map_poses(at, ego), *boxes), tries)
 
 
 def free_state(

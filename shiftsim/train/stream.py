@@ -21,15 +21,7 @@ from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.runs.results import Run, open_run
 from shiftsim.runs.rollouts import Task
 from shiftsim.sim.planner import scene_info
-from shiftsim.train.samples import (
-    KINDS,
-    STEPS,
-    Batch,
-    Sample,
-    in_one_piece,
-    make_batch,
-    make_sample,
-)
+from shiftsim.train.samples import KINDS, STEPS, Batch, Sample, make_batch, make_sample, pooled
 from shiftsim.world.scenario import Scenario
 
 BATCH, PER_BLOCK = 32, 64  # samples; scenarios, enough that batches differ little
@@ -97,7 +89,7 @@ class BlockMaker:
             make_batch([made[i] for i in order[first : first + size]], self._kind)
             for first in range(0, len(order), size)
         ]
-        return Block(batches, dict(failed))
+        return Block(pooled(batches), dict(failed))
 
     def _of_scenario(self, token: str, key: list[int], failed: Counter[str]) -> list[Sample]:
         """Samples of a scenario."""
@@ -164,9 +156,8 @@ class Blocks(IterableDataset[Block]):
         """The blocks of this worker, which are every so manyth."""
         info = get_worker_info()
         make, start = BlockMaker(self.stream), self.first + (info.id if info else 0)
-        for number in count(start, info.num_workers if info else 1):
-            block = make(number)
-            yield block._replace(batches=in_one_piece(block.batches)) if info else block
+        for block in count(start, info.num_workers if info else 1):
+            yield make(block)
 
 
 def load_blocks(stream: Stream, first: int, workers: int) -> Iterator[Block]:
