@@ -146,10 +146,14 @@ def works(folder: Path) -> dict[str, Callable[[], object]]:
 
 
 def come_back(scenario: Scenario) -> None:
-    """The way back of an ego that was moved."""
-    from shiftsim.train.samples import way_back  # needs torch
+    """The way back of an ego that was moved, and a sample for training."""
+    from shiftsim.planners.learned.plantf.planner import PlanTF  # these need torch
+    from shiftsim.train.samples import make_sample, way_back
 
     way_back(3.0, scenario.ego[:81, :3] - scenario.ego[0, :3])
+    recorded, planner = cruise_scenario(speed=4.0, iterations=121), PlanTF.asking(list)
+    planner.reset(scene_info(recorded))
+    assert make_sample(planner, recorded, 5, np.random.default_rng(0)).valid.all()
 
 
 def measure_realism(scenario: Scenario) -> None:

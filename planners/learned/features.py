@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shiftsim.geometry.boxes import turned
-from shiftsim.kernels import BoolArray, FloatArray, IntArray
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.sim.planner import History
 from shiftsim.world import state
 
@@ -20,6 +19,8 @@ PLAN_POSES = 80
 _WINDOW = np.arange(-2, 3)  # samples of the derivative filter, a parabola through five
 _SLOPE = _WINDOW / 10.0
 _BEND = (_WINDOW**2 - 2.0) / 7.0
+_LENGTH, _WIDTH = state.PACIFICA.length, state.PACIFICA.width
+_LAST_KIND = int(state.LAST_AGENT_KIND)
 
 NO_ROUTE = "the scenario has no route on the map"
 
@@ -49,47 +50,50 @@ def agent_features(history: History, center: FloatArray, max_agents: int) -> Age
     tracks, ego = history.tracks, history.ego[-SAMPLES:]
     nearest = nearest_agents(tracks, center, max_agents)
     cos, sin, vx, vy = np.cos(ego[:, 2]), np.sin(ego[:, 2]), ego[:, 3], ego[:, 4]
-    own = (
-        ego[:, :3],
-        np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy]),
-        np.full((len(ego), 2), [state.PACIFICA.length, state.PACIFICA.width]),
-        np.ones(len(ego), np.bool_),
-    )
-    others = (tracks.poses, tracks.velocities, tracks.sizes, tracks.valid)
-    poses, velocities, sizes, seen = (
-        np.concatenate([one[:, None], rows[-SAMPLES:].take(nearest, axis=1)], axis=1)
-        for one, rows in zip(own, others, strict=True)
-    )
+    own = np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy])
+    rows = tracks.poses, tracks.velocities, tracks.sizes, tracks.valid, tracks.kinds
+    return AgentFeatures(nearest, *_histories(ego, own, rows, nearest, frame_of(ego[-1])))
 
-    def filled(values: np.ndarray, kind: Any = np.float32) -> np.ndarray:
-        """(A, 21, ...) samples of rows (T, A, ...); 0 where nothing was seen."""
-        out = np.zeros((SAMPLES, *values.shape[1:]), kind)
-        part = out[SAMPLES - len(values) :]
-        np.copyto(part.T, values.T, where=seen.T, casting="same_kind")
-        return out.swapaxes(0, 1)
 
-    category = np.zeros(len(nearest) + 1, np.int64)
-    category[1:] = tracks.kinds[nearest] + 1
-    heading = float(ego[-1, state.HEADING])
-    return AgentFeatures(
-        tracks=nearest,
-        position=filled(turned(poses[..., :2] - ego[-1, :2], heading)),
-        heading=filled(poses[..., 2] - heading),
-        velocity=filled(turned(velocities, heading)),
-        shape=filled(sizes[..., ::-1]),
-        valid=filled(seen, np.bool_),
-        category=category,
-    )
+def frame_of(pose: FloatArray) -> tuple[float, ...]:
+    """x, y, heading, its cosine and its sine of a pose: kernels would round these two otherwise."""
+    return (*pose[:3].tolist(), float(np.cos(pose[2])), float(np.sin(pose[2])))
+
+
+@kernel
+def _histories(ego: FloatArray, own: FloatArray, rows: Any, nearest: IntArray, frame: Any) -> Any:
+    """Fields of `AgentFeatures`: of the ego and its velocities `own`, and of rows of tracks."""
+    (x0, y0, heading, cos, sin), (poses, velocities, sizes, valid, kinds) = frame, rows
+    shape, first = (len(nearest) + 1, SAMPLES), SAMPLES - len(ego)
+    angle, seen = np.zeros(shape, np.float32), np.zeros(shape, np.bool_)
+    position, velocity, size = np.zeros((3, *shape, 2), np.float32)
+    category = np.append(np.zeros(1, np.int64), kinds[nearest] + 1)
+    for row in range(len(seen)):
+        for step in range(len(ego)):
+            at = first + step
+            (x, y, turn), (vx, vy) = ego[step, :3], own[step]
+            length, width = _LENGTH, _WIDTH
+            if row > 0:
+                here = len(valid) - len(ego) + step, nearest[row - 1]
+                if not valid[here]:
+                    continue
+                x, y, turn = poses[here]
+                (vx, vy), (length, width) = velocities[here], sizes[here]
+            x, y = x - x0, y - y0
+            position[row, at, 0], position[row, at, 1] = cos * x + sin * y, cos * y - sin * x
+            velocity[row, at, 0], velocity[row, at, 1] = cos * vx + sin * vy, cos * vy - sin * vx
+            size[row, at, 0], size[row, at, 1] = width, length
+            angle[row, at], seen[row, at] = turn - heading, True
+    return position, angle, velocity, size, seen, category
 
 
 def nearest_agents(tracks: state.Tracks, center: FloatArray, count: int) -> IntArray:
     """Present agents, nearest first."""
     # nuPlan rule 300: sorted from a list by kind, by a method that does not keep the order of ties
-    present = np.flatnonzero(tracks.valid[-1] & (tracks.kinds <= state.LAST_AGENT_KIND))
+    present = np.flatnonzero(tracks.valid[-1] & (tracks.kinds <= _LAST_KIND))
     by_kind = present[np.argsort(tracks.kinds[present], kind="stable")]
-    away = tracks.poses[-1, by_kind, :2] - center[:2]
-    order = np.argsort(np.sqrt(away[:, 0] ** 2 + away[:, 1] ** 2))
-    return by_kind[order[:count]]
+    dx, dy = (tracks.poses[-1, by_kind, :2] - center[:2]).T
+    return by_kind[np.argsort(np.sqrt(dx * dx + dy * dy))[:count]]
 
 
 def poses_of(plan: np.ndarray) -> FloatArray:
@@ -113,12 +117,10 @@ def straight_on(history: History) -> state.Trajectory:
     """A fallback where a planner has no plan: heading and speed are kept for 8 s."""
     present = history.ego[-1]
     times = STEP * np.arange(1, PLAN_POSES + 1)
-    speed = present[state.VX] * np.array(
-        [np.cos(present[state.HEADING]), np.sin(present[state.HEADING])]
-    )
-    poses = np.empty((PLAN_POSES, 3))
-    poses[:, :2] = present[:2] + times[:, None] * speed
-    poses[:, state.HEADING] = present[state.HEADING]
+    heading = present[state.HEADING]
+    speed = present[state.VX] * np.array([np.cos(heading), np.sin(heading)])
+    poses = np.tile(present[:3], (PLAN_POSES, 1))
+    poses[:, :2] += times[:, None] * speed
     return plan_of_poses(poses, history)
 
 

@@ -4,16 +4,17 @@ Everything that does not depend on the ego is made once per map, in the map fram
 centre line and on either side of every object. A step then selects, moves and turns.
 """
 
-from typing import NamedTuple
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
 
-from shiftsim.geometry.boxes import turned
 from shiftsim.geometry.polylines import point_on_polyline
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
+from shiftsim.planners.learned.features import frame_of
 from shiftsim.world.layers import Polylines, meeting, square_around
-from shiftsim.world.map import NONE, PerMap, VectorMap
+from shiftsim.world.map import NONE, VectorMap
 from shiftsim.world.state import LightStatus, TrafficLights
 
 POINTS = 20  # per polyline; their vectors lead to the next one
@@ -61,17 +62,14 @@ def _make_road_objects(road: VectorMap) -> RoadObjects:
         left = corners[2] + along * (corners[1] - corners[2])
         lines[num_edges + index] = (left + right) / 2.0, left, right
     steps = np.diff(lines, axis=2)
-    kind = np.full(len(lines), CROSSWALK)
-    kind[:num_edges] = np.arange(num_edges) >= road.num_lanes
-    block = np.full(len(lines), NONE)
-    block[:num_edges] = road.block_of
-    limit = np.full(len(lines), np.nan)
-    limit[:num_edges] = road.speed_limits
+    kind = np.append(np.arange(num_edges) >= road.num_lanes, np.full(num_crosswalks, CROSSWALK))
+    block = np.append(road.block_of, np.full(num_crosswalks, NONE))
+    limit = np.append(road.speed_limits, np.full(num_crosswalks, np.nan))
     angles = np.arctan2(steps[..., 1], steps[..., 0])
     return RoadObjects(lines, steps, angles, kind, block, limit)
 
 
-road_objects = PerMap(_make_road_objects)
+road_objects = lru_cache(256)(_make_road_objects)  # training goes from town to town
 
 
 @kernel
@@ -186,28 +184,39 @@ def road_features(
     `radius` is half the side of the square [m], the rear axle `ego` (3,) the frame of the features,
     `lights` (E,) are of `LightLookup`, `on_route` (B,) blocks. In the order of `RoadObjects`.
     """
-    known = road_objects(road)
-    square = square_around(float(center[0]), float(center[1]), radius)
-    edges = meeting(road.edges.polygons, square)
-    near = np.concatenate([edges, len(road.edges) + meeting(road.crosswalks.polygons, square)])
-    heading = float(ego[2])
-    offsets = turned(known.lines[near, :, :-1] - ego[:2], heading)
-    valid: BoolArray = np.all(np.abs(offsets[:, 0]) < radius, axis=-1)
-    seen = valid.any(axis=1)
-    chosen, valid, points = near[seen], valid[seen], offsets[seen].astype(np.float32)
-    vectors = turned(known.steps[chosen], heading).astype(np.float32)
-    orientations = (known.angles[chosen] - heading).astype(np.float32)
-    limit = known.limit[chosen]
-    has_limit = ~np.isnan(limit)
-    light = np.full(len(chosen), int(LightStatus.UNKNOWN))
-    num_edges = int(np.searchsorted(chosen, len(road.edges)))
-    light[:num_edges] = lights[chosen[:num_edges]]
-    block = known.block[chosen]
+    known, areas = road_objects(road), (road.edges.polygons, road.crosswalks.polygons)
+    around = square_around(float(center[0]), float(center[1]), radius), radius
+    chosen, points, vectors, orientations, valid = _select(known[:3], areas, around, frame_of(ego))
+    kind, block, limit = (values[chosen] for values in known[3:])
+    light = np.append(lights, int(LightStatus.UNKNOWN))[np.minimum(chosen, len(lights))]
     routed = (block != NONE) & on_route[block] if len(on_route) else np.zeros(len(chosen), np.bool_)
-    centers = np.concatenate(
-        [points[:, 0, _MIDDLE], orientations[:, 0, _MIDDLE : _MIDDLE + 1]], axis=1
-    )
-    return RoadFeatures(
-        *(chosen, points, vectors, orientations, centers, valid, known.kind[chosen], routed, light),
-        *(has_limit, np.where(has_limit, limit, 0.0).astype(np.float32)),
-    )
+    has_limit = ~np.isnan(limit)
+    limit = np.where(has_limit, limit, 0.0).astype(np.float32)
+    centers = np.concatenate([points[:, 0, _MIDDLE], orientations[:, 0, _MIDDLE, None]], axis=1)
+    lines = points, vectors, orientations, centers, valid
+    return RoadFeatures(chosen, *lines, kind, routed, light, has_limit, limit)
+
+
+@kernel
+def _select(known: Any, areas: Any, around: Any, frame: Any) -> Any:
+    """Objects of a map around the ego, their lines in its frame, and what is near of them."""
+    (lines, steps, angles), (edges, crosswalks), (square, radius) = known, areas, around
+    near = np.concatenate((meeting(edges, square), len(edges.bounds) + meeting(crosswalks, square)))
+    points, vectors = np.empty((2, len(near), 3, POINTS, 2), np.float32)
+    orientations = np.empty((len(near), 3, POINTS), np.float32)
+    valid, found = np.empty((len(near), POINTS), np.bool_), 0
+    x0, y0, heading, cos, sin = frame
+    for row in near:
+        for side in range(2, -1, -1):
+            for point in range(POINTS):
+                at = found, side, point
+                x, y = lines[row, side, point, 0] - x0, lines[row, side, point, 1] - y0
+                ahead, left = cos * x + sin * y, cos * y - sin * x
+                points[at][0], points[at][1] = ahead, left
+                valid[found, point] = abs(ahead) < radius and abs(left) < radius  # of the centre
+                x, y = steps[row, side, point, 0], steps[row, side, point, 1]
+                vectors[at][0], vectors[at][1] = cos * x + sin * y, cos * y - sin * x
+                orientations[at] = angles[row, side, point] - heading
+        near[found] = row
+        found += valid[found].any()
+    return near[:found], points[:found], vectors[:found], orientations[:found], valid[:found]

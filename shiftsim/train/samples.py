@@ -50,12 +50,6 @@ NEIGHBOURS = 10  # agents that the ego must not be moved into, and that Diffusio
 # a driven ego is a sample if it is this near to the path [m], and at most so many steps late
 MOST_AHEAD, MOST_ASIDE, MOST_LATE = 2.5, 1.5, 80
 
-_ELSEWHERE = "driven far from the recording"
-_SHORT = "less than 8 s recorded after it"
-_NO_ROAD = "no lane or crosswalk around it"
-_NO_LINE = "no reference line"
-_NO_LANE = "no lane within 100 m"
-
 
 class Sample(NamedTuple):
     """One sample. A rows of agents, the ego first."""
@@ -109,6 +103,17 @@ class Batch(NamedTuple):
             moved["counts"] = [change(by_scene) for by_scene in counts]
         labels: list[Any] = [None if value is None else change(value) for value in self[1:]]
         return Batch(type(self.inputs)(**moved), *labels)
+
+
+def pooled(batches: Sequence[Batch]) -> list[Batch]:
+    """The same in one piece of memory, as processes hand over piece by piece."""
+    tensors = [value for batch in batches for value in batch.tensors().values()]
+    tensors.sort(key=Tensor.element_size, reverse=True)  # which aligns them
+    parts = (value.reshape(-1).view(torch.uint8).numpy() for value in tensors)
+    piece = torch.from_numpy(np.concatenate([np.zeros(0, np.uint8), *parts]))
+    pairs = zip(tensors, torch.split(piece, [value.nbytes for value in tensors]), strict=True)
+    moved = {id(value): part.view(value.dtype).view(value.shape) for value, part in pairs}
+    return [batch._map(lambda value: moved.get(id(value), value)) for batch in batches]
 
 
 def perturbed_state(state: FloatArray, noise: FloatArray) -> FloatArray:
@@ -185,22 +190,23 @@ def way_back(speed: float, path: FloatArray) -> FloatArray:
             the B steps before now, if it is late, now, and of the 8 s after it.
     """
     path = path.copy()
-    path[:, 2] = np.unwrap(path[:, 2])
+    if np.abs(np.diff(path[:, 2])).max() > 3.0:
+        path[:, 2] = np.unwrap(path[:, 2])
     steps = np.hypot(*np.diff(path[:, :2], axis=0).T)
     lengths = np.concatenate([[0.0], np.cumsum(steps)])
     lon, lat, turn = to_frame(np.zeros(3), path[0])
     along = caught_up(lengths, np.append(steps, steps[-1]) / STEP, lon, speed)
     poses = np.column_stack([np.interp(along, lengths, column) for column in path.T])
-    outside = along - np.clip(along, 0.0, lengths[-1])  # behind the first pose, beyond the last
-    poses[:, 0] += outside * np.cos(poses[:, 2])
-    poses[:, 1] += outside * np.sin(poses[:, 2])
+    # behind the first pose, beyond the last
+    outside = along - np.minimum(np.maximum(along, 0.0), lengths[-1])
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     reach = max(NEAREST_BACK, TIME_BACK * max(speed, steps[0] / STEP))
     place = np.minimum((along - lon) / reach, 1.0)  # a cubic from the offset and its slope to 0
-    slope, left = np.clip(np.tan(turn), -1.0, 1.0), 1.0 - place
+    slope, left = min(max(np.tan(turn), -1.0), 1.0), 1.0 - place
     aside = left**2 * (lat * (1.0 + 2.0 * place) + slope * reach * place)
     change = left * (slope * (1.0 - 3.0 * place) - 6.0 * lat / reach * place)
-    poses[:, 0] -= aside * np.sin(poses[:, 2])
-    poses[:, 1] += aside * np.cos(poses[:, 2])
+    poses[:, 0] = poses[:, 0] + outside * cos - aside * sin
+    poses[:, 1] = poses[:, 1] + outside * sin + aside * cos
     poses[:, 2] += np.arctan(change)
     return poses
 
@@ -229,14 +235,6 @@ def caught_up(lengths: FloatArray, speeds: FloatArray, place: float, speed: floa
     return out
 
 
-class Future(NamedTuple):
-    """What was recorded in the 8 s after a sample. A rows of agents, the ego first."""
-
-    present: FloatArray  # (A, 3) poses now
-    poses: FloatArray  # (A, 80, 3)
-    valid: BoolArray  # (A, 80) whether there was a row
-
-
 class Moment(NamedTuple):
     """The present of a sample."""
 
@@ -254,51 +252,59 @@ class Moment(NamedTuple):
         step = self.scenario.row_step
         return slice(self.row + step, self.row + step * STEPS + 1, step)
 
-    def future(self, near: IntArray) -> Future:
-        """Of the ego from where it is now, and of some tracks."""
+    def future(self, near: IntArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Poses of the ego and of some tracks: (A, 3) now, (A, 80, 3) later; whether recorded."""
         scenario, tracks, rows = self.scenario, self.scenario.tracks, self.rows
-        poses = np.empty((1 + len(near), STEPS, 3))
+        poses = _recorded(tracks.poses, near, rows.start, rows.step)
         valid = np.ones(poses.shape[:2], np.bool_)
-        # take: indexing with two arrays is slow
-        poses[1:] = tracks.poses[rows].take(near, axis=1).swapaxes(0, 1)
         valid[1:] = tracks.valid[rows].take(near, axis=1).T
         now, poses[0] = self.observation.history.ego[-1:, :3], scenario.ego[rows, :3]
         if self.beside is not None:
             path = scenario.ego[self.beside : rows.stop : rows.step, :3]
             poses[0] = from_frame(way_back(self.state[3], to_frame(path, now[0])), now[0])
-        return Future(np.vstack([now, tracks.poses[self.row, near]]), poses, valid)
+        return np.vstack([now, tracks.poses[self.row, near]]), poses, valid
 
-    def velocities(self, near: IntArray, future: Future) -> FloatArray:
-        """(A, 80, 2) in the frame of the map [m/s], of the same."""
+    def velocities(self, near: IntArray, drive: FloatArray) -> FloatArray:
+        """(A, 80, 2) in the frame of the map [m/s], of the same; `drive` (81, 3) is the ego's."""
         ego, velocities = self.scenario.ego[self.rows], self.scenario.tracks.velocities
         cos, sin, vx, vy = np.cos(ego[:, 2]), np.sin(ego[:, 2]), ego[:, VX], ego[:, VY]
         own = np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy])
         if self.beside is not None:
-            drive = np.vstack([future.present[:1], future.poses[0]])
             own = np.diff(drive[:, :2], axis=0) / STEP
-        others = velocities[self.rows].take(near, axis=1).swapaxes(0, 1)
-        return np.concatenate([own[None], others])
+        motion: FloatArray = _recorded(velocities, near, self.rows.start, self.rows.step)
+        motion[0] = own
+        return motion
+
+
+@kernel
+def _recorded(values: FloatArray, near: IntArray, first: int, step: int) -> FloatArray:
+    """(1 + N, 80, k) of some tracks from a row on, behind a first one that is not yet known."""
+    out = np.empty((1 + len(near), STEPS, values.shape[2]))
+    for track in range(len(near)):
+        for place in range(STEPS):
+            for axis in range(values.shape[2]):
+                out[1 + track, place, axis] = values[first + place * step, near[track], axis]
+    return out
 
 
 def _plantf_sample(planner: plantf.PlanTF, read: plantf.Features, now: Moment) -> Sample | str:
     if not len(read.road.objects):
-        return _NO_ROAD
+        return "no lane or crosswalk around it"
     read.current_state[3:] = now.state[3:]
-    future = now.future(read.agents.tracks)
-    return Sample(read, targets(future.present, future.poses, future.present[0]), future.valid)
+    present, poses, valid = now.future(read.agents.tracks)
+    return Sample(read, targets(present, poses, present[0]), valid)
 
 
 def _pluto_sample(planner: pluto.Pluto, read: pluto.SceneInputs, now: Moment) -> Sample | str:
     if not read.line_valid.any():
-        return _NO_LINE
+        return "no reference line"
     read.current_state[3:] = now.state[3:]
     seen = planner.surroundings
-    near = seen.agents.tracks
-    future = now.future(near)
-    future.valid[0, steps_before_red(planner, now, future.poses[0]) :] = False
-    motion = now.velocities(near, future)
-    target = motion_targets(future.present, future.poses, motion, future.present[0])
-    return Sample(read, target, future.valid, projections(seen.lines, future.poses[0]))
+    present, poses, valid = now.future(seen.agents.tracks)
+    valid[0, steps_before_red(planner, now, poses[0]) :] = False
+    motion = now.velocities(seen.agents.tracks, np.vstack([present[:1], poses[0]]))
+    target = motion_targets(present, poses, motion, present[0])
+    return Sample(read, target, valid, projections(seen.lines, poses[0]))
 
 
 def steps_before_red(planner: pluto.Pluto, now: Moment, ego: FloatArray) -> int:
@@ -312,16 +318,14 @@ def steps_before_red(planner: pluto.Pluto, now: Moment, ego: FloatArray) -> int:
     return STEPS
 
 
-def _diffusion_sample(
-    planner: diffusion.DiffusionPlanner, read: DiffusionFeatures, now: Moment
-) -> Sample | str:
+def _diffusion_sample(planner: Any, read: DiffusionFeatures, now: Moment) -> Sample | str:
     if not len(read.edges):
-        return _NO_LANE
-    future = now.future(read.agents[:NEIGHBOURS])
-    poses = to_frame(future.poses, future.present[0])
+        return "no lane within 100 m"
+    present, poses, recorded = now.future(read.agents[:NEIGHBOURS])
+    poses = to_frame(poses, present[0])
     target = np.zeros((1 + NEIGHBOURS, STEPS, 3), np.float32)
     valid = np.zeros(target.shape[:2], np.bool_)
-    target[: len(poses)], valid[: len(poses)] = np.nan_to_num(poses), future.valid
+    target[: len(poses)], valid[: len(poses)] = np.nan_to_num(poses), recorded
     return Sample(read, target, valid)
 
 
@@ -369,7 +373,7 @@ def make_sample(
     """
     row, kind = int(scenario.iteration_rows[iteration]), KINDS[planner.name]
     if row + STEPS * scenario.row_step >= len(scenario.time_us):
-        return _SHORT
+        return "less than 8 s recorded after it"
     if driven is not None:
         return _driven_sample(planner, scenario, iteration, driven)
     observation = observe_log(scenario, iteration)
@@ -395,8 +399,6 @@ def _driven_sample(
 ) -> Sample | str:
     """Of an ego that a planner has driven near the recorded path, maybe late."""
     row, step = int(scenario.iteration_rows[iteration]), scenario.row_step
-    if row + STEPS * step >= len(scenario.time_us):
-        return _SHORT
     ego = scenario.ego[past_rows(scenario, iteration)].copy()
     states = driven[max(iteration + 1 - len(ego), 0) : iteration + 1]
     ego[len(ego) - len(states) :] = states
@@ -405,7 +407,7 @@ def _driven_sample(
     near = int(np.hypot(*(scenario.ego[before, :2] - ego[-1, :2]).T).argmin())
     ahead, aside, turn = np.abs(to_frame(ego[-1, :3], scenario.ego[before[near], :3]))
     if ahead > MOST_AHEAD or aside > MOST_ASIDE or turn > NOISE[2]:
-        return _ELSEWHERE
+        return "driven far from the recording"
     state = plantf.current_state(observation.history).astype(np.float64)
     now = Moment(scenario, row, observation, state, int(before[near]))
     return KINDS[planner.name].label(planner, planner.features(observation), now)
@@ -418,9 +420,7 @@ def _perturb(
     ego, tracks = history.ego[-1], history.tracks
     near = features.nearest_agents(tracks, center_poses(ego[:3]), NEIGHBOURS)
     boxes = tracks.poses[-1, near], tracks.sizes[-1, near]
-    return free_state(
-        state, noise, lambda pose: is_free(features.map_poses(pose, ego), *boxes), tries
-    )
+    return free_state(state, noise, lambda at: is_free(features.map_poses(at, ego), *boxes), tries)
 
 
 def free_state(

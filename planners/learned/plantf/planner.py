@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from shiftsim.geometry.boxes import wrap_angle
-from shiftsim.kernels import BoolArray
 from shiftsim.planners.learned import features
 from shiftsim.planners.learned.base import LearnedPlanner
 from shiftsim.planners.learned.map_features import LightLookup, RoadFeatures, road_features
@@ -55,8 +54,6 @@ class PlanTF(LearnedPlanner[Features, Plans]):
         self._map, self._lights = scene.map, LightLookup(scene.map)
         blocks = scene.route_blocks
         self._corrector = RouteCorrector(scene.map, blocks, START_REACH) if blocks else None
-        self._route: tuple[int, ...] = ()
-        self._on_route: BoolArray = np.zeros(len(scene.map.blocks), np.bool_)
 
     def features(self, observation: Observation) -> Features:
         """What the network reads."""
@@ -64,20 +61,14 @@ class PlanTF(LearnedPlanner[Features, Plans]):
         rear_axle = history.ego[-1, :3].copy()
         center = center_poses(rear_axle)
         route = self._corrector.at(rear_axle) if self._corrector else ()
-        if route is not self._route:
-            self._route = route
-            self._on_route[:] = False
-            self._on_route[list(route)] = True
+        on_route = np.zeros(len(self._map.blocks), np.bool_)
+        on_route[list(route)] = True
         agents = features.agent_features(history, center, MAX_AGENTS)
         lights = self._lights.at(observation.lights)
-        road = road_features(self._map, rear_axle, center, RADIUS, lights, self._on_route)
-        if not len(road.objects):
-            self._reason = _NO_LANE
-        else:
-            self._reason = (
-                features.short_history(len(history.ego)) if self._corrector else features.NO_ROUTE
-            )
-        return Features(agents, road, current_state(history), self._route)
+        road = road_features(self._map, rear_axle, center, RADIUS, lights, on_route)
+        reason = features.short_history(len(history.ego)) if self._corrector else features.NO_ROUTE
+        self._reason = reason if len(road.objects) else _NO_LANE
+        return Features(agents, road, current_state(history), route)
 
     def infer(self, scenes: Sequence[Features]) -> Sequence[Plans]:
         """Six plans per scene."""

@@ -21,6 +21,7 @@ STATIC_KINDS = (
     AgentKind.TRAFFIC_CONE,
     AgentKind.GENERIC_OBJECT,
 )  # in the order of the network's categories
+_CATEGORY = np.array([STATIC_KINDS.index(k) if k in STATIC_KINDS else -1 for k in AgentKind])
 SEEN_RADIUS = 120.0  # m, of static objects in the features
 SCORED_RADIUS = 50.0  # m, of static objects that are collided with
 
@@ -52,10 +53,7 @@ class World(NamedTuple):
 
 def static_objects(tracks: Tracks, drivable: Drivable, x: float, y: float) -> StaticObjects:
     """Static objects of the last row around the ego centre (x, y), by category."""
-    kinds = tracks.kinds
-    categories = np.full(len(kinds), -1)
-    for category, kind in enumerate(STATIC_KINDS):
-        categories[kinds == kind] = category
+    categories = _CATEGORY[tracks.kinds]
     poses, sizes = tracks.poses[-1], tracks.sizes[-1]
     here = np.flatnonzero(tracks.valid[-1] & (categories >= 0))
     distances = np.hypot(poses[here, 0] - x, poses[here, 1] - y)
