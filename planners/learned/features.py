@@ -47,7 +47,8 @@ def agent_features(history: History, center: FloatArray, max_agents: int) -> Age
 
     A history shorter than 2 s leaves its oldest samples invalid, the ego's included.
     """
-    tracks, ego = history.tracks, history.ego[-SAMPLES:]
+    tracks = history.tracks
+    ego = history.ego[-min(SAMPLES, len(tracks.valid)) :]
     nearest = nearest_agents(tracks, center, max_agents)
     cos, sin, vx, vy = np.cos(ego[:, 2]), np.sin(ego[:, 2]), ego[:, 3], ego[:, 4]
     own = np.column_stack([cos * vx - sin * vy, sin * vx + cos * vy])
