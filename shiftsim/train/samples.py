@@ -105,17 +105,6 @@ class Batch(NamedTuple):
         return Batch(type(self.inputs)(**moved), *labels)
 
 
-def pooled(batches: Sequence[Batch]) -> list[Batch]:
-    """The same in one piece of memory, as processes hand over piece by piece."""
-    tensors = [value for batch in batches for value in batch.tensors().values()]
-    tensors.sort(key=Tensor.element_size, reverse=True)  # which aligns them
-    parts = (value.reshape(-1).view(torch.uint8).numpy() for value in tensors)
-    piece = torch.from_numpy(np.concatenate([np.zeros(0, np.uint8), *parts]))
-    pairs = zip(tensors, torch.split(piece, [value.nbytes for value in tensors]), strict=True)
-    moved = {id(value): part.view(value.dtype).view(value.shape) for value, part in pairs}
-    return [batch._map(lambda value: moved.get(id(value), value)) for batch in batches]
-
-
 def perturbed_state(state: FloatArray, noise: FloatArray) -> FloatArray:
     """(7,) x, y, heading, speed, acceleration, steering angle, yaw rate moved by noise (7,)."""
     moved = state + noise

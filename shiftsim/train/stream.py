@@ -21,7 +21,7 @@ from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.runs.results import Run, open_run
 from shiftsim.runs.rollouts import Task
 from shiftsim.sim.planner import scene_info
-from shiftsim.train.samples import KINDS, STEPS, Batch, Sample, make_batch, make_sample, pooled
+from shiftsim.train.samples import KINDS, STEPS, Batch, Sample, make_batch, make_sample
 from shiftsim.world.scenario import Scenario
 
 BATCH, PER_BLOCK = 32, 64  # samples; scenarios, enough that batches differ little
@@ -89,7 +89,7 @@ class BlockMaker:
             make_batch([made[i] for i in order[first : first + size]], self._kind)
             for first in range(0, len(order), size)
         ]
-        return Block(pooled(batches), dict(failed))
+        return Block(batches, dict(failed))
 
     def _of_scenario(self, token: str, key: list[int], failed: Counter[str]) -> list[Sample]:
         """Samples of a scenario."""
