@@ -65,7 +65,7 @@ def map_unordered(
         make: Called once per worker; returns the function, whose `close` is called at the end. It,
             tasks and results must pickle, but for a single worker, this process, without a limit.
         tasks: The tasks.
-        workers: Number of worker processes, no more than tasks; 0 chooses from the cores.
+        workers: Number of worker processes; 0 chooses from the cores and the tasks.
         alone: So many leading tasks are done one by one, so that kernels are compiled once.
         limit: Time per task or part of a batch [s]; 0 for any. Loading, compiling do not count.
         in_batches: Whether tasks are tuples of several; those of a dead worker are done one by one.
@@ -74,7 +74,7 @@ def map_unordered(
     Yields an outcome per task, or per part of such a batch. ConfigError: workers cannot be started.
     """
     tasks = list(tasks)
-    workers = min(workers or default_workers(), len(tasks))
+    workers = workers or min(default_workers(), len(tasks))
     if workers <= 1 and not limit:
         function = make()
         try:
