@@ -10,6 +10,7 @@ import pytest
 from shiftsim import benchmarks
 from shiftsim.benchmarks import TRACKS, known_sets, load_track, published
 from shiftsim.benchmarks.bench import open_runs, plan_bench, run_bench
+from shiftsim.benchmarks.inventory import coverage
 from shiftsim.edits.sampling import GRADES, KINDS
 from shiftsim.errors import ConfigError
 from shiftsim.metrics import PROFILES
@@ -133,7 +134,9 @@ def test_the_finding_is_driven_at_home_and_in_foreign_towns(tmp_path, monkeypatc
     assert [listed.name for listed in plan.own] == ["finding-home", "finding-foreign"]
     done = run_bench(plan)
     assert all(run.is_complete for run in done)
-    [table] = open_runs([plan.folder]).coverage(open_runs([plan.folder]).groups())
+    opened = open_runs([plan.folder])
+    [found] = dict.fromkeys(opened.tracks)
+    table = coverage(found, opened.groups())
     assert {row[0].split(" ")[0] for row in table.rows} == {"finding-home", "finding-foreign"}
     with pytest.raises(ConfigError, match="towns of its own"):
         plan_bench(track, settings | {"store": "demo"})
