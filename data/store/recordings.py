@@ -159,55 +159,82 @@ class StoredRecording:
         row = tables.column(found, "row")
         inside = (row >= first) & (row < last)  # row groups hold more than the window
         found = found if inside.all() else found.filter(pa.array(inside))
-        light, each = _columns(found, "light")
+        if not len(found):
+            return TrafficLights.empty(last - first)
+        starts, light, each = _runs(found, "light")
         status = np.full((last - first, len(each)), LightStatus.ABSENT, np.int8)
+        light = np.repeat(light, np.diff(starts))
         status[tables.column(found, "row") - first, light] = tables.column(found, "status")
-        return TrafficLights(tuple(found["connector"].take(each).to_pylist()), status)
+        names = found["connector"].take(pa.array(each)).cast(pa.string())  # quicker to list
+        return TrafficLights(tuple(names.to_pylist()), status)
 
     def _tracks(self, first: int, last: int, choose: _Choice, validate: bool) -> Tracks:
         found = self.tracks.read(self.tracks.blocks(first, last), validate=validate)
-        row = tables.column(found, "row") - first
-        track, each = _columns(found, "track")
-        tokens: list[str] = found["token"].take(each).to_pylist()
+        if not len(found):
+            return Tracks.empty(last - first)
+        row, (starts, track, each) = tables.column(found, "row"), _runs(found, "track")
+        tokens: list[str] = found["token"].take(pa.array(each)).cast(pa.string()).to_pylist()
         kinds = tables.column(found, "kind")[each].astype(np.int64)
-        inside = (row >= 0) & (row < last - first)  # row groups hold more than the window
         valid = np.zeros((last - first, len(each)), np.bool_)
-        valid[row[inside], track[inside]] = True
+        _mark(row, first, starts, track, valid)
         order = choose(valid, kinds, tokens)
+        valid, kinds, tokens = valid.take(order, 1), kinds[order], [tokens[i] for i in order]
         place = np.full(len(each), -1)
         place[order] = np.arange(len(order))
-        track = place[track]
-        boxes = np.where(inside & (track >= 0), row * len(order) + track, -1)
-        valid, kinds, tokens = valid.take(order, 1), kinds[order], [tokens[i] for i in order]
-        poses, velocities, sizes = (np.full((*valid.shape, n), np.nan) for n in (3, 2, 2))
-        flat = tuple(values.reshape(-1, values.shape[2]) for values in (poses, velocities, sizes))
-        _place(boxes, tuple(tables.column(found, name) for name in schema.BOX), flat)
+        poses, velocities, sizes = (np.empty((*valid.shape, n)) for n in (3, 2, 2))
+        boxes = tuple(tables.column(found, name) for name in schema.BOX)
+        _fill(row, first, starts, place[track], boxes, valid, (poses, velocities, sizes))
         return Tracks(valid, poses, velocities, sizes, kinds, tuple(tokens))
 
 
 @kernel
-def _place(at: IntArray, boxes: tuple[FloatArray, ...], out: tuple[FloatArray, ...]) -> None:
-    """Write the columns of `schema.BOX` into rows `at` of the arrays of tracks; none if -1."""
+def _mark(row: IntArray, first: int, starts: IntArray, track: IntArray, valid: BoolArray) -> None:
+    """Note which of the rows `first` … of a recording have a box of each track (K,) of a run."""
+    for run in range(len(track)):
+        for box in range(starts[run], starts[run + 1]):
+            if 0 <= row[box] - first < len(valid):  # row groups hold more than the window
+                valid[row[box] - first, track[run]] = True
+
+
+@kernel
+def _fill(
+    row: IntArray,
+    first: int,
+    starts: IntArray,
+    track: IntArray,
+    boxes: tuple[FloatArray, ...],
+    valid: BoolArray,
+    out: tuple[FloatArray, ...],
+) -> None:
+    """Write the columns of `schema.BOX` into arrays of tracks; a run of track -1 is left out."""
     x, y, heading, vx, vy, length, width = boxes
     poses, velocities, sizes = out
-    for box, row in enumerate(at):
-        if row >= 0:
-            poses[row, 0], poses[row, 1], poses[row, 2] = x[box], y[box], heading[box]
-            velocities[row, 0], velocities[row, 1] = vx[box], vy[box]
-            sizes[row, 0], sizes[row, 1] = length[box], width[box]
+    for at in range(valid.shape[0]):
+        for one in range(valid.shape[1]):
+            if not valid[at, one]:
+                poses[at, one], velocities[at, one], sizes[at, one] = np.nan, np.nan, np.nan
+    for run in range(len(track)):
+        one = track[run]
+        for box in range(starts[run], starts[run + 1]):
+            at = row[box] - first
+            if one >= 0 and 0 <= at < len(valid):
+                poses[at, one, 0], poses[at, one, 1] = x[box], y[box]
+                poses[at, one, 2] = heading[box]
+                velocities[at, one, 0], velocities[at, one, 1] = vx[box], vy[box]
+                sizes[at, one, 0], sizes[at, one, 1] = length[box], width[box]
 
 
-def _columns(found: pa.Table, name: str) -> tuple[IntArray, pa.Array]:
-    """Columns in dense arrays of what A rows of a table are about, the track or light of a column.
+def _runs(found: pa.Table, name: str) -> tuple[IntArray, IntArray, IntArray]:
+    """Runs of rows of a table, one at least, about the same thing: the track or light of a column.
 
-    Returns the column (A,) of each row, in the order of the numbers, and the index (N,) of a row of
-    the table for each column. There are few runs of equal numbers, as files are written.
+    Returns where each begins, and the last one ends (K + 1,); its column (K,) in dense arrays, in
+    the order of the numbers; and the index (N,) of a row of the table for each column.
     """
     numbers = tables.column(found, name)
-    starts = np.flatnonzero(np.diff(numbers, prepend=numbers[:1] - 1))
-    _, each, place = np.unique(numbers[starts], return_index=True, return_inverse=True)
-    lengths = np.diff(starts, append=len(numbers))
-    return np.repeat(place, lengths), starts[each]
+    ends = np.flatnonzero(numbers[1:] != numbers[:-1]) + 1
+    starts = np.concatenate([[0], ends, [len(numbers)]])
+    _, each, place = np.unique(numbers[starts[:-1]], return_index=True, return_inverse=True)
+    return starts, place, starts[each]
 
 
 def _rows(table: tables.Table, first: int, last: int, validate: bool) -> pa.Table:
@@ -237,4 +264,6 @@ def ego_span(table: tables.Table) -> tuple[int, int]:
 def ego_states(table: tables.Table, first: int, last: int, *, validate: bool = True) -> FloatArray:
     """(R, 11) states of an ego over the rows first … last - 1 of the recording, or a DataError."""
     found = _rows(table, first, last, validate)
-    return np.column_stack([tables.column(found, name) for name in schema.EGO_COLUMNS])
+    (batch,) = found.select(schema.EGO_COLUMNS).combine_chunks().to_batches()
+    states: FloatArray = batch.to_tensor().to_numpy()
+    return states

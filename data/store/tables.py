@@ -185,6 +185,7 @@ class Table:
                 raise DataError(f"{column} is {kind}, not {field.type}", hint=REPAIR)
         self._names = expected.names
         self._texts = [field.name for field in expected if pa.types.is_string(field.type)]
+        self._validated: set[int] = set()  # row groups whose numbers are in their ranges
         self._full = [f.name for f in expected if found.field(f.name).nullable and not f.nullable]
         self.footer = self._read_footer()
 
@@ -230,7 +231,7 @@ class Table:
         """Rows of some row groups and columns; of all where None.
 
         Raises DataError: the file is damaged or, where `validate` is asked for, holds a number
-        outside of its range.
+        outside of its range; that is looked at once while the file is open.
         """
         groups = list(range(self._file.num_row_groups)) if blocks is None else blocks
         wanted = self._names if columns is None else columns
@@ -247,8 +248,9 @@ class Table:
             if name in wanted and (missing := found[name].null_count):
                 what = f"{missing} of {len(found)} values are missing"
                 raise DataError(f"{self.path}: column {name!r}: {what}", hint=REPAIR)
-        if validate:
+        if validate and not self._validated.issuperset(groups):
             require_ranges(found, str(self.path))
+            self._validated.update(groups if columns is None else ())
         return found
 
 

@@ -5,6 +5,7 @@ is cut into blocks of some scenarios; a worker makes whole blocks, which come in
 makes them.
 """
 
+import pickle
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -69,7 +70,6 @@ class BlockMaker:
         self._stream, self._store = stream, open_store(stream.store)
         self._kind = KINDS[stream.planner]
         self._planner = self._kind.planner.asking(lambda scenes: ())
-        self._validated: set[str] = set()  # scenarios whose numbers are in their ranges
         self._driven: dict[str, list[tuple[Run, Task]]] = {}
         for run in map(open_run, stream.driven):
             for task, place in run.rollout_places.items():
@@ -95,8 +95,7 @@ class BlockMaker:
         """Samples of a scenario."""
         made: list[Sample] = []
         try:
-            scenario = self._store.read(token, validate=token not in self._validated)
-            self._validated.add(token)
+            scenario = self._store.read(token)
             self._planner.reset(scene_info(scenario))
         except ShiftsimError as error:
             failed[type(error).__name__] += 1
@@ -146,22 +145,24 @@ def _draw(scenario: Scenario, key: list[int]) -> IntArray:
     return drawn
 
 
-class Blocks(IterableDataset[Block]):
-    """Blocks of a stream from `first` on, without end."""
+class Blocks(IterableDataset[Block | bytes]):
+    """Blocks of a stream from `first` on, without end; pickled by workers."""
 
     def __init__(self, stream: Stream, first: int) -> None:
         self.stream, self.first = stream, first
 
-    def __iter__(self) -> Iterator[Block]:
+    def __iter__(self) -> Iterator[Block | bytes]:
         """The blocks of this worker, which are every so manyth."""
         info = get_worker_info()
         make, start = BlockMaker(self.stream), self.first + (info.id if info else 0)
         for block in count(start, info.num_workers if info else 1):
-            yield make(block)
+            # to share the memory of each tensor takes longer than to make them
+            yield pickle.dumps(make(block), protocol=5) if info else make(block)
 
 
 def load_blocks(stream: Stream, first: int, workers: int) -> Iterator[Block]:
     """Blocks from `first` on in their order, made by so many processes, or by this one for 0."""
     options: dict[str, Any] = {"prefetch_factor": 2} if workers else {}
     blocks = Blocks(stream, first)
-    return iter(DataLoader(blocks, batch_size=None, num_workers=workers, **options))
+    loaded = DataLoader(blocks, batch_size=None, num_workers=workers, **options)
+    return map(pickle.loads, loaded) if workers else iter(loaded)
