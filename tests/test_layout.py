@@ -29,7 +29,7 @@ BUDGETS = {
     "data/maps": 3_620,  # goal 3_000
     "data": 5_010,  # goal 3_900
     "data/nuplan": 2_720,  # goal 2_400
-    "data/store": 2_190,  # goal 2_200
+    "data/store": 2_200,
     "data/synthetic": 2_575,  # goal 2_100
     "shiftsim/report": 3_195,  # goal 2_200
     "shiftsim/view": 2_375,  # goal 1_800

@@ -156,85 +156,74 @@ class StoredRecording:
 
     def _lights(self, first: int, last: int, validate: bool) -> TrafficLights:
         found = self.lights.read(self.lights.blocks(first, last), validate=validate)
-        row = tables.column(found, "row")
-        inside = (row >= first) & (row < last)  # row groups hold more than the window
-        found = found if inside.all() else found.filter(pa.array(inside))
         if not len(found):
             return TrafficLights.empty(last - first)
-        starts, light, each = _runs(found, "light")
-        status = np.full((last - first, len(each)), LightStatus.ABSENT, np.int8)
-        light = np.repeat(light, np.diff(starts))
-        status[tables.column(found, "row") - first, light] = tables.column(found, "status")
-        names = found["connector"].take(pa.array(each)).cast(pa.string())  # quicker to list
-        return TrafficLights(tuple(names.to_pylist()), status)
+        at, each = _rows_of(found, "light", first, last)
+        listed = (at >= 0).any(axis=0)
+        at, names = at[:, listed], _texts(found["connector"], each[listed])
+        status = np.where(at >= 0, tables.column(found, "status")[at], np.int8(LightStatus.ABSENT))
+        return TrafficLights(names, status)
 
     def _tracks(self, first: int, last: int, choose: _Choice, validate: bool) -> Tracks:
         found = self.tracks.read(self.tracks.blocks(first, last), validate=validate)
         if not len(found):
             return Tracks.empty(last - first)
-        row, (starts, track, each) = tables.column(found, "row"), _runs(found, "track")
-        tokens: list[str] = found["token"].take(pa.array(each)).cast(pa.string()).to_pylist()
+        at, each = _rows_of(found, "track", first, last)
         kinds = tables.column(found, "kind")[each].astype(np.int64)
-        valid = np.zeros((last - first, len(each)), np.bool_)
-        _mark(row, first, starts, track, valid)
-        order = choose(valid, kinds, tokens)
-        valid, kinds, tokens = valid.take(order, 1), kinds[order], [tokens[i] for i in order]
-        place = np.full(len(each), -1)
-        place[order] = np.arange(len(order))
-        poses, velocities, sizes = (np.empty((*valid.shape, n)) for n in (3, 2, 2))
+        tokens = _texts(found["token"], each)
+        order = choose(at >= 0, kinds, tokens)
+        at = at.take(order, axis=1)
+        poses, velocities, sizes = (np.empty((*at.shape, n)) for n in (3, 2, 2))
         boxes = tuple(tables.column(found, name) for name in schema.BOX)
-        _fill(row, first, starts, place[track], boxes, valid, (poses, velocities, sizes))
-        return Tracks(valid, poses, velocities, sizes, kinds, tuple(tokens))
+        _fill(at, boxes, (poses, velocities, sizes))
+        names = tuple(tokens[i] for i in order)
+        return Tracks(at >= 0, poses, velocities, sizes, kinds[order], names)
 
 
-@kernel
-def _mark(row: IntArray, first: int, starts: IntArray, track: IntArray, valid: BoolArray) -> None:
-    """Note which of the rows `first` … of a recording have a box of each track (K,) of a run."""
-    for run in range(len(track)):
-        for box in range(starts[run], starts[run + 1]):
-            if 0 <= row[box] - first < len(valid):  # row groups hold more than the window
-                valid[row[box] - first, track[run]] = True
+def _rows_of(found: pa.Table, name: str, first: int, last: int) -> tuple[IntArray, IntArray]:
+    """Rows of a table about each track, or light: a column has its number.
 
-
-@kernel
-def _fill(
-    row: IntArray,
-    first: int,
-    starts: IntArray,
-    track: IntArray,
-    boxes: tuple[FloatArray, ...],
-    valid: BoolArray,
-    out: tuple[FloatArray, ...],
-) -> None:
-    """Write the columns of `schema.BOX` into arrays of tracks; a run of track -1 is left out."""
-    x, y, heading, vx, vy, length, width = boxes
-    poses, velocities, sizes = out
-    for at in range(valid.shape[0]):
-        for one in range(valid.shape[1]):
-            if not valid[at, one]:
-                poses[at, one], velocities[at, one], sizes[at, one] = np.nan, np.nan, np.nan
-    for run in range(len(track)):
-        one = track[run]
-        for box in range(starts[run], starts[run + 1]):
-            at = row[box] - first
-            if one >= 0 and 0 <= at < len(valid):
-                poses[at, one, 0], poses[at, one, 1] = x[box], y[box]
-                poses[at, one, 2] = heading[box]
-                velocities[at, one, 0], velocities[at, one, 1] = vx[box], vy[box]
-                sizes[at, one, 0], sizes[at, one, 1] = length[box], width[box]
-
-
-def _runs(found: pa.Table, name: str) -> tuple[IntArray, IntArray, IntArray]:
-    """Runs of rows of a table, one at least, about the same thing: the track or light of a column.
-
-    Returns where each begins, and the last one ends (K + 1,); its column (K,) in dense arrays, in
-    the order of the numbers; and the index (N,) of a row of the table for each column.
+    Returns:
+        (T, N) row of the table for each row `first` … `last` - 1 of the recording, -1 where there
+        is none, by number; and any row (N,) of the table about each.
     """
     numbers = tables.column(found, name)
-    ends = np.flatnonzero(numbers[1:] != numbers[:-1]) + 1
-    starts = np.concatenate([[0], ends, [len(numbers)]])
-    _, each, place = np.unique(numbers[starts[:-1]], return_index=True, return_inverse=True)
-    return starts, place, starts[each]
+    starts = np.concatenate([[0], np.flatnonzero(numbers[1:] != numbers[:-1]) + 1])
+    _, each, place = np.unique(numbers[starts], return_index=True, return_inverse=True)
+    at = np.full((last - first, len(each)), -1)
+    _find(tables.column(found, "row"), first, np.append(starts, len(numbers)), place, at)
+    return at, starts[each]
+
+
+@kernel
+def _find(row: IntArray, first: int, starts: IntArray, place: IntArray, at: IntArray) -> None:
+    """Note the rows of a table: runs of them, from `starts` (K + 1,) on, are about `place` (K,)."""
+    for run in range(len(place)):
+        for box in range(starts[run], starts[run + 1]):
+            if 0 <= row[box] - first < len(at):  # row groups hold more than the window
+                at[row[box] - first, place[run]] = box
+
+
+@kernel
+def _fill(at: IntArray, boxes: tuple[FloatArray, ...], out: tuple[FloatArray, ...]) -> None:
+    """Write rows `at` (T, N) of the columns of `schema.BOX` into arrays of tracks; NaN if -1."""
+    x, y, heading, vx, vy, length, width = boxes
+    poses, velocities, sizes = out
+    for time in range(at.shape[0]):
+        for track in range(at.shape[1]):
+            box, place = at[time, track], (time, track)
+            if box < 0:
+                poses[place], velocities[place], sizes[place] = np.nan, np.nan, np.nan
+            else:
+                poses[time, track, 0], poses[time, track, 1] = x[box], y[box]
+                poses[time, track, 2] = heading[box]
+                velocities[time, track, 0], velocities[time, track, 1] = vx[box], vy[box]
+                sizes[time, track, 0], sizes[time, track, 1] = length[box], width[box]
+
+
+def _texts(column: pa.ChunkedArray, rows: IntArray) -> tuple[str, ...]:
+    """Some texts of a column."""
+    return tuple(column.take(pa.array(rows)).cast(pa.string()).to_pylist())  # lists quicker
 
 
 def _rows(table: tables.Table, first: int, last: int, validate: bool) -> pa.Table:
