@@ -9,10 +9,12 @@ import pickle
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from io import BytesIO
 from itertools import count
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from shiftsim.data import open_store
@@ -30,6 +32,7 @@ BATCH, PER_BLOCK = 32, 64  # samples; scenarios, enough that batches differ litt
 DRAWN = (0.4, 0.16, 0.05)
 DRIVEN = 0.4  # share of those that a planner has driven
 TURNING, STANDING = 0.35, 1.0  # rad from which it turns, m below which it stands
+ALIGNED = 64  # bytes
 
 
 class Block(NamedTuple):
@@ -145,19 +148,48 @@ def _draw(scenario: Scenario, key: list[int]) -> IntArray:
     return drawn
 
 
-class Blocks(IterableDataset[Block | bytes]):
-    """Blocks of a stream from `first` on, without end; pickled by workers."""
+class Packed(NamedTuple):
+    """A block on its way between processes: to share each tensor takes longer than to make it."""
+
+    frame: bytes  # pickled, without numbers
+    places: list[tuple[int, int]]  # of the numbers of each tensor
+    memory: torch.Tensor  # all of them, as bytes
+
+
+def pack(block: Block) -> Packed:
+    """A block with its numbers in one piece of memory, which processes share."""
+    frame, found = BytesIO(), list[pickle.PickleBuffer]()
+    pickler = pickle.Pickler(frame, 5, buffer_callback=found.append)
+    pickler.dispatch_table = {torch.Tensor: lambda one: (torch.from_numpy, (one.numpy(),))}
+    pickler.dump(block)
+    parts = [buffer.raw() for buffer in found]
+    starts = np.cumsum([0, *(-(-len(part) // ALIGNED) * ALIGNED for part in parts)]).tolist()
+    memory = torch.empty(starts.pop(), dtype=torch.uint8)
+    places = [(start, start + len(part)) for start, part in zip(starts, parts, strict=True)]
+    for (start, end), part in zip(places, parts, strict=True):
+        memory.numpy().data[start:end] = part
+    return Packed(frame.getvalue(), places, memory)
+
+
+def unpack(packed: Packed) -> Block:
+    """The block, in the memory in which it came."""
+    numbers = packed.memory.numpy().data
+    block: Block = pickle.loads(packed.frame, buffers=[numbers[a:b] for a, b in packed.places])
+    return block
+
+
+class Blocks(IterableDataset[Block | Packed]):
+    """Blocks of a stream from `first` on, without end; packed by workers."""
 
     def __init__(self, stream: Stream, first: int) -> None:
         self.stream, self.first = stream, first
 
-    def __iter__(self) -> Iterator[Block | bytes]:
+    def __iter__(self) -> Iterator[Block | Packed]:
         """The blocks of this worker, which are every so manyth."""
         info = get_worker_info()
         make, start = BlockMaker(self.stream), self.first + (info.id if info else 0)
         for block in count(start, info.num_workers if info else 1):
-            # to share the memory of each tensor takes longer than to make them
-            yield pickle.dumps(make(block), protocol=5) if info else make(block)
+            yield pack(make(block)) if info else make(block)
 
 
 def load_blocks(stream: Stream, first: int, workers: int) -> Iterator[Block]:
@@ -165,4 +197,4 @@ def load_blocks(stream: Stream, first: int, workers: int) -> Iterator[Block]:
     options: dict[str, Any] = {"prefetch_factor": 2} if workers else {}
     blocks = Blocks(stream, first)
     loaded = DataLoader(blocks, batch_size=None, num_workers=workers, **options)
-    return map(pickle.loads, loaded) if workers else iter(loaded)
+    return map(unpack, loaded) if workers else iter(loaded)

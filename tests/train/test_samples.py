@@ -1,6 +1,7 @@
 """Samples of PlanTF and PLUTO: right by hand, and the same whoever makes them."""
 
 import hashlib
+import pickle
 from dataclasses import asdict, replace
 from functools import partial
 from itertools import islice
@@ -32,7 +33,7 @@ from shiftsim.train.samples import (
     projections,
     targets,
 )
-from shiftsim.train.stream import Stream, load_blocks
+from shiftsim.train.stream import Stream, load_blocks, pack, unpack
 from shiftsim.world.state import PACIFICA, LightStatus, TrafficLights
 
 pytestmark = [pytest.mark.learned, pytest.mark.slow]
@@ -229,6 +230,21 @@ def test_batches_are_the_same_for_any_number_of_workers(stream, planner, workers
     for number in workers:
         assert digest(stream, number) == alone
     assert digest(replace(stream, seed=4), 0) != alone
+
+
+def test_a_block_is_the_same_behind_its_way_between_processes(stream):
+    block = next(load_blocks(replace(stream, planner="pluto"), 0, 0))
+    found = unpack(pack(block))
+    assert found.failed == block.failed
+    for one, other in zip(block.batches, found.batches, strict=True):
+        assert one.inputs.counts == other.inputs.counts
+        for a, b in zip(arrays_of(one), arrays_of(other), strict=True):
+            assert a.dtype == b.dtype
+            assert torch.equal(a, b)
+    valid = found.batches[0].valid
+    valid[:] = False  # who learns may write to it, and nothing else changes
+    assert torch.equal(found.batches[0].target, block.batches[0].target)
+    assert len(pickle.dumps(valid)) < valid.nbytes + 1000  # a copy of it is not one of the block
 
 
 @pytest.mark.thorough
