@@ -113,11 +113,9 @@ PRESETS = {
     "workstation": Preset(5_000_000, 10, 128, 1e-3),
     "paper": Preset(25_000_000, 25, 128, 1e-3, published=True),
 }
-COSTS = {
-    "plantf": 1.0,
-    "pluto": 1.6,
-    "diffusion-planner": 2.5,
-}  # of a sample; presets have as many as take the same time
+# of a sample; presets have as many as take the same time
+COSTS = {"plantf": 1.0, "pluto": 1.6, "diffusion-planner": 2.5}
+_FOR = Option("Whose features: plantf, pluto or diffusion-planner.", ("--for",))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,11 +156,7 @@ class FeatureSettings(BaseSettings):
     elsewhere: ClassVar = ("out", "workers", "samples")
 
     out: Path = field(metadata={"option": Option("Folder for the samples.")})
-    planner: str = field(
-        metadata={
-            "option": Option("Whose features: plantf, pluto or diffusion-planner.", ("--for",))
-        }
-    )
+    planner: str = field(metadata={"option": _FOR})
     workers: int = setting(2, "Processes that make samples; 0 for none but this one.")
     samples: int = setting(0, "Stop at so many; 0 to take every scenario once.")
 
@@ -194,17 +188,12 @@ def prepare_folder(settings: BaseSettings, store: str, *, resume: bool) -> None:
         return
     before = {"planner": "plantf"} | json.loads(place.read_text("utf-8"))  # was the only one once
     for name in sorted(now):
-        if before.get(name) != now[name]:
-            raise ConfigError(
-                f"{str(place)!r} is of a training with {name} {before.get(name)!r}, "
-                f"not {now[name]!r}",
-                hint="choose another --out",
-            )
+        if (old := before.get(name)) != now[name]:
+            what = f"{str(place)!r} is of a training with {name} {old!r}, not {now[name]!r}"
+            raise ConfigError(what, hint="choose another --out")
     if not resume:
-        raise ConfigError(
-            f"{str(settings.out)!r} holds a training already",
-            hint="go on with --resume, or choose another --out",
-        )
+        what = f"{str(settings.out)!r} holds a training already"
+        raise ConfigError(what, hint="go on with --resume, or choose another --out")
 
 
 def make_folder(path: Path) -> None:
@@ -221,9 +210,8 @@ def read_state(path: Path) -> dict[str, Any]:
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
-        raise CheckpointError(
-            f"{str(path)!r} cannot be read: {error}", hint="delete it to begin again"
-        ) from error
+        what = f"{str(path)!r} cannot be read: {error}"
+        raise CheckpointError(what, hint="delete it to begin again") from error
     return state
 
 
@@ -325,9 +313,8 @@ def write_features(settings: FeatureSettings, on_message: OnMessage) -> dict[str
     store = open_store(settings.store)
     tokens = tuple(sorted(open_split(store, settings.split)[0].tokens))
     prepare_folder(settings, store.hash, resume=True)
-    stream = Stream(
-        settings.store, tokens, settings.seed, sys.maxsize, settings.planner, as_published=True
-    )
+    which = settings.store, tokens, settings.seed, sys.maxsize, settings.planner
+    stream = Stream(*which, as_published=True)
     files: dict[str, int] = {}  # samples of each
     failed, blocks, reported = Counter[str](), None, monotonic()
     for number in count():
@@ -357,6 +344,5 @@ def write_features(settings: FeatureSettings, on_message: OnMessage) -> dict[str
 def _write_block(path: Path, block: "Block") -> None:
     """Write all samples of a block, whose only batch they are."""
     tensors = block.batches[0].tensors() if block.batches else {}
-    samples = len(block.batches[0].target) if block.batches else 0
-    made = {"samples": samples, "failed": block.failed}
+    made = {"samples": len(tensors.get("target", ())), "failed": block.failed}
     write_tensors(path, tensors, {"made": json.dumps(made)})  # several entries have no order
