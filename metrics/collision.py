@@ -20,6 +20,7 @@ from shiftsim.metrics.result import Collision, MetricPart, MetricRow, Thresholds
 from shiftsim.world.state import (
     LAST_AGENT_KIND,
     AgentKind,
+    TrackArrays,
     Tracks,
     VehicleParameters,
     center_poses,
@@ -79,22 +80,8 @@ def flat_ego(states: FloatArray, vehicle: VehicleParameters) -> Ego:
 
 def flat_tracks(tracks: Tracks) -> FlatTracks:
     """Contiguous arrays of the tracks, without a copy where they already are."""
-    return FlatTracks(
-        np.ascontiguousarray(tracks.valid),
-        np.ascontiguousarray(tracks.poses),
-        np.ascontiguousarray(tracks.velocities),
-        np.ascontiguousarray(tracks.sizes),
-        tracks.kinds > LAST_AGENT_KIND,
-    )
-
-
-def first_contacts(ego: Ego, tracks: FlatTracks) -> Contacts:
-    """When and how the ego first touches each track."""
-    # nuPlan rule 83: only the first contact with a track is classified
-    count = len(tracks.is_static)
-    out = Contacts(np.full(count, len(ego.states)), np.zeros(count, np.int64), np.zeros(count))
-    _first_contacts(ego, tracks, out)
-    return out
+    arrays = TrackArrays._make(map(np.ascontiguousarray, tracks.arrays))
+    return FlatTracks(*arrays, tracks.kinds > LAST_AGENT_KIND)
 
 
 def classify(
@@ -200,10 +187,14 @@ def collide(a: FloatArray, b: FloatArray, corners: FloatArray) -> bool:
 
 
 @kernel
-def _first_contacts(ego: Ego, tracks: FlatTracks, out: Contacts) -> None:
+def first_contacts(ego: Ego, tracks: FlatTracks) -> Contacts:
+    """When and how the ego first touches each track."""
+    # nuPlan rule 83: only the first contact with a track is classified
     box, other, scratch = np.empty(BOX_SIZE), np.empty(BOX_SIZE), np.empty((2, 4, 2))
-    valid, poses, sizes, first = tracks.valid, tracks.poses, tracks.sizes, out.first
+    valid, poses, sizes = tracks.valid, tracks.poses, tracks.sizes
     num_samples, num_tracks = valid.shape
+    first, types = np.full(num_tracks, num_samples), np.zeros(num_tracks, np.int64)
+    delta_v = np.zeros(num_tracks)
     for i in range(num_samples):
         set_box(box, ego.centers[i], ego.size[0], ego.size[1])
         for j in range(num_tracks):
@@ -221,6 +212,7 @@ def _first_contacts(ego: Ego, tracks: FlatTracks, out: Contacts) -> None:
                 w = np.hypot(tracks.velocities[i, j, 0], tracks.velocities[i, j, 1])
             # `collide` left the corners of the track
             kind = contact_type(ego.states[i], v, ego.corners[i], other[0], other[1], w, scratch[1])
-            first[j], out.types[j] = i, kind
+            first[j], types[j] = i, kind
             angle = ego.states[i, 2] - poses[i, j, 2]
-            out.delta_v[j] = 0.5 * np.sqrt(max(0.0, v * v + w * w - 2.0 * v * w * np.cos(angle)))
+            delta_v[j] = 0.5 * np.sqrt(max(0.0, v * v + w * w - 2.0 * v * w * np.cos(angle)))
+    return Contacts(first, types, delta_v)

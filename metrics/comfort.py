@@ -33,16 +33,9 @@ from shiftsim.world.state import (
 
 NAME = "ego_is_comfortable"
 MIN_SAMPLES = 4  # the yaw acceleration is a cubic fit
-_SMOOTH_WINDOW, _JERK_WINDOW, _YAW_WINDOW = 8, 15, 5  # samples
-
-
-class Filters(NamedTuple):
-    """The filters that make the signals."""
-
-    smooth: Filter
-    jerk: Filter  # first derivative
-    yaw_rate: Filter  # first derivative
-    yaw_accel: Filter  # second derivative
+_YAW_WINDOW = 5  # samples
+# samples, degree and derivative of filters: smooth, jerk, yaw rate, yaw acceleration
+_FILTERS = ((8, 2, 0), (15, 2, 1), (_YAW_WINDOW, 2, 1), (_YAW_WINDOW, 3, 2))
 
 
 class ComfortSignals(NamedTuple):
@@ -57,23 +50,17 @@ class ComfortSignals(NamedTuple):
     yaw_accel: FloatArray  # second derivative of the heading [rad/s^2]
 
 
-# What is bounded, in nuPlan's order: devkit metric name -> signal. `bounds_of` has the same order.
-BOUNDED_SIGNALS = {
-    "ego_jerk": "mag_jerk",
-    "ego_lat_acceleration": "lat_accel",
-    "ego_lon_acceleration": "lon_accel",
-    "ego_lon_jerk": "lon_jerk",
-    "ego_yaw_acceleration": "yaw_accel",
-    "ego_yaw_rate": "yaw_rate",
-}
-_UNITS = {
-    "ego_jerk": "meters_per_second_cubed",
-    "ego_lat_acceleration": "meters_per_second_squared",
-    "ego_lon_acceleration": "meters_per_second_squared",
-    "ego_lon_jerk": "meters_per_second_cubed",
-    "ego_yaw_acceleration": "radians_per_second_squared",
-    "ego_yaw_rate": "radians_per_second",
-}
+# What is bounded, in nuPlan's order: devkit metric name, signal, unit; as that of `bounds_of`.
+_BOUNDED = (
+    ("ego_jerk", "mag_jerk", "meters_per_second_cubed"),
+    ("ego_lat_acceleration", "lat_accel", "meters_per_second_squared"),
+    ("ego_lon_acceleration", "lon_accel", "meters_per_second_squared"),
+    ("ego_lon_jerk", "lon_jerk", "meters_per_second_cubed"),
+    ("ego_yaw_acceleration", "yaw_accel", "radians_per_second_squared"),
+    ("ego_yaw_rate", "yaw_rate", "radians_per_second"),
+)
+BOUNDED_SIGNALS = {metric: signal for metric, signal, _ in _BOUNDED}
+_UNITS = {metric: unit for metric, _, unit in _BOUNDED}
 
 
 def comfort_signals(time_us: IntArray, states: FloatArray) -> ComfortSignals:
@@ -215,15 +202,9 @@ def unwrap(angles: FloatArray) -> FloatArray:
     return out
 
 
-def filters_of(count: int) -> Filters:
-    """The filters of signals with so many samples."""
-    windows = (
-        (_SMOOTH_WINDOW, 2, 0),
-        (_JERK_WINDOW, 2, 1),
-        (_YAW_WINDOW, 2, 1),
-        (_YAW_WINDOW, 3, 2),
-    )
-    return Filters(*(make_filter(min(window, count), *order) for window, *order in windows))
+def filters_of(count: int) -> list[Filter]:
+    """Those of `_FILTERS`, of signals with so many samples."""
+    return [make_filter(min(window, count), *order) for window, *order in _FILTERS]
 
 
 def _filtered(values: FloatArray, how: Filter, scale: float) -> FloatArray:

@@ -22,13 +22,12 @@ from shiftsim.metrics.result import NUPLAN
 from shiftsim.planners.pdm.forecast import ring_of
 from shiftsim.planners.pdm.planner import PdmClosed
 from shiftsim.planners.pdm.rollout import roll_out
-from shiftsim.planners.pdm.scorer import AHEAD_SECONDS, TTC_STEPS, Place, meet
+from shiftsim.planners.pdm.scorer import AHEAD_SECONDS, TTC_STEPS, meet
 from shiftsim.planners.proposals import contacts, places
 from shiftsim.planners.proposals.areas import Areas, areas_of
 from shiftsim.planners.proposals.comfort import ComfortBounds, comfort
 from shiftsim.planners.proposals.tracker import DT, SCORED, STEP_US, drive_proposals
-from shiftsim.planners.routes.correction import known_blocks
-from shiftsim.sim.planner import observe_log, scene_info
+from shiftsim.sim.planner import Observation, observe_log, scene_info
 from shiftsim.world import layers, state
 from shiftsim.world.map import NONE, PerMap, VectorMap
 from shiftsim.world.scenario import Scenario
@@ -125,6 +124,7 @@ class FrameWorld:
     plan: FloatArray  # (T, 3) what PDM-Closed plans, in the frame of the map
     reference: Scores  # of that plan
     human: Scores  # of what was driven, alone and without a past
+    reach: FloatArray  # (1,) progress of the reference, less where it fails [m]
 
 
 def frame_world(scenario: Scenario, iteration: int = 0, version: str = "v2") -> FrameWorld:
@@ -144,21 +144,19 @@ def frame_world(scenario: Scenario, iteration: int = 0, version: str = "v2") -> 
     ego, time_us = scenario.ego[row].copy(), int(scenario.time_us[row])
     around = recorded_surroundings(scenario.tracks.rows(after), rules.ttc_steps)
     if version == "v2":
-        # nuPlan rule 741: what touches the ego at the beginning is not there
-        footprint = boxes_to_corners(state.center_poses(ego[:3]), np.array(SIZE[:2]))
-        others, touching = around.others, contacts.touches_boxes(footprint, around.others.boxes[0])
-        others.ignored[:] = touching & np.isfinite(others.centers[0, :, 0])
-        around = with_lights(around, scenario, after, FRAMES)
+        around = seen_by_v2(around, scenario, after, FRAMES, ego)
     ground, plan = _reference_plan(scenario, iteration, version)
-    human = to_frame(scenario.ego[after[1:9], :3], ego[:3])[None]
+    driven = to_frame(scenario.ego[after[1:9], :3], ego[:3])[None]
     poses = [sample_plans(plan[None], time_us + STEP_US * np.arange(SCORED + 1), time_us)]
-    poses.append(_poses_of(human, ego, time_us))
+    poses.append(_poses_of(driven, ego, time_us))
     states = drive_proposals(np.concatenate(poses), ego).states
     past = past_states(scenario.time_us[before], scenario.ego[before])
     pairs = (states[:1], past), (states[1:], past[:0])
-    parts = (evaluate(driven, ground, around, version, before) for driven, before in pairs)
-    scores = (total(part, version, time_us, None) for part in parts)
-    return FrameWorld(version, time_us, ego, past, ground, around, plan, *scores)
+    parts = (evaluate(each, ground, around, version, before) for each, before in pairs)
+    reference, human = (total(part, version, time_us, None) for part in parts)
+    reach = reference.progress_m * reference.multiplicative_metrics_prod
+    at = version, time_us, ego, past
+    return FrameWorld(*at, ground, around, plan, reference, human, reach)
 
 
 def score(
@@ -189,13 +187,12 @@ def score(
     if previous is not None:
         seconds = (world.time_us - previous.time_us) * 1e-6
         if not 0.0 < seconds < MAX_INTERVAL or previous.states.shape != states.shape:
-            text = f"extended comfort compares {len(plans)} plans of up to {MAX_INTERVAL} s before"
+            text = f"extended comfort compares {len(states)} plans of up to {MAX_INTERVAL} s before"
             raise ValueError(f"{text}, not {len(previous.score)} of {seconds:.3g} s before")
         differences = extended_differences(states, previous.states, seconds)
         parts["two_frame_extended_comfort"] = 1.0 * (differences <= EXTENDED_LIMITS).all(axis=1)
     human = world.human if human_filter and world.version == "v2" else None
-    reach = world.reference.progress_m * world.reference.multiplicative_metrics_prod
-    return total(parts, world.version, world.time_us, human, reach)
+    return total(parts, world.version, world.time_us, human, world.reach)
 
 
 def evaluate(
@@ -392,12 +389,17 @@ def recorded_surroundings(tracks: state.Tracks, ttc_steps: int) -> Surroundings:
     return Surroundings(others, np.arange(ttc_steps), reaches, [], np.zeros((SCORED + 1, 0), bool))
 
 
-def with_lights(on: Surroundings, scenario: Scenario, rows: IntArray, each: int) -> Surroundings:
-    """The same with the red lights of the route, known at rows that are `each` steps apart."""
-    edges, lights = scenario.map.edges, scenario.traffic_lights
-    blocks = known_blocks(scenario.map, scenario.route, scenario.token, "navsim")
-    listed = [set(lights.red(row)) for row in rows.tolist()]
-    lanes = [e for e in scenario.map.lanes_of(blocks) if any(edges.ids[e] in red for red in listed)]
+def seen_by_v2(
+    on: Surroundings, scenario: Scenario, rows: IntArray, each: int, ego: FloatArray
+) -> Surroundings:
+    """The same as v2 sees it, with the lights of rows that are `each` steps apart."""
+    # nuPlan rule 741: what touches the ego at the beginning is not there
+    others, footprint = on.others, boxes_to_corners(state.center_poses(ego[:3]), np.array(SIZE[:2]))
+    touching = contacts.touches_boxes(footprint, others.boxes[0])
+    others.ignored[:] = touching & np.isfinite(others.centers[0, :, 0])
+    edges, route = scenario.map.edges, scene_info(scenario).route_lanes
+    listed = [set(scenario.traffic_lights.red(row)) for row in rows.tolist()]
+    lanes = [e for e in route if any(edges.ids[e] in red for red in listed)]
     red = np.array([[edges.ids[e] in ids for e in lanes] for ids in listed], np.bool_)
     red = red.reshape(len(listed), len(lanes)).repeat(each, axis=0)[: each * (len(rows) - 1) + 1]
     return on._replace(connectors=[edges.shape(e) for e in lanes], red=red)
@@ -405,10 +407,8 @@ def with_lights(on: Surroundings, scenario: Scenario, rows: IntArray, each: int)
 
 def _reference_plan(scenario: Scenario, iteration: int, version: str) -> tuple[Ground, FloatArray]:
     """The map as seen from an iteration, and the poses (T, 3) that PDM-Closed plans there."""
-    planner = PdmClosed(map_radius=RADIUS)
-    planner.reset(scene_info(scenario))
-    observation = observe_log(scenario, iteration)
-    seen, paths, limit = planner.look(observation)
+    planner, observation = PdmClosed(map_radius=RADIUS), observe_log(scenario, iteration)
+    ground, (seen, paths, limit) = look_around(scenario, observation, planner)
     ego, forecast = observation.history.ego[-1].copy(), seen.forecast
     scene, targets = planner.scene_in(seen, paths, ego, limit, state.PACIFICA)
     others, numbers = forecast.others, range(len(forecast.moves), len(forecast.ignored))
@@ -416,7 +416,6 @@ def _reference_plan(scenario: Scenario, iteration: int, version: str) -> tuple[G
     steps, red = VERSIONS[version].ttc_steps, np.ones((SCORED + 1, len(lights)), np.bool_)
     reaches = (AHEAD_SECONDS + DT) * others.speeds[0]
     around = Surroundings(others, np.arange(steps) // 2, reaches, lights, red)
-    ground = ground_around(scenario.map, seen.place, state.center_poses(ego[:3]))
     # nuPlan rule 750: proposals look for leads as far as they get in 5 s, and never brake at last
     proposals = roll_out(scene, ego, targets, LEAD_HORIZON).poses[:, :, : SCORED + 1]
     poses = np.ascontiguousarray(proposals).reshape(-1, SCORED + 1, 3)
@@ -426,18 +425,20 @@ def _reference_plan(scenario: Scenario, iteration: int, version: str) -> tuple[G
     return ground, poses[np.argmax(total(parts, version, 0, None, reach).score)]
 
 
-def ground_around(road: VectorMap, place: Place, center: FloatArray) -> Ground:
-    """The map around a centre (3,); lanes and centerline are PDM-Closed's."""
-    square = layers.square_around(center[0], center[1], RADIUS)
-    parts = (road.blocks, road.intersections, road.car_parks)
-    blocks, crossings, parks = (layers.meeting(part.polygons, square) for part in parts)
-    after = len(road.blocks), len(road.blocks) + len(road.intersections)
-    drivable = [blocks[blocks < road.num_roadblocks], crossings + after[0], parks + after[1]]
+def look_around(scenario: Scenario, seen: Observation, planner: PdmClosed) -> tuple[Ground, Any]:
+    """The map around an observation, with the planner's lanes and centerline, and its `look`."""
+    planner.reset(scene_info(scenario))
+    look, road, (x, y, _) = planner.look(seen), scenario.map, seen.ego.center.tolist()
+    place, drivable = look[0].place, _drivable_areas(road)
+    first = len(road.blocks)  # of the intersections
+    near = layers.meeting(drivable.polygons, layers.square_around(x, y, RADIUS))
+    near = near[(near < road.num_roadblocks) | (near >= first)]
+    crossings = near[drivable.on_route[near]] - first
     shapes = [road.intersections.rings(index) for index in crossings.tolist()]
-    lanes, areas = place.selected[place.selected < len(road.edges)], np.concatenate(drivable)
+    lanes = place.selected[place.selected < len(road.edges)]
     line, polygons = shapely.LineString(place.centerline.xy), layers.make_polygons(shapes)
     shapely.prepare(line)
-    return Ground(place.areas, lanes, _drivable_areas(road), areas, polygons, line)
+    return Ground(place.areas, lanes, drivable, near, polygons, line), look
 
 
 @PerMap

@@ -56,37 +56,36 @@ def metric_rows(log: SimulationLog, scenario: Scenario) -> list[MetricRow]:
     along the route, or with less than 1.5 s before them, are left out.
     """
     found, driven = defaultdict[str, list[float]](list), driven_scenario(log, scenario)
-    frames = range(0, len(log.ego) - SCORED, STRIDE)
     for version, total in TOTALS.items():
         before: navsim.Scores | None = None
+        columns = {"score": total} | (SHORT if version == "v2" else {})
         ahead = round(10 * navsim.VERSIONS[version].seconds)
-        for iteration in (one for one in frames if one + ahead < len(log.ego)):
+        for iteration in range(0, len(log.ego) - ahead, STRIDE):
             try:
                 world = navsim.frame_world(driven, iteration, version)
             except (DataError, PlannerError):  # no past, no way
                 before = None
                 continue
-            plan = plan_at(log, iteration)
-            scores = {"windows": score_window(world, log, iteration)}
-            if plan is not None:
-                previous = before if version == "v2" else None
-                scores["plans"] = before = navsim.score(
-                    world, plan, human_filter=False, previous=previous
-                )
-            for mode, each in scores.items():
-                found[metric_name(mode, total)].append(float(each.score[0]))
-                for name, short in SHORT.items() if version == "v2" else ():
-                    if (values := getattr(each, name)) is not None:
-                        found[metric_name(mode, short)].append(float(values[0]))
+            states = np.ascontiguousarray(log.ego[None, iteration : iteration + SCORED + 1])
+            parts = navsim.evaluate(states, world.ground, world.around, version, world.past)
+            scores = {"windows": navsim.total(parts, version, world.time_us, None, world.reach)}
+            if (plan := plan_at(log, iteration)) is not None:
+                kept = before if version == "v2" else None
+                before = navsim.score(world, plan, human_filter=False, previous=kept)
+                scores["plans"] = before
+            for (mode, each), (name, column) in product(scores.items(), columns.items()):
+                if (values := getattr(each, name)) is not None:
+                    found[metric_name(mode, column)].append(float(values[0]))
     rows = [
         MetricRow(name, None, float(np.mean(found[name])), "score", None, None)
         for name in (metric_name(*pair) for pair in product(MODES, COLUMNS))
         if name in found
     ]
+    frames = len(range(0, len(log.ego) - SCORED, STRIDE))
     for mode in MODES:
         if scored := found.get(metric_name(mode, TOTALS["v2"])):
             name = metric_name(mode, FRAMES)
-            rows.append(MetricRow(name, None, len(scored), "count", len(frames), None))
+            rows.append(MetricRow(name, None, len(scored), "count", frames, None))
     return rows
 
 
@@ -99,7 +98,7 @@ def driven_scenario(log: SimulationLog, scenario: Scenario) -> Scenario:
     index = np.maximum(np.arange(-start, len(log.ego)), 0)
     tracks = log.tracks.rows(index)  # a copy
     tracks.valid[:start] = False
-    for values in (tracks.poses, tracks.velocities, tracks.sizes):
+    for values in tracks.arrays[1:]:
         values[:start] = np.nan
     return replace(
         scenario,
@@ -125,11 +124,3 @@ def plan_at(log: SimulationLog, iteration: int) -> FloatArray | None:
     columns = (*in_ego[:, :2].T, np.unwrap(in_ego[:, 2]))
     times = _KEPT_S[known]
     return np.stack([np.interp(_PLAN_S, times, values) for values in columns], axis=1)[None]
-
-
-def score_window(world: navsim.FrameWorld, log: SimulationLog, iteration: int) -> navsim.Scores:
-    """Scores of what was driven in the 4 s from an iteration on."""
-    states = np.ascontiguousarray(log.ego[None, iteration : iteration + SCORED + 1])
-    parts = navsim.evaluate(states, world.ground, world.around, world.version, world.past)
-    reach = world.reference.progress_m * world.reference.multiplicative_metrics_prod
-    return navsim.total(parts, world.version, world.time_us, None, reach)

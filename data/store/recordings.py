@@ -26,7 +26,7 @@ def write_recording(folder: Path, recording: Recording) -> None:
     _require(
         tracks.valid.shape == shape and tracks.kinds.shape == shape[1:], folder / tables.TRACKS
     )
-    for values, width in ((tracks.poses, 3), (tracks.velocities, 2), (tracks.sizes, 2)):
+    for values, width in zip(tracks.arrays[1:], (3, 2, 2), strict=True):
         _require(values.shape == (*shape, width), folder / tables.TRACKS)
     lights = recording.lights
     _require(lights.status.shape == (count, len(lights.connector_ids)), folder / tables.LIGHTS)
@@ -97,9 +97,7 @@ def tracks_table(tracks: Tracks, rows: slice) -> pa.Table:
     track, row = np.nonzero(part.valid.T)
     tokens = pa.array(tracks.tokens, pa.string()).take(pa.array(track))
     numbers = [
-        values[row, track, axis]
-        for values in (part.poses, part.velocities, part.sizes)
-        for axis in range(values.shape[-1])
+        values[row, track, axis] for values in part.arrays[1:] for axis in range(values.shape[-1])
     ]
     kinds = tracks.kinds[track]
     return _table(schema.TRACKS, row + rows.start, track, tokens, kinds, *numbers)

@@ -14,7 +14,7 @@ from shiftsim.planners.proposals.contacts import Obstacles, touches_boxes
 from shiftsim.planners.proposals.places import EgoBox, ego_corners
 from shiftsim.planners.proposals.tracker import STEPS
 from shiftsim.planners.routes.lead import RedLights
-from shiftsim.world.state import HEADING, LAST_AGENT_KIND, Tracks, X, Y
+from shiftsim.world.state import HEADING, LAST_AGENT_KIND, TrackArrays, Tracks, X, Y
 
 LIGHT_TOKEN = "red_light_"
 NUM_FORECASTS = STEPS // 2 + 1  # nuPlan rule 188: every other time index has a map of its own
@@ -69,30 +69,18 @@ def make_forecast(tracks: Tracks, chosen: IntArray, lights: RedLights) -> Foreca
         is_agent=np.empty(count, np.bool_),
         ignored=ignored[:count],
     )
-    forecast = Forecast(
-        others,
-        np.empty(count, np.bool_),
-        np.empty(count),
-        ignored,
-        lights.xy,
-        lights.ptr,
-        lights.bounds,
-    )
-    now = (array[-1].copy() for array in (tracks.poses, tracks.velocities, tracks.sizes))
-    _forecast(chosen, tracks.kinds.copy(), *now, forecast)
+    moves, headings = np.empty(count, np.bool_), np.empty(count)
+    known = lights.xy, lights.ptr, lights.bounds
+    forecast = Forecast(others, moves, headings, ignored, *known)
+    now = TrackArrays(*(array[-1].copy() for array in tracks.arrays))
+    _forecast(chosen, tracks.kinds.copy(), now, forecast)
     return forecast
 
 
 @kernel
-def _forecast(
-    chosen: IntArray,
-    kinds: IntArray,
-    poses: FloatArray,
-    velocities: FloatArray,
-    sizes: FloatArray,
-    out: Forecast,
-) -> None:
+def _forecast(chosen: IntArray, kinds: IntArray, now: TrackArrays, out: Forecast) -> None:
     """Fill in the boxes of all forecast maps."""
+    _, poses, velocities, sizes = now
     boxes, centers, centroids = out.others.boxes, out.others.centers, out.others.centroids
     speeds, radii, is_agent = out.others.speeds, out.others.radii, out.others.is_agent
     headings, moves, box, ring = out.headings, out.moves, np.empty((4, 2)), np.empty((4, 2))

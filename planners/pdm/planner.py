@@ -72,24 +72,6 @@ class Step(NamedTuple):
     scores: Scores  # of the driven proposals
 
 
-def plan_step(
-    ego: FloatArray,  # (11,) ego state
-    targets: FloatArray,  # (F,) target speeds, slowest first [m/s]
-    scene: Scene,  # what the proposals are rolled out in
-    place: Place,  # the map of this step
-    vehicle: VehicleParameters,
-    params: PdmParameters,
-) -> Step:
-    """Roll out, drive and score proposals, and choose."""
-    proposals = roll_out(scene, ego, targets)
-    poses = np.ascontiguousarray(proposals.poses[:, :, : SCORED + 1]).reshape(-1, SCORED + 1, 3)
-    driven = drive_proposals(poses, ego, vehicle)
-    scores = score(driven.states, place, scene.forecast.others, scene.size, params)
-    best, braked = choose(scores, ego, params)
-    plan = brake_poses(ego, vehicle) if braked else extend(proposals, scene, best)
-    return Step(plan, best, braked, proposals, driven, scores)
-
-
 def choose(scores: Scores, ego: FloatArray, params: PdmParameters) -> tuple[int, bool]:
     """Number of the best proposal, and whether the emergency brake replaces it."""
     best = int(np.argmax(scores.total))  # the first one on ties
@@ -206,9 +188,19 @@ class PdmClosed:
     def step_in(
         self, seen: Seen, paths: Paths, ego: FloatArray, limit: float, vehicle: VehicleParameters
     ) -> Step:
-        """One planning step in what an ego (11,) sees; arguments as for `scene_in`."""
+        """One planning step in what an ego (11,) sees; arguments as for `scene_in`.
+
+        Proposals are rolled out, driven and scored, and the best one is chosen.
+        """
         scene, targets = self.scene_in(seen, paths, ego, limit, vehicle)
-        return plan_step(ego, targets, scene, seen.place, vehicle, self.parameters)
+        proposals = roll_out(scene, ego, targets)
+        poses = np.ascontiguousarray(proposals.poses[:, :, : SCORED + 1])
+        driven = drive_proposals(poses.reshape(-1, SCORED + 1, 3), ego, vehicle)
+        others, params = seen.forecast.others, self.parameters
+        scores = score(driven.states, seen.place, others, scene.size, params)
+        best, braked = choose(scores, ego, params)
+        plan = brake_poses(ego, vehicle) if braked else extend(proposals, scene, best)
+        return Step(plan, best, braked, proposals, driven, scores)
 
     def scene_in(
         self, seen: Seen, paths: Paths, ego: FloatArray, limit: float, vehicle: VehicleParameters

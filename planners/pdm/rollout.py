@@ -154,10 +154,8 @@ def _roll(
         # policy does not overwrite it inherits from the one before
         lead_speed, rear = 0.0, 0.0
         for policy in range(policies[0], policies[1] + 1):
-            progress, speed = (
-                motion[number, policy, step - 1, 0],
-                motion[number, policy, step - 1, 1],
-            )
+            progress = motion[number, policy, step - 1, 0]
+            speed = motion[number, policy, step - 1, 1]
             if step % 2 == 1:
                 for column in range(3):  # nuPlan rule 193: at index 1 these are zeros
                     leads[number, policy, step, column] = leads[number, policy, step - 1, column]

@@ -140,16 +140,11 @@ def first_violations(
 ) -> FloatArray:
     """(P,) first time indices at which a proposal comes too near to one of the others, inf if none.
 
-    Each of these counts until its first contact with the ego or its projection. `rows` has the row
-    of time of each time index; as many indices are tested as have all projections in it. `reaches`
-    (N,) is how far each of the others gets from where it is within the projection [m].
+    Each of these counts until its first contact with the ego or its projection. As many indices are
+    tested as have all projections in `rows`; what is not described is as of `meet`.
     """
-    states, centers, corners, off_lane = (
-        places.states,
-        places.centers,
-        places.corners,
-        places.off_lane,
-    )
+    states, centers = places.states, places.centers
+    corners, off_lane = places.corners, places.off_lane
     others_at, boxes, centroids = others.centers, others.boxes, others.centroids
     radii, box = others.radii, np.empty((4, 2))
     radius = 0.5 * np.hypot(size.length, size.width) + SLACK

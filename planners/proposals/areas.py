@@ -33,7 +33,8 @@ def make_areas(road: VectorMap, route_lanes: list[int]) -> Areas:
     return areas._replace(on_route=np.isin(areas.lane, np.array(route_lanes)))
 
 
-def _make_unmarked(road: VectorMap) -> Areas:
+@PerMap
+def _areas_on(road: VectorMap) -> Areas:
     polygons = road.edges.polygons
     if len(road.car_parks):
         polygons = join_polygons([polygons, road.car_parks.polygons])
@@ -56,9 +57,6 @@ def areas_of(polygons: Polygons, on_route: BoolArray, lane: IntArray) -> Areas:
         runs[:, 0] = np.minimum.reduceat(np.minimum(xy, xy[before])[:, 1], starts)
         runs[:, 2:0:-1] = np.maximum.reduceat(np.maximum(xy, xy[before]), starts)
     return Areas(polygons, on_route, lane, run_ptr, runs)
-
-
-_areas_on = PerMap(_make_unmarked)
 
 
 def select_areas(road: VectorMap, x: float, y: float, half_width: float) -> IntArray:

@@ -24,16 +24,6 @@ class ComfortBounds(NamedTuple):
     yaw_rate: float = 0.95  # rad/s
 
 
-class Filters(NamedTuple):
-    """The filters that make the signals."""
-
-    smooth: Filter
-    smooth_briefly: Filter
-    slope: Filter
-    turn_rate: Filter
-    turn_accel: Filter
-
-
 class Comfort(NamedTuple):
     """Comfort of P driven proposals."""
 
@@ -50,7 +40,7 @@ def comfort(states: FloatArray, bounds: ComfortBounds) -> Comfort:
     windows = ((whole, 2, 0), (8, 2, 0), (whole, 2, 1), (5, 2, 1), (5, 3, 2))
     signals = np.empty((len(states), len(SIGNALS), whole))
     is_within = np.ones(signals.shape[:2], np.bool_)
-    filters = Filters(*(make_filter(*window) for window in windows))
+    filters = tuple(make_filter(*window) for window in windows)
     _filter_signals(states, filters, np.array(bounds, np.float64), signals, is_within)
     return Comfort(signals, is_within, np.where(np.all(is_within, axis=1), 1.0, 0.0))
 
@@ -58,13 +48,13 @@ def comfort(states: FloatArray, bounds: ComfortBounds) -> Comfort:
 @kernel
 def _filter_signals(
     states: FloatArray,
-    filters: Filters,
+    filters: tuple[Filter, ...],
     bounds: FloatArray,  # (7,) those of `ComfortBounds`
     out: FloatArray,
     is_within: BoolArray,
 ) -> None:
     """Write the signals (P, 6, 41) of states, and where they leave their bounds."""
-    count = states.shape[1]
+    count, (smooth, smooth_briefly, slope, turn_rate, turn_accel) = states.shape[1], filters
     raw, brief = np.empty((4, count)), np.empty(count)  # acceleration ahead, aside, any; heading
     for row in range(len(states)):
         turn, signals = 0.0, out[row]
@@ -75,14 +65,14 @@ def _filter_signals(
                 change = states[row, step, HEADING] - states[row, step - 1, HEADING]
                 turn -= 2.0 * np.pi * np.rint(change / (2.0 * np.pi))
             raw[3, step] = states[row, step, HEADING] + turn
-        filter_signal(raw[0], filters.smooth, 1.0, signals[0])
-        filter_signal(raw[1], filters.smooth, 1.0, signals[1])
-        filter_signal(raw[2], filters.smooth_briefly, 1.0, brief)
-        filter_signal(brief, filters.slope, DT, signals[2])
-        filter_signal(raw[0], filters.smooth_briefly, 1.0, brief)
-        filter_signal(brief, filters.slope, DT, signals[3])
-        filter_signal(raw[3], filters.turn_accel, DT * DT, signals[4])
-        filter_signal(raw[3], filters.turn_rate, DT, signals[5])
+        filter_signal(raw[0], smooth, 1.0, signals[0])
+        filter_signal(raw[1], smooth, 1.0, signals[1])
+        filter_signal(raw[2], smooth_briefly, 1.0, brief)
+        filter_signal(brief, slope, DT, signals[2])
+        filter_signal(raw[0], smooth_briefly, 1.0, brief)
+        filter_signal(brief, slope, DT, signals[3])
+        filter_signal(raw[3], turn_accel, DT * DT, signals[4])
+        filter_signal(raw[3], turn_rate, DT, signals[5])
         for number in range(len(signals)):
             high = bounds[1 + number]
             low = bounds[0] if number == 0 else -high

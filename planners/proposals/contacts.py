@@ -106,11 +106,8 @@ def first_faults(
         (P,) factors 0, 0.5 or 1, and time indices of the first collisions, inf if none.
     """
     scores, first = np.ones(len(places.states)), np.full(len(places.states), NEVER)
-    radius, centers, others_at = (
-        circle_around(places.corners[0, 0])[2],
-        places.centers,
-        others.centers,
-    )
+    radius = circle_around(places.corners[0, 0])[2]
+    centers, others_at = places.centers, others.centers
     for proposal in range(len(scores)):
         for index in near:
             reach = radius + others.radii[index] + SLACK

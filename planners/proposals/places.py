@@ -87,12 +87,8 @@ def _locate(
 ) -> None:
     """Fill in boxes, flags and speed limits."""
     polygons, run_ptr, runs, on_route = areas.polygons, areas.run_ptr, areas.runs, areas.on_route
-    xy, ring_ptr, poly_ptr, bounds = (
-        polygons.xy,
-        polygons.ring_ptr,
-        polygons.poly_ptr,
-        polygons.bounds,
-    )
+    xy, ring_ptr, poly_ptr = polygons.xy, polygons.ring_ptr, polygons.poly_ptr
+    bounds = polygons.bounds
     states, corners, centers, flags = places.states, places.corners, places.centers, places.flags
     off_lane, speed_limits = places.off_lane, places.speed_limits
     points = np.empty((5, 2))  # corners of the ego, and what decides whether it is on the route

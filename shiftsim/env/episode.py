@@ -55,7 +55,6 @@ class Episode:
 
     def __init__(self, scenario: Scenario, setting: Setting, action: np.ndarray) -> None:
         driver = _Driver()
-        self._made_of = scenario, setting
         self._rollout = Rollout(scenario, driver, setting)
         self.scenario, self.scene = scenario, driver.scene
         self.log = self._rollout.log()
@@ -65,7 +64,7 @@ class Episode:
 
     def __reduce__(self) -> Any:
         """Copies come to the same iteration: the arrays are views of one another."""
-        return _resumed, (*self._made_of, self.snapshot())
+        return _resumed, (self.scenario, self._rollout.setting, self.snapshot())
 
     def snapshot(self) -> Snapshot:
         """What another episode of the scenario can go on from."""

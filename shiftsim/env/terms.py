@@ -11,14 +11,14 @@ from shiftsim.geometry.boxes import STOPPED_SPEED, box_corners
 from shiftsim.geometry.polylines import project_on_polyline
 from shiftsim.geometry.rings import point_segment_distance
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
-from shiftsim.metrics.collision import BOX_SIZE, collide, flat_tracks, set_box
+from shiftsim.metrics.collision import BOX_SIZE, FlatTracks, collide, flat_tracks, set_box
 from shiftsim.metrics.comfort import MIN_SAMPLES, comfort_signals, within_bounds
 from shiftsim.metrics.result import NUPLAN
 from shiftsim.planners.routes.graph import deviation
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.layers import Polygons, Polylines, containing
 from shiftsim.world.map import VectorMap
-from shiftsim.world.state import HEADING, LAST_AGENT_KIND, PACIFICA, VX, VY, center_poses
+from shiftsim.world.state import HEADING, PACIFICA, VX, VY, center_poses
 
 FREE_OFFSET = 0.5  # m from the centre line that costs nothing
 MAX_OVERSPEED = NUPLAN.max_overspeed  # m/s, at which the whole term is lost
@@ -26,7 +26,6 @@ TTC_STEP, TTC_TESTS = 0.2, 4  # s; a horizon of 1 s, which itself is not tested
 TTC_STOPPED_SPEED = 5e-3  # m/s
 _PROGRESS, _LANE, _SPEED, _ON_ROUTE, _COMFORT, _TTC, _OFF_ROAD, _COLLISION, _DONE = range(9)
 _START = (0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0)  # the terms before the first step
-_LAST_AGENT = int(LAST_AGENT_KIND)
 _LENGTH, _WIDTH, _TO_CENTER = PACIFICA.length, PACIFICA.width, PACIFICA.rear_axle_to_center
 
 
@@ -66,11 +65,7 @@ class EpisodeState(NamedTuple):
     expert: FloatArray  # (T, 2) recorded centres [m]
     expert_arc: FloatArray  # (T,) arc length at each of them [m]
     ego: FloatArray  # (K, 11) states, as far as driven
-    valid: BoolArray  # (K, N)
-    poses: FloatArray  # (K, N, 3)
-    velocities: FloatArray  # (K, N, 2)
-    sizes: FloatArray  # (K, N, 2)
-    kinds: IntArray  # (N,) AgentKind codes
+    tracks: FlatTracks
     touched: BoolArray  # (N,) written: the ego has touched the track
     found: IntArray  # (16,) scratch: edges that hold a point
     boxes: FloatArray  # (2, 9) scratch
@@ -101,11 +96,7 @@ def make_state(log: SimulationLog, road: VectorMap) -> EpisodeState:
         expert=expert,
         expert_arc=np.concatenate([[0.0], np.cumsum(steps)]),
         ego=log.ego,
-        valid=tracks.valid,
-        poses=tracks.poses,
-        velocities=tracks.velocities,
-        sizes=tracks.sizes,
-        kinds=log.tracks.kinds.copy(),
+        tracks=tracks,
         touched=np.zeros(len(tracks.is_static), np.bool_),
         found=np.zeros(int(np.diff(road.edges.polygons.cell_ptr).max(initial=1)), np.int64),
         boxes=np.zeros((2, BOX_SIZE)),
@@ -204,17 +195,17 @@ def _find_contacts(episode: EpisodeState, row: int, speed: float) -> tuple[bool,
 
     Touched tracks are noted. In the horizon everybody goes straight on at constant speed.
     """
-    is_hit = is_ahead = False
+    tracks, is_hit, is_ahead = episode.tracks, False, False
     for track in range(len(episode.touched)):
-        if episode.touched[track] or not episode.valid[row, track]:
+        if episode.touched[track] or not tracks.valid[row, track]:
             continue
         state, ego, other = episode.ego[row], episode.boxes[0], episode.boxes[1]
         set_box(ego, state, _LENGTH, _WIDTH)
         ego[0] = state[0] + _TO_CENTER * ego[2]
         ego[1] = state[1] + _TO_CENTER * ego[3]
-        pose, size = episode.poses[row, track], episode.sizes[row, track]
-        velocity, other_speed = episode.velocities[row, track], 0.0
-        if episode.kinds[track] <= _LAST_AGENT:
+        pose, size = tracks.poses[row, track], tracks.sizes[row, track]
+        velocity, other_speed = tracks.velocities[row, track], 0.0
+        if not tracks.is_static[track]:
             other_speed = np.hypot(velocity[0], velocity[1])
         dx, dy = pose[0] - ego[0], pose[1] - ego[1]
         reach = ego[7] + 0.5 * (size[0] + size[1]) + TTC_STEP * TTC_TESTS * (speed + other_speed)

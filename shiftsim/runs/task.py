@@ -187,12 +187,8 @@ class TaskRunner:
         return open_loop.metric_rows(poses, scenario)
 
     def _setting(self, task: Task) -> Setting:
-        drift = self.noises[task.noise]
         return Setting(
-            noise=drift.noise,
-            perception=drift.perception,
-            localization=drift.localization,
-            latency=drift.latency,
+            noise=self.noises[task.noise],
             seed=task.seed,
             traffic=self._make_traffic(),
             controller=self.config.controller,

@@ -4,7 +4,8 @@ Metrics, results and pages are made from a log. It holds K = T - 1 samples for a
 iterations: the state reached after the last planner call is never stored.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import astuple, dataclass, fields, replace
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,8 +26,8 @@ CONTROLLERS = ("lqr", "perfect", "log-playback")
 class Setting:
     """How a scenario is driven, whichever scenario and planner it is."""
 
-    # actuation noise, by name or model; added to the command before the motion model
-    noise: str | NoiseModel = "none"
+    # actuation noise, by name or model; added to the command before the motion model; or a drift
+    noise: str | NoiseModel | Drift = "none"
     seed: int = 0  # seed of what is random, also of planners that sample
     traffic: str | Traffic = "nonreactive"  # `nonreactive`, `reactive`, or a traffic model
     # `lqr` (tracker and kinematic bicycle), `perfect` (the ego is where the plan says) or `log-
@@ -155,9 +156,7 @@ class Snapshot:
 
     def _bytes(self) -> tuple[Any, ...]:
         token, setting, *parts, plans, _ = self._content()
-        for plan in plans:
-            one = isinstance(plan, Command) and [plan.acceleration, plan.steering_rate]
-            parts += [one] if one else [plan.time_us, plan.states]
+        parts += chain(*map(astuple, plans))
         return token, setting, *(np.asarray(part).tobytes() for part in parts)
 
     def __reduce__(self) -> Any:

@@ -140,7 +140,13 @@ class Rollout:
         iteration, row = self.iteration, self._start + self.iteration
         self._seconds[iteration] = seconds
         if self.planner is not None:
-            self._note_fallback()
+            if reason := getattr(self.planner, "degraded", ""):  # by its own account
+                if self.setting.strict:
+                    raise PlannerError(
+                        f"the planner fell back at iteration {iteration}: {reason}",
+                        hint="without --strict it continues, and the step is counted as degraded",
+                    )
+                self._degraded[iteration] = True
             plan = self._checked(plan)
         if iteration + 1 == self.num_samples:
             return None
@@ -163,16 +169,6 @@ class Rollout:
         if script.termination.is_reached(self.scenario.map, x, y):
             # nuPlan rule 719: interPlan asks the planner once more where the goal is reached
             self.num_samples = self.iteration + 1
-
-    def _note_fallback(self) -> None:
-        """Note whether the plan is a fallback by the planner's own account."""
-        if reason := getattr(self.planner, "degraded", ""):
-            if self.setting.strict:
-                raise PlannerError(
-                    f"the planner fell back at iteration {self.iteration}: {reason}",
-                    hint="without --strict it continues, and the step is counted as degraded",
-                )
-            self._degraded[self.iteration] = True
 
     def _checked(self, plan: Any) -> Trajectory | Command:
         """The plan in log time; its poses are noted."""
@@ -220,18 +216,10 @@ class Rollout:
         for name in ("noise", "perception", "localization", "traffic"):
             if not isinstance(given := getattr(self.setting, name), str):
                 names[name] = type(given).__name__ if name == "traffic" else given.name
-        named = replace(self.setting, **names)
-        return Snapshot(
-            token=self.scenario.token,
-            setting=named,
-            ego=self._ego[self._start : end],
-            commands=self._commands[past],
-            planning_seconds=self._seconds[past],
-            degraded=self._degraded[past],
-            plans=tuple(self._waiting),
-            action=action,
-            scenario=self.scenario,
-        )
+        named, ego = replace(self.setting, **names), self._ego[self._start : end]
+        parts = self._commands[past], self._seconds[past], self._degraded[past]
+        waiting = tuple(self._waiting)
+        return Snapshot(self.scenario.token, named, ego, *parts, waiting, action, self.scenario)
 
     def resume(self, snapshot: Snapshot) -> None:
         """Come to where another rollout was that has been where this one is, or is fresh.

@@ -81,18 +81,16 @@ class NoiseModel:
                 f"noise kind {self.kind!r} with function {self.function!r}",
                 "give a function with kind 'custom', and only then",
             )
-        if not self.name:
-            object.__setattr__(self, "name", self._derived_name())
-
-    def _derived_name(self) -> str:
-        if self.function is not None:
-            owner = self.function
+        if self.name:
+            return
+        name = self.kind
+        if (owner := self.function) is not None:
             label = getattr(owner, "__qualname__", type(owner).__qualname__)
-            return f"{owner.__module__}:{label}"
-        if self.kind == "none":
-            return "none"
-        sigmas = f"{self.sigma_accel:g},{self.sigma_rate:g}"
-        return f"ou({sigmas},{self.theta:g})" if self.kind == "ou" else f"awgn({sigmas})"
+            name = f"{owner.__module__}:{label}"
+        elif name != "none":
+            theta = f",{self.theta:g}" if name == "ou" else ""
+            name += f"({self.sigma_accel:g},{self.sigma_rate:g}{theta})"
+        object.__setattr__(self, "name", name)
 
 
 def parse_noise(name: str) -> NoiseModel:
@@ -106,7 +104,16 @@ def parse_noise(name: str) -> NoiseModel:
         ConfigError: The name is unknown, or the custom model cannot be imported.
     """
     if ":" in name:
-        return _load_noise(name)
+        hint = "give module:attribute of a function or NoiseModel on the Python path"
+        found = load_attribute("noise", name, hint)
+        if isinstance(found, NoiseModel):
+            return found
+        if not callable(found):
+            raise ConfigError(
+                f"noise {name!r} is {type(found).__name__}, not callable",
+                "see shiftsim.sim.noise.NoiseFunction for the signature",
+            )
+        return NoiseModel("custom", function=found, name=name)
     one_of("noise", name, (*NOISE_NAMES, "module:attribute"))
     if name == "none":
         return NoiseModel()
@@ -139,7 +146,14 @@ def sample_noise(
         return np.zeros((num_steps, 2))
     accel, steering = (keyed_generator(seed, token, channel) for channel in CHANNELS)
     if model.function is not None:
-        return _checked(model, model.function(accel, steering, num_steps, dt), num_steps)
+        noise = np.asarray(model.function(accel, steering, num_steps, dt), np.float64)
+        if noise.shape != (num_steps, 2) or not np.isfinite(noise).all():
+            raise ConfigError(
+                f"noise {model.name!r} returned shape {noise.shape}, "
+                f"{int(np.count_nonzero(~np.isfinite(noise)))} values not finite",
+                f"return {num_steps} x 2 finite numbers: acceleration and steering rate",
+            )
+        return noise
     eps = np.stack([accel.standard_normal(num_steps), steering.standard_normal(num_steps)], axis=1)
     return noise_from_normals(model, eps, dt)
 
@@ -150,22 +164,14 @@ def noise_from_normals(model: NoiseModel, eps: FloatArray, dt: float = 0.1) -> F
     for column, sigma in enumerate((model.sigma_accel, model.sigma_rate)):
         if sigma == 0.0 or model.kind == "none":
             continue  # not 0 * eps, which can be -0.0
-        normals = eps[:, column]
-        is_ou = model.kind == "ou"
-        out[:, column] = (
-            ou_from_normals(normals, sigma, model.theta, dt) if is_ou else sigma * normals
-        )
+        if model.kind != "ou":
+            out[:, column] = sigma * eps[:, column]
+            continue
+        value, diffusion = 0.0, sigma * float(np.sqrt(dt))
+        for row, normal in enumerate(eps[:, column].tolist()):  # 0 at first, updated, applied
+            value = value + model.theta * (0.0 - value) * dt + diffusion * normal
+            out[row, column] = value
     return out
-
-
-def ou_from_normals(eps: FloatArray, sigma: float, theta: float, dt: float) -> FloatArray:
-    """Ornstein-Uhlenbeck process (T,) from standard normals (T,): 0 at first, updated, applied."""
-    value, diffusion = 0.0, sigma * float(np.sqrt(dt))
-    out = []
-    for normal in eps.tolist():
-        value = value + theta * (0.0 - value) * dt + diffusion * normal
-        out.append(value)
-    return np.array(out, np.float64)
 
 
 def keyed_generator(seed: int, token: str, channel: str) -> np.random.Generator:
@@ -182,27 +188,3 @@ def channel_key(seed: int, token: str, channel: str) -> bytes:
     # nuPlan rule 14: the key is the BLAKE2b digest of the three, the generator is Philox
     text = f"{int(seed)}\n{token}\n{channel}"
     return hashlib.blake2b(text.encode(), digest_size=16).digest()
-
-
-def _load_noise(name: str) -> NoiseModel:
-    hint = "give module:attribute of a function or NoiseModel on the Python path"
-    found = load_attribute("noise", name, hint)
-    if isinstance(found, NoiseModel):
-        return found
-    if not callable(found):
-        raise ConfigError(
-            f"noise {name!r} is {type(found).__name__}, not callable",
-            "see shiftsim.sim.noise.NoiseFunction for the signature",
-        )
-    return NoiseModel("custom", function=found, name=name)
-
-
-def _checked(model: NoiseModel, noise: FloatArray, num_steps: int) -> FloatArray:
-    values = np.asarray(noise, np.float64)
-    if values.shape != (num_steps, 2) or not np.isfinite(values).all():
-        raise ConfigError(
-            f"noise {model.name!r} returned shape {values.shape}, "
-            f"{int(np.count_nonzero(~np.isfinite(values)))} values not finite",
-            f"return {num_steps} x 2 finite numbers: acceleration and steering rate",
-        )
-    return values

@@ -21,28 +21,22 @@ DT = 0.1  # s, nominal time between rows
 DT_MS = 100
 LEVELS = ("low", "mid", "high")
 
-_ERRORS = {
-    "low": {"position": 0.1, "heading": radians(1.0), "velocity": 0.2, "size": 0.02},
-    "mid": {"position": 0.3, "heading": radians(3.0), "velocity": 0.5, "size": 0.05},
-    "high": {"position": 0.5, "heading": radians(5.0), "velocity": 1.0, "size": 0.1},
+_LEVELS: dict[str, dict[str, tuple[float, ...]]] = {  # fields of models at `LEVELS`, by kind
+    "perception": {
+        "position": (0.1, 0.3, 0.5),
+        "heading": (radians(1.0), radians(3.0), radians(5.0)),
+        "velocity": (0.2, 0.5, 1.0),
+        "size": (0.02, 0.05, 0.1),
+    },
+    "miss": {"missed": (0.02, 0.1, 0.2), "gap": (0.3, 0.5, 1.0)},
+    # one of 20, 10, 5 tracks in 15 s
+    "dropout": {"lost": (1 / 300, 1 / 150, 1 / 75), "lost_for": (1.0, 2.0, 4.0)},
+    "localization": {
+        "position": (0.05, 0.15, 0.3),
+        "heading": (radians(0.2), radians(0.5), radians(1.0)),
+    },
 }
-_MISSES = {
-    "low": {"missed": 0.02, "gap": 0.3},
-    "mid": {"missed": 0.1, "gap": 0.5},
-    "high": {"missed": 0.2, "gap": 1.0},
-}
-_LOSSES = {  # one of 20, 10, 5 tracks in 15 s
-    "low": {"lost": 1 / 300, "lost_for": 1.0},
-    "mid": {"lost": 1 / 150, "lost_for": 2.0},
-    "high": {"lost": 1 / 75, "lost_for": 4.0},
-}
-_POSES = {
-    "low": {"position": 0.05, "heading": radians(0.2)},
-    "mid": {"position": 0.15, "heading": radians(0.5)},
-    "high": {"position": 0.3, "heading": radians(1.0)},
-}
-_KINDS = {"perception": _ERRORS, "miss": _MISSES, "dropout": _LOSSES, "localization": _POSES}
-_AXES = (*_KINDS, "range", "latency")  # in the order of tables, behind actuation noise
+_AXES = (*_LEVELS, "range", "latency")  # in the order of tables, behind actuation noise
 _HINT = "give module:attribute of a function, NoiseModel, Perception or Localization"
 
 
@@ -204,7 +198,7 @@ def parse_drift(name: str) -> Drift:
     """
     found, kinds = Drift(), list[str]()
     for part in filter(lambda part: part != "none", name.split("+")):
-        kind, _, level = part.partition("-")
+        kind = part.partition("-")[0]
         if kind not in _AXES:
             model: Any = load_attribute("noise", part, _HINT) if ":" in part else None
             if not isinstance(model, (Perception, Localization)):
@@ -212,31 +206,27 @@ def parse_drift(name: str) -> Drift:
             kind = _axis(model)
             found = replace(found, **{kind: model})
         elif kind == "latency":
-            found = replace(found, latency=_number(part, level))
-        elif kind == "localization":
-            one_of(kind, level, LEVELS)
-            found = replace(found, localization=Localization(**_POSES[level], name=part))
+            found = replace(found, **_values(part))
         else:
-            found = replace(found, perception=_seen(found.perception, part))
+            axis = kind if kind == "localization" else "perception"
+            before = getattr(found, axis)
+            joined = part if before.name == "none" else f"{before.name}+{part}"
+            found = replace(found, **{axis: replace(before, **_values(part), name=joined)})
         kinds.append(kind)
     if len(kinds) != len(set(kinds)):
         raise ConfigError(f"drift {name!r} has two of a kind")
     return found
 
 
-def _seen(before: Perception, part: str) -> Perception:
-    """A perception with one more of its named errors."""
+def _values(part: str) -> dict[str, Any]:
+    """Fields of a model that a name stands for, such as `miss-low` or `range-60`."""
     kind, _, level = part.partition("-")
-    ranged = {"range": float(_number(part, level))} if kind == "range" else {}
-    more = ranged or _KINDS[kind][one_of(kind, level, LEVELS)]
-    name = part if before.name == "none" else f"{before.name}+{part}"
-    return replace(before, **more, name=name)
-
-
-def _number(part: str, text: str) -> int:
-    if not text.isdecimal():
+    if kind in _LEVELS:
+        number = LEVELS.index(one_of(kind, level, LEVELS))
+        return {field: values[number] for field, values in _LEVELS[kind].items()}
+    if not level.isdecimal():
         raise ConfigError(f"{part!r} has no number", hint="for example latency-200 or range-60")
-    return int(text)
+    return {kind: int(level) if kind == "latency" else float(level)}
 
 
 def _axis(model: NoiseModel | Perception | Localization) -> str:

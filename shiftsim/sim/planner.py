@@ -299,8 +299,8 @@ class ObservationBuilder:
         self, time_us: IntArray, ego: FloatArray, tracks: Tracks, lights: TrafficLights
     ) -> None:
         """Arrays of a rollout."""
-        boxes = tracks.valid, tracks.poses, tracks.velocities, tracks.sizes
-        self._arrays, self._lights = [array.view() for array in (time_us, ego, *boxes)], lights
+        self._arrays = [array.view() for array in (time_us, ego, *tracks.arrays)]
+        self._lights = lights
         for view in self._arrays:
             view.flags.writeable = not KEEPS_READ_ONLY  # once, not step by step
         self._whose = readonly(tracks.kinds), tracks.tokens

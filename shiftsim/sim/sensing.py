@@ -12,7 +12,6 @@ are drawn before the first row, and a row follows from the truth of the rows up 
 """
 
 from collections import deque
-from collections.abc import Callable
 from math import exp, sqrt
 from typing import Any, NamedTuple, TypeAlias
 
@@ -23,8 +22,7 @@ from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.sim.log import Seen
 from shiftsim.sim.noise import channel_key, keyed_generator
 from shiftsim.sim.perception import DT, DT_MS, Drift
-from shiftsim.sim.traffic.idm.scene import Row, row_of
-from shiftsim.world.state import HEADING, VX, Command, Tracks, Trajectory
+from shiftsim.world.state import HEADING, VX, Command, TrackArrays, Tracks, Trajectory
 
 FAR = 50.0  # m, beyond which detections are missed twice as often
 NEAR, PER_METRE, MOST = 0.5, 1.0 / 40.0, 3.0  # growth of errors with distance
@@ -49,7 +47,12 @@ class _Model(NamedTuple):
 
 @kernel
 def see_boxes(
-    row: int, ego: FloatArray, believed: FloatArray, model: _Model, truth: Row, seen: Row
+    row: int,
+    ego: FloatArray,
+    believed: FloatArray,
+    model: _Model,
+    truth: TrackArrays,
+    seen: TrackArrays,
 ) -> None:
     """Fill a row of what is seen, NaN so far, after those before; `ego`, `believed` are poses."""
     turn = believed[2] - ego[2]
@@ -112,18 +115,19 @@ class Sensing:
         self._rows, self._key = 0, (seed, token)
         model, place, rows = drift.perception, drift.localization, len(self._ego)
         tokens, kinds = self._tracks.tokens, self._tracks.kinds
-        errors = draws = lost = np.zeros((0, rows))
-        if model.sigmas.any():
-            errors = self._draw("boxes", lambda one, out: one.standard_normal(out=out), 6)
-        if model.missed:
-            draws = self._draw("miss", lambda one, out: one.random(out=out))
-        if model.lost:
-            lost = self._draw("dropout", lambda one, out: one.random(out=out))
-        spans = _spans(lost < model.lost * DT, max(round(model.lost_for / DT), 1), len(tokens))
-        numbers = (exp(-DT / model.tau), model.missed, DT / model.gap, model.range)
+        begins = self._draw("dropout", model.lost) < model.lost * DT
+        spans = _spans(begins, max(round(model.lost_for / DT), 1), len(tokens))
         table = np.array([span[1:] for span in spans], np.int64).reshape(-1, 3)
-        drawn = (errors.reshape(-1, rows, 6), draws, table)
-        self._model = _Model(*numbers, model.sigmas, *drawn)
+        self._model = _Model(
+            keeps=exp(-DT / model.tau),
+            missed=model.missed,
+            leaves=DT / model.gap,
+            range=model.range,
+            sigmas=model.sigmas,
+            errors=self._draw("boxes", float(model.sigmas.max()), 6),
+            draws=self._draw("miss", model.missed),
+            spans=table,
+        )
         self._shift: FloatArray | None = None
         if place.acts:
             normals = keyed_generator(seed, token, "localization").standard_normal((rows, 3))
@@ -132,28 +136,30 @@ class Sensing:
         self.ego = self._ego if self._shift is None else np.full(self._ego.shape, np.nan)
         names = tuple(f"{tokens[at]}~{n}" if n else tokens[at] for n, at, *_ in spans)
         shape = (rows, len(spans))
-        boxes = Row(np.zeros(shape, np.bool_), *(np.full((*shape, w), np.nan) for w in (3, 2, 2)))
-        self.tracks = Tracks(*boxes, kinds[table[:, 0]], names)
-        self._boxes = row_of(self._tracks, slice(None)), boxes
+        boxes = [np.full((*shape, width), np.nan) for width in (3, 2, 2)]
+        arrays = TrackArrays._make([np.zeros(shape, np.bool_), *boxes])
+        self.tracks = Tracks(*arrays, kinds[table[:, 0]], names)
 
-    def _draw(self, channel: str, draw: Callable[..., Any], *shape: int) -> FloatArray:
-        """(N, R, ...) random numbers of every track, each from a generator with a key of its own.
+    def _draw(self, channel: str, share: float, *shape: int) -> FloatArray:
+        """(N, R) uniform numbers, or (N, R, *shape) normals; (0, …) where the share is 0.
 
-        The generators are those of `keyed_generator`, without making each of them.
+        Those of a track come from its `keyed_generator`, without making each of them.
         """
-        tokens, rows = self._tracks.tokens, len(self._ego)
-        out = np.empty((len(tokens), rows, *shape))
+        tokens = self._tracks.tokens if share else ()
+        out = np.empty((len(tokens), len(self._ego), *shape))
         generator = keyed_generator(*self._key, channel)
-        state = generator.bit_generator.state
+        draw: Any = generator.standard_normal if shape else generator.random
+        state: Any = generator.bit_generator.state
         for number, track in enumerate(tokens):
             key = channel_key(*self._key, f"{channel}\n{track}")
             state["state"]["key"] = np.frombuffer(key, "<u8")
             generator.bit_generator.state = state
-            draw(generator, out[number])
+            draw(out=out[number])
         return out
 
     def see(self, row: int) -> None:
         """Make what is seen of the rows up to one, whose truth is there."""
+        given = self._model, self._tracks.arrays, self.tracks.arrays
         for one in range(self._rows, row + 1):
             pose = believed = self._ego[one, :3]
             if self._shift is not None:
@@ -161,7 +167,7 @@ class Sensing:
                 believed = self.ego[one, :3]
                 believed += self._shift[one]
                 believed[HEADING] = wrap_angles(believed[HEADING])
-            see_boxes(one, pose, believed, self._model, *self._boxes)
+            see_boxes(one, pose, believed, *given)
         self._rows = max(self._rows, row + 1)
 
     def to_truth(self, plan: Plan, row: int) -> Plan:
@@ -195,10 +201,7 @@ def _spans(begins: BoolArray, length: int, count: int) -> list[tuple[int, ...]]:
 
 
 def ar1(normals: FloatArray, tau: float) -> FloatArray:
-    """Stationary AR(1) process (R, ...) of deviation 1 that standard normals make, in place.
-
-    Its autocorrelation decays to 1/e in `tau` [s].
-    """
+    """Stationary AR(1) process (R, ...) of deviation 1 and time `tau` [s], in place of normals."""
     keeps = exp(-DT / tau)
     normals[1:] *= sqrt(1.0 - keeps * keeps)
     for row in range(1, len(normals)):
@@ -222,10 +225,7 @@ def first_plans(milliseconds: int, past: FloatArray, now_us: int) -> deque[Plan]
 
 
 def exchange(waiting: deque[Plan], plan: Plan, next_us: int) -> Plan:
-    """The plan that is followed until `next_us`, of those under way, as this one is made.
-
-    One that ends before goes on as it ends.
-    """
+    """The plan that is followed until `next_us`, as this one is made; it goes on as it ends."""
     waiting.append(plan)
     plan = waiting.popleft()
     if isinstance(plan, Command) or plan.time_us[-1] >= next_us:

@@ -116,12 +116,11 @@ def _with_vehicle(tracks: Tracks, pose: np.ndarray) -> Tracks:
     """The same tracks and a vehicle like the ego that stands with its rear end at a pose (3,)."""
     center = from_frame(np.array([0.5 * PACIFICA.length, 0.0, 0.0]), pose)
     new = (True, center, np.zeros(2), [PACIFICA.length, PACIFICA.width])
-    old = (tracks.valid, tracks.poses, tracks.velocities, tracks.sizes)
 
     def wider(array: np.ndarray, value: Any) -> np.ndarray:
         column = np.full((len(array), 1, *array.shape[2:]), value, array.dtype)
         return np.concatenate([array, column], axis=1)
 
-    valid, poses, velocities, sizes = map(wider, old, new)
+    valid, poses, velocities, sizes = map(wider, tracks.arrays, new)
     kinds = np.append(tracks.kinds, AgentKind.VEHICLE)
     return Tracks(valid, poses, velocities, sizes, kinds, (*tracks.tokens, "obstacle"))

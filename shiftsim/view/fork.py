@@ -6,17 +6,18 @@ driver who brakes on the path of the rollout, in the same traffic and with the s
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from shiftsim.edits.sampling import HARDEST
 from shiftsim.errors import ConfigError
+from shiftsim.kernels import FloatArray
+from shiftsim.metrics.result import Collision
 from shiftsim.planners.pdm.planner import PdmClosed
 from shiftsim.planners.registry import load_planner
 from shiftsim.report.words import COLLISIONS
 from shiftsim.runs.avoidable import REACTION_US, Braking, at_fault
-from shiftsim.sim.log import SimulationLog
+from shiftsim.sim.log import Setting, SimulationLog
 from shiftsim.sim.loop import Rollout
 from shiftsim.sim.noise import NoiseModel
 from shiftsim.sim.planner import Planner
@@ -39,61 +40,46 @@ def find_fork(scenario: Scenario, item: ShownRollout, manifest: Mapping[str, Any
     first = next((row for row in item.metrics if row["metric"] == COLLISIONS), None)
     if first is None or first["first_violation_iteration"] is None:
         return None
-    planners = {
-        name: partial(load_planner, made["planner"], made["arguments"])
-        for name, made in made_with["planners"].items()
-    }
-    iteration = first["first_violation_iteration"]
-    return _Search(scenario, item.log, item.seed, made_with["traffic"], iteration).fork(planners)
+    log, hit_at = item.log, first["first_violation_iteration"]
+    braking = partial(Braking, scenario, HARDEST, driven=(log.time_us, log.ego))
+    planners: dict[str, Callable[[], Planner]] = {BRAKING: braking}
+    for name, made in made_with["planners"].items():
+        planners[name] = partial(load_planner, made["planner"], made["arguments"])
+    planners.setdefault(PDM, PdmClosed)
+    noise = NoiseModel("custom", function=lambda *_: log.noise, name="as driven")
+    setting = Setting(noise, item.seed, made_with["traffic"])
+
+    def branch(name: str, start: int) -> Branch:
+        rollout = Rollout(scenario, planners[name](), setting)
+        rollout.resume(log.snapshot(start, setting))
+        return Branch(name, *_drive(rollout, log, hit_at + _AFTER))
+
+    def can_avoid(start: int) -> bool:
+        return any(branch(name, start).hit is None for name in (BRAKING, PDM))
+
+    least = max(hit_at - _BACK, 0)
+    for start in range(hit_at - 1, least - 1, -_STRIDE):
+        if can_avoid(start):
+            later = range(min(start + _STRIDE, hit_at) - 1, start, -1)
+            start = next(filter(can_avoid, later), start)
+            return Fork(start, tuple(branch(name, start) for name in planners))
+    return Fork(least, ())
 
 
-@dataclass(frozen=True)
-class _Search:
-    """A rollout that collides at fault, and what could be driven in its place."""
-
-    scenario: Scenario
-    log: SimulationLog  # the rollout
-    seed: int
-    traffic: str
-    iteration: int  # at which it collides
-
-    def fork(self, planners: Mapping[str, Callable[[], Planner]]) -> Fork:
-        """The last moment within five seconds at which the collision is avoided, and branches."""
-        makers = {BRAKING: self._braking, **planners}
-        makers.setdefault(PDM, PdmClosed)
-
-        def branch(name: str, start: int) -> Branch:
-            return self._branch(name, start, makers[name]())
-
-        def can_avoid(start: int) -> bool:
-            return any(branch(name, start).hit is None for name in (BRAKING, PDM))
-
-        least = max(self.iteration - _BACK, 0)
-        for start in range(self.iteration - 1, least - 1, -_STRIDE):
-            if can_avoid(start):
-                later = range(min(start + _STRIDE, self.iteration) - 1, start, -1)
-                start = next(filter(can_avoid, later), start)
-                return Fork(start, tuple(branch(name, start) for name in makers))
-        return Fork(least, ())
-
-    def _braking(self) -> Planner:
-        return Braking(self.scenario, HARDEST, driven=(self.log.time_us, self.log.ego))
-
-    def _branch(self, name: str, start: int, planner: Planner) -> Branch:
-        """What a planner drives from an iteration on, to the first collision at fault."""
-        noise = NoiseModel("custom", function=lambda *_: self.log.noise, name="as driven")
-        rollout = Rollout(self.scenario, planner, noise=noise, seed=self.seed, traffic=self.traffic)
-        rollout.resume(self.log.snapshot(start, rollout.setting))
-        stop = min(self.iteration + _AFTER, rollout.num_samples - 1)
-        # commands are repeated for as long as it takes to react
-        acts = start + (_REACTION if isinstance(planner, Braking) else 0)
-        while rollout.iteration < stop and not rollout.done:
-            plan = planner.plan(rollout.observe())
-            if rollout.iteration < min(acts, len(self.log.commands) - 1):
-                plan = Command(*self.log.commands[rollout.iteration].tolist())
-            rollout.advance(plan)
-        log = rollout.log()
-        hits = at_fault(log, rollout.iteration + 1)
-        hit = next((one for one in hits if one.iteration > start), None)
-        end = hit.iteration if hit else rollout.iteration
-        return Branch(name, log.ego[start : end + 1, :3], hit)
+def _drive(rollout: Rollout, log: SimulationLog, stop: int) -> tuple[FloatArray, Collision | None]:
+    """What is driven from where a log was on, to the first collision at fault, and that."""
+    planner, start = rollout.planner, rollout.iteration
+    assert planner is not None
+    stop = min(stop, rollout.num_samples - 1)
+    # commands are repeated for as long as it takes to react
+    acts = start + (_REACTION if isinstance(planner, Braking) else 0)
+    while rollout.iteration < stop and not rollout.done:
+        plan = planner.plan(rollout.observe())
+        if rollout.iteration < min(acts, len(log.commands) - 1):
+            plan = Command(*log.commands[rollout.iteration].tolist())
+        rollout.advance(plan)
+    driven = rollout.log()
+    found = at_fault(driven, rollout.iteration + 1)
+    hit = next((one for one in found if one.iteration > start), None)
+    end = hit.iteration if hit else rollout.iteration
+    return driven.ego[start : end + 1, :3], hit

@@ -7,6 +7,7 @@ the rear axle, a track's pose is the centre of its box.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -75,6 +76,15 @@ class LightStatus(IntEnum):
     UNKNOWN = 3
 
 
+class TrackArrays(NamedTuple):
+    """The arrays of `Tracks` over its rows, as kernels take them; or one row of each."""
+
+    valid: BoolArray
+    poses: FloatArray
+    velocities: FloatArray
+    sizes: FloatArray
+
+
 @dataclass(frozen=True, slots=True)
 class Tracks:
     """Everything that moves or stands except the ego, over a span of time.
@@ -119,11 +129,14 @@ class Tracks:
         """Number of tracks, present or not."""
         return len(self.tokens)
 
+    @property
+    def arrays(self) -> TrackArrays:
+        """The four arrays over the rows."""
+        return TrackArrays(self.valid, self.poses, self.velocities, self.sizes)
+
     def _with(self, change: Callable[[np.ndarray], np.ndarray]) -> "Tracks":
         """The same tracks, all arrays over the rows changed."""
-        arrays = (self.valid, self.poses, self.velocities, self.sizes)
-        valid, poses, velocities, sizes = map(change, arrays)
-        return Tracks(valid, poses, velocities, sizes, self.kinds, self.tokens)
+        return Tracks(*TrackArrays._make(map(change, self.arrays)), self.kinds, self.tokens)
 
     def rows(self, index: slice | IntArray) -> "Tracks":
         """The same tracks over other rows: a view for a slice, a copy for an index array."""

@@ -14,46 +14,33 @@ from typing import Any
 import numpy as np
 
 from shiftsim.errors import ConfigError, DataError, ShiftsimError
-from shiftsim.geometry.boxes import boxes_to_corners, from_frame, wrap_angle
-from shiftsim.kernels import FloatArray, IntArray, kernel
+from shiftsim.geometry.boxes import boxes_to_corners, from_frame
+from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.metrics import navsim
 from shiftsim.planners.basic import ConstantVelocity
 from shiftsim.planners.pdm.planner import PdmClosed
 from shiftsim.planners.pdm.scorer import TTC_STEPS
 from shiftsim.planners.proposals import contacts
 from shiftsim.planners.registry import load_planner
-from shiftsim.sim.dynamics.bicycle import step_bicycle, step_seconds
+from shiftsim.sim.dynamics.bicycle import command_and_step
 from shiftsim.sim.dynamics.lqr import (
     MIN_POSES,
     NOT_COVERED,
     NUPLAN,
     TOO_SHORT,
     TRACKED,
-    LqrParameters,
-    Reference,
+    aim,
     command,
     fit_profiles,
     num_resampled,
-    profile_at,
     raise_for_status,
 )
 from shiftsim.sim.dynamics.perfect import interpolate
 from shiftsim.sim.log import Setting, Snapshot
 from shiftsim.sim.loop import Rollout, simulate_together
-from shiftsim.sim.planner import BatchPlanner, Planner, scene_info
+from shiftsim.sim.planner import BatchPlanner, Planner
 from shiftsim.sim.traffic import traffic_name
-from shiftsim.world.state import (
-    HEADING,
-    LAST_AGENT_KIND,
-    NUM_STATE,
-    PACIFICA,
-    Command,
-    Tracks,
-    Trajectory,
-    X,
-    Y,
-    center_poses,
-)
+from shiftsim.world.state import LAST_AGENT_KIND, NUM_STATE, Command, Tracks, Trajectory
 
 _PAST = 15  # states before the present that comfort looks back on
 _TTC = TTC_STEPS[-1]  # steps that the time to collision looks ahead
@@ -139,13 +126,13 @@ def branch(
         ```
     """
     plans = np.asarray(plans, np.float64)
+    rest = (steps, spacing, follow, planner)
     if isinstance(snapshot, Snapshot):
-        return _Start(snapshot, store, setting).branch(plans, steps, spacing, follow, planner)
+        return _branch(_start(snapshot, store, setting), snapshot, plans, *rest)
     if len(plans) != len(snapshot) or not len(plans):
         raise ConfigError(f"{len(snapshot)} snapshots, and plans for {len(plans)} of them")
-    starts = (_Start(one, store, setting) for one in snapshot)
-    pairs = zip(starts, plans, strict=True)
-    found = [one.branch(own, steps, spacing, follow, planner) for one, own in pairs]
+    pairs = zip(snapshot, plans, strict=True)
+    found = [_branch(_start(one, store, setting), one, own, *rest) for one, own in pairs]
     return Branches(
         states=np.stack([one.states for one in found]),
         parts={name: np.stack([one.parts[name] for one in found]) for name in PARTS},
@@ -154,160 +141,144 @@ def branch(
     )
 
 
-class _Start:
-    """Where branches begin: the rollout that has come there."""
-
-    def __init__(self, snapshot: Snapshot, store: Any, setting: Setting | None) -> None:
-        scenario = snapshot.scenario
-        if scenario is None:
-            if store is None:
-                raise DataError(
-                    f"{snapshot!r} is from another process, without its scenario",
-                    hint="give the store that has it: store=shiftsim.open_store(NAME)",
-                )
-            scenario = store.read(snapshot.token)
-        self.snapshot, self.scenario = snapshot, scenario
-        self.setting = setting or snapshot.setting
-        if self.setting.controller != "lqr":
-            raise ConfigError(f"branches need the controller 'lqr', not {self.setting.controller}")
-        self.rollout = Rollout(scenario, ConstantVelocity(), self.setting).fork()
-        self.rollout.resume(snapshot)
-        # whether the others do the same whatever the ego does
-        named, script = self.setting.traffic, scenario.script
-        is_replayed = isinstance(named, str) and traffic_name(named) == "nonreactive"
-        self.is_replayed = is_replayed and not (script is not None and script.has_pedestrians)
-
-    def branch(
-        self,
-        plans: FloatArray,
-        steps: int,
-        spacing: float,
-        follow: int | None,
-        planner: str | Planner,
-    ) -> Branches:
-        """All branches of one snapshot; arguments as of `branch`."""
-        follow = steps if follow is None or not planner else min(follow, steps)
-        self._require(plans, steps, spacing, follow)
-        log, now = self.rollout.log(), self.snapshot.iteration
-        ego = self.snapshot.ego[-1]
-        plan_us = log.time_us[now] + np.rint(1e6 * spacing * np.arange(plans.shape[1] + 1))
-        states = np.zeros((len(plans), plans.shape[1] + 1, NUM_STATE))
-        states[:, 0, :3], states[:, 1:, :3] = ego[:3], from_frame(plans, ego[:3])
-        commands = np.empty((len(plans), follow, 2))
-        driven = np.empty((len(plans), follow + 1, NUM_STATE))
-        driven[:, 0] = ego
-        times = log.time_us[now : now + follow + 1], plan_us.astype(np.int64)
-        if late := min(len(self.snapshot.plans), follow):  # what all do before their plans arrive
-            before = self.rollout.fork()
-            for _ in range(late):
-                before.advance(Command(0.0, 0.0))  # is not followed any more
-            driven[:, : late + 1] = before.log().ego[now : now + late + 1]
-            commands[:, :late] = before.log().commands[now : now + late]
-        noise = log.noise[now : now + follow]
-        status = follow_plans(*times, states, late, noise, NUPLAN, driven, commands)
-        raise_for_status(int(status), int(times[0][0]), times[1])
-        if self.is_replayed and follow == steps:
-            return self._rated(driven, [], np.full(len(plans), "", object))
-        waiting = [
-            (*self.snapshot.plans[follow:], *[Trajectory(times[1], plan)] * late) for plan in states
-        ]
-        forks, errors = self._forks(driven[:, 1:], commands, waiting)
-        if follow < steps:
-            self._drive_on(forks, errors, planner, steps - follow)
-        out = np.full((len(plans), steps + 1, NUM_STATE), np.nan)
-        for number, fork in enumerate(forks):
-            states = fork.log().ego[now : now + steps + 1]
-            out[number, : len(states)] = states
-            if len(states) <= steps and not errors[number]:
-                errors[number] = "the scenario has ended"
-        return self._rated(out, forks, errors)
-
-    def _require(self, plans: FloatArray, steps: int, spacing: float, follow: int) -> None:
-        left = self.rollout.num_samples - 1 - self.snapshot.iteration
-        if not 1 <= steps <= left or not follow:
-            raise DataError(f"{steps} steps, {follow} by plan: {self.snapshot!r} has {left} left")
-        if plans.ndim != 3 or plans.shape[2] != 3 or not plans.size or not np.isfinite(plans).all():
-            raise ConfigError(f"plans must be finite and (K, H, 3), not {plans.shape}")
-        if round(10 * spacing * plans.shape[1]) < follow:
-            raise ConfigError(
-                f"plans of {spacing * plans.shape[1]:g} s are too short for {follow} steps",
-                hint="drive fewer steps, or let a planner go on: follow=…, planner=…",
-            )
-
-    def _forks(
-        self, driven: FloatArray, commands: FloatArray, waiting: Sequence[Any]
-    ) -> tuple[list[Rollout], np.ndarray]:
-        """A rollout of each branch, in which the others have seen what it drove."""
-        forks, errors, before = [], np.full(len(driven), "", object), self.snapshot
-        for number, (states, sent) in enumerate(zip(driven, commands, strict=True)):
-            fork = self.rollout.fork()
-            more = replace(
-                before,
-                ego=np.concatenate([before.ego, states]),
-                commands=np.concatenate([before.commands, sent]),
-                planning_seconds=np.append(before.planning_seconds, np.zeros(len(sent))),
-                degraded=np.append(before.degraded, np.zeros(len(sent), np.bool_)),
-                plans=waiting[number],
-            )
-            try:
-                fork.resume(more)
-            except ShiftsimError as error:
-                errors[number] = error.message
-            forks.append(fork)
-        return forks, errors
-
-    def _drive_on(
-        self, forks: list[Rollout], errors: np.ndarray, planner: str | Planner, steps: int
-    ) -> None:
-        """Let planners drive the branches that are under way; those of one network together."""
-        one: Any = load_planner(planner) if isinstance(planner, str) else planner
-        active = [number for number, error in enumerate(errors) if not error]
-        for number in active:
-            own = one.fork() if isinstance(one, BatchPlanner) else deepcopy(one)
-            forks[number].drive_by(own)
-        ended = simulate_together([forks[number] for number in active], steps)
-        for number, result in zip(active, ended, strict=True):
-            if isinstance(result, Exception):
-                errors[number] = str(result)
-
-    def _rated(self, driven: FloatArray, worlds: list[Rollout], errors: np.ndarray) -> Branches:
-        """Parts of all branches, in one world each, or in the recorded one."""
-        now, count = self.snapshot.iteration, driven.shape[1]
-        observation, road = self.rollout.observe(), self.scenario.map
-        planner = PdmClosed(map_radius=navsim.RADIUS, lateral_offsets=())
-        planner.reset(scene_info(self.scenario))
-        place = planner.look(observation)[0].place
-        ground = navsim.ground_around(road, place, observation.ego.center)
-        ego, lights = observation.history.ego, self.scenario.iteration_rows[now : now + count]
-        # beyond what was driven only a recording is known
-        known = slice(now, now + count + (_TTC if self.is_replayed else 0))
-        around = [_around(one.log().tracks.rows(known), ego[-1]) for one in (self.rollout, *worlds)]
-        lit = navsim.with_lights(around[0], self.scenario, lights, 1)
-        parts = {name: np.full(len(driven), np.nan) for name in PARTS}
-        first = {name: np.full(len(driven), np.nan) for name in FIRST}
-        good = np.flatnonzero(errors == "")
-        if len(good):
-            past = np.ascontiguousarray(ego[-1 - _PAST : -1])
-            own = tuple(around[1 + number] for number in good if worlds)
-            found = navsim.evaluate(driven[good], ground, lit, "v2", past, own)
-            for name, column in parts.items():
-                column[good] = found[name]
-            for name, column in first.items():
-                column[good] = found[FIRST[name]]
-        driven[errors != ""] = np.nan
-        return Branches(states=driven, parts=parts, first=first, errors=errors)
+def _start(snapshot: Snapshot, store: Any, setting: Setting | None) -> Rollout:
+    """The rollout that has come to a snapshot, without a planner."""
+    if snapshot.scenario is None and store is None:
+        raise DataError(
+            f"{snapshot!r} is from another process, without its scenario",
+            hint="give the store that has it: store=shiftsim.open_store(NAME)",
+        )
+    setting = setting or snapshot.setting
+    if setting.controller != "lqr":
+        raise ConfigError(f"branches need the controller 'lqr', not {setting.controller}")
+    scenario = snapshot.scenario or store.read(snapshot.token)
+    rollout = Rollout(scenario, ConstantVelocity(), setting).fork()
+    rollout.resume(snapshot)
+    return rollout
 
 
-def _around(tracks: Tracks, ego: FloatArray) -> navsim.Surroundings:
-    """The others at times 0.1 s apart, without lights; what the ego touches at first is ignored."""
+def _branch(
+    rollout: Rollout,
+    snapshot: Snapshot,
+    plans: FloatArray,
+    steps: int,
+    spacing: float,
+    follow: int | None,
+    planner: str | Planner,
+) -> Branches:
+    """All branches of one snapshot, to which a rollout has come; arguments as of `branch`."""
+    follow = steps if follow is None or not planner else min(follow, steps)
+    log, now, ego = rollout.log(), snapshot.iteration, snapshot.ego[-1]
+    left = rollout.num_samples - 1 - now
+    if not 1 <= steps <= left or not follow:
+        raise DataError(f"{steps} steps, {follow} by plan: {snapshot!r} has {left} left")
+    if plans.ndim != 3 or plans.shape[2] != 3 or not plans.size or not np.isfinite(plans).all():
+        raise ConfigError(f"plans must be finite and (K, H, 3), not {plans.shape}")
+    if round(10 * spacing * plans.shape[1]) < follow:
+        raise ConfigError(
+            f"plans of {spacing * plans.shape[1]:g} s are too short for {follow} steps",
+            hint="drive fewer steps, or let a planner go on: follow=…, planner=…",
+        )
+    plan_us = log.time_us[now] + np.rint(1e6 * spacing * np.arange(plans.shape[1] + 1))
+    times = log.time_us[now : now + follow + 1], plan_us.astype(np.int64)
+    states = np.zeros((len(plans), plans.shape[1] + 1, NUM_STATE))
+    states[:, 0, :3], states[:, 1:, :3] = ego[:3], from_frame(plans, ego[:3])
+    commands = np.empty((len(plans), follow, 2))
+    driven = np.empty((len(plans), follow + 1, NUM_STATE))
+    driven[:, 0] = ego
+    if late := min(len(snapshot.plans), follow):  # what all do before their plans arrive
+        before = rollout.fork()
+        for _ in range(late):
+            before.advance(Command(0.0, 0.0))  # is not followed any more
+        driven[:, : late + 1] = before.log().ego[now : now + late + 1]
+        commands[:, :late] = before.log().commands[now : now + late]
+    noise = log.noise[now : now + follow]
+    status = follow_plans(*times, states, late, noise, driven, commands)
+    raise_for_status(int(status), int(times[0][0]), times[1])
+    # whether the others do the same whatever the ego does
+    named, script = rollout.setting.traffic, rollout.scenario.script
+    is_replayed = isinstance(named, str) and traffic_name(named) == "nonreactive"
+    is_replayed = is_replayed and not (script is not None and script.has_pedestrians)
+    forks, errors = list[Rollout](), np.full(len(plans), "", object)
+    if is_replayed and follow == steps:
+        return _rated(rollout, driven, forks, errors, is_replayed)
+    for number, (one, sent) in enumerate(zip(driven, commands, strict=True)):
+        forks.append(rollout.fork())
+        under_way = (*snapshot.plans[follow:], *[Trajectory(times[1], states[number])] * late)
+        more = replace(
+            snapshot,
+            ego=np.concatenate([snapshot.ego, one[1:]]),
+            commands=np.concatenate([snapshot.commands, sent]),
+            planning_seconds=np.zeros(now + follow),
+            degraded=np.zeros(now + follow, np.bool_),
+            plans=under_way,
+        )
+        try:
+            forks[-1].resume(more)  # the others see what it drove
+        except ShiftsimError as error:
+            errors[number] = error.message
+    if follow < steps:
+        _drive_on(forks, errors, planner, steps - follow)
+    out = np.full((len(plans), steps + 1, NUM_STATE), np.nan)
+    for number, fork in enumerate(forks):
+        reached = fork.log().ego[now : now + steps + 1]
+        out[number, : len(reached)] = reached
+        if len(reached) <= steps and not errors[number]:
+            errors[number] = "the scenario has ended"
+    return _rated(rollout, out, forks, errors, is_replayed)
+
+
+def _drive_on(forks: list[Rollout], errors: np.ndarray, planner: str | Planner, steps: int) -> None:
+    """Let planners drive the branches that are under way; those of one network together."""
+    one: Any = load_planner(planner) if isinstance(planner, str) else planner
+    active = np.flatnonzero(errors == "").tolist()
+    for number in active:
+        forks[number].drive_by(one.fork() if isinstance(one, BatchPlanner) else deepcopy(one))
+    ended = simulate_together([forks[number] for number in active], steps)
+    for number, result in zip(active, ended, strict=True):
+        if isinstance(result, Exception):
+            errors[number] = str(result)
+
+
+def _rated(
+    rollout: Rollout,
+    driven: FloatArray,
+    worlds: list[Rollout],
+    errors: np.ndarray,
+    is_replayed: bool,
+) -> Branches:
+    """Parts of all branches, in one world each, or in the recorded one."""
+    now, count, scenario = rollout.iteration, driven.shape[1], rollout.scenario
+    observation = rollout.observe()
+    planner = PdmClosed(map_radius=navsim.RADIUS, lateral_offsets=())
+    ground, _ = navsim.look_around(scenario, observation, planner)
+    ego, lights = observation.history.ego, scenario.iteration_rows[now : now + count]
+    # beyond what was driven only a recording is known
+    known = slice(now, now + count + (_TTC if is_replayed else 0))
+    ignored = np.zeros(len(scenario.tracks.tokens), np.bool_)
+    around = [_around(one.log().tracks.rows(known), ignored) for one in (rollout, *worlds)]
+    values = {name: np.full(len(driven), np.nan) for name in (*PARTS, *FIRST.values())}
+    good = np.flatnonzero(errors == "")
+    if len(good):
+        past = np.ascontiguousarray(ego[-1 - _PAST : -1])
+        own = tuple(around[1 + number] for number in good if worlds)
+        lit = navsim.seen_by_v2(around[0], scenario, lights, 1, ego[-1])
+        found = navsim.evaluate(driven[good], ground, lit, "v2", past, own)
+        for name, column in values.items():
+            column[good] = found[name]
+    driven[errors != ""] = np.nan
+    parts = {name: values[name] for name in PARTS}
+    first = {name: values[index] for name, index in FIRST.items()}
+    return Branches(states=driven, parts=parts, first=first, errors=errors)
+
+
+def _around(tracks: Tracks, ignored: BoolArray) -> navsim.Surroundings:
+    """The others at times 0.1 s apart, without lights; some (N,) are ignored."""
     boxes = boxes_to_corners(tracks.poses, tracks.sizes)
     centers = np.where(tracks.valid[..., None], tracks.poses[..., :2], np.inf)
     is_agent = tracks.kinds <= LAST_AGENT_KIND
     speeds = np.where(is_agent, np.nan_to_num(np.hypot(*tracks.velocities.T).T), 0.0)
     radii = 0.5 * np.nan_to_num(np.hypot(*tracks.sizes.T).T).max(axis=0, initial=0.0)
-    size = np.array([PACIFICA.length, PACIFICA.width])
-    footprint = boxes_to_corners(center_poses(ego[:3]), size)
-    ignored = contacts.touches_boxes(footprint, boxes[0]) & tracks.valid[0]
     others = contacts.Obstacles(boxes, centers, centers, speeds, radii, is_agent, ignored)
     way = np.nan_to_num(np.hypot(*np.diff(tracks.poses[..., :2], axis=0).T).T)
     reaches = (_TTC + 1) * way.max(axis=0, initial=0.0)
@@ -321,37 +292,21 @@ def follow_plans(
     plans: FloatArray,  # (K, H, 11) states of plans; only the poses are read
     first: int,  # the step at which they are there; states before are given
     noise: FloatArray,  # (S, 2) of the commands
-    params: LqrParameters,
     states: FloatArray,  # (K, S + 1, 11) receives those after that step
     commands: FloatArray,  # (K, S, 2) receives the commands before noise
 ) -> int:
-    """What `track_and_step` does step by step, for many plans that are not made anew.
-
-    Returns:
-        TRACKED, or why the rest was not written.
-    """
-    if num_resampled(plan_us, params.step_us) < MIN_POSES:
+    """What `track_and_step` does step by step, for plans that are not made anew; its status."""
+    if num_resampled(plan_us, NUPLAN.step_us) < MIN_POSES:
         return TOO_SHORT
-    dt, target, ahead = params.step_us / 1e6, np.empty(plans.shape[2]), np.empty(params.horizon)
+    target, ahead = np.empty(plans.shape[2]), np.empty(NUPLAN.horizon)
     for row in range(len(plans)):
-        speeds, curvatures = fit_profiles(plan_us, plans[row], params)
+        profiles = fit_profiles(plan_us, plans[row], NUPLAN)
         for step in range(first, len(noise)):
-            now, state = time_us[step] * 1e-6, states[row, step]
-            if not interpolate(plan_us, plans[row], time_us[step], target):
+            now, state, sent = time_us[step], states[row, step], commands[row, step]
+            if not interpolate(plan_us, plans[row], now, target):
                 return NOT_COVERED
-            turn = target[HEADING]
-            lateral = -(state[X] - target[X]) * np.sin(turn) + (state[Y] - target[Y]) * np.cos(turn)
-            for index in range(params.horizon):
-                at = now + index * dt
-                ahead[index] = profile_at(curvatures, plan_us[0], params.step_us, at)
-            speed = profile_at(speeds, plan_us[0], params.step_us, now + params.horizon * dt)
-            error = wrap_angle(state[HEADING] - turn)
-            accel, rate = command(state, Reference(TRACKED, lateral, error, speed, ahead), params)
-            commands[row, step, 0], commands[row, step, 1] = accel, rate
-            if noise[step, 0] != 0.0:
-                accel += noise[step, 0]
-            if noise[step, 1] != 0.0:
-                rate += noise[step, 1]
-            span = step_seconds(time_us[step], time_us[step + 1])
-            step_bicycle(state, accel, rate, params.wheel_base, span, states[row, step + 1])
+            goal = aim(now, state, target, plan_us[0], profiles, NUPLAN, ahead)
+            sent[0], sent[1] = command(state, goal, NUPLAN)
+            added, after = noise[step], states[row, step + 1]
+            command_and_step(now, time_us[step + 1], state, sent, added[0], added[1], after)
     return TRACKED

@@ -97,11 +97,10 @@ def rollout_rows(
     schema = [*STATES, *(TRACKS if with_tracks else ()), *(SEEN if with_seen else ())]
     columns += _box_columns(log.tracks) if with_tracks else []
     if with_seen:
-        count, names = len(log.time_us), SEEN.names
+        count, types = len(log.time_us), SEEN.types[3:]
         seen = log.seen or Seen(np.full((count, 3), np.nan), Tracks.empty(count))
         columns += map(pa.array, np.ascontiguousarray(seen.ego.T))
-        boxes = zip(_box_columns(seen.tracks), names[3:], strict=True)
-        columns += [lists.cast(SEEN.field(name).type) for lists, name in boxes]
+        columns += map(pa.Array.cast, _box_columns(seen.tracks), types)
     if with_kinds:
         codes = pa.array(log.tracks.kinds[np.nonzero(log.tracks.valid)[1]], pa.int8())
         columns.append(_lists(log.tracks.valid.sum(axis=1), codes))
@@ -114,7 +113,7 @@ def _box_columns(tracks: Tracks) -> list[pa.Array]:
     row, track = np.nonzero(tracks.valid)
     lengths = tracks.valid.sum(axis=1)
     columns = [_lists(lengths, pa.array(tracks.tokens, pa.string()).take(pa.array(track)))]
-    for values in (tracks.poses, tracks.velocities, tracks.sizes):
+    for values in tracks.arrays[1:]:
         columns += [_lists(lengths, of) for of in values[row, track].T]
     return columns
 

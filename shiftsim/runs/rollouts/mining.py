@@ -5,7 +5,6 @@ among the others of that rollout. From there on any planner can drive.
 """
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -59,22 +58,8 @@ def mine(
         hint = "an edit has no second beginning: run without --edits, and mine that run"
         raise ConfigError(f"run {run.path.name!r} drove edited scenarios", hint)
     window = before + AFTER if window is None else window
-    edits = list(_edits(run, kind, before, window, planner))
-    if not edits:
-        raise ConfigError(
-            f"run {run.path.name!r} has no rollout with {kind!r}",
-            hint="look at `shiftsim report RUN`, or choose another kind",
-        )
-    path = Path(out)
-    make_edits({"edit": edits}, path.stem)  # what it says can be read
-    write_text(path, edits_text({"format": 1, "edit": edits}))
-    return path
-
-
-def _edits(
-    run: Run, kind: str, before: float, window: float, planner: str
-) -> Iterator[dict[str, Any]]:
-    store, traffic = open_run_store(run), run.manifest["determining"]["traffic"]
+    edits, traffic = list[dict[str, Any]](), run.manifest["determining"]["traffic"]
+    store = open_run_store(run)
     for row in run.metrics.to_pylist():
         at = row["first_violation_iteration"]
         is_wrong = row["metric"] == KINDS[kind] and at is not None and row["score"] != 1.0
@@ -87,10 +72,20 @@ def _edits(
         ego: FloatArray = run.rollout(task, scenario).ego[: start + 1]
         seconds = float(np.diff(scenario.iteration_times[[start, -1]])[0]) * 1e-6
         label = re.sub(r"\W", "_", f"{task.planner}_{task.noise}", flags=re.ASCII)[:_NAME]
-        yield {
+        edit = {
             "name": f"{kind.replace('-', '_')}_{label}_{task.seed}",
             "tokens": [task.token],
             "type": kind,
             "window_s": min(window, round(seconds, 1)),
             "start": {"ego": ego.tolist(), "traffic": traffic},
         }
+        edits.append(edit)
+    if not edits:
+        raise ConfigError(
+            f"run {run.path.name!r} has no rollout with {kind!r}",
+            hint="look at `shiftsim report RUN`, or choose another kind",
+        )
+    path = Path(out)
+    make_edits({"edit": edits}, path.stem)  # what it says can be read
+    write_text(path, edits_text({"format": 1, "edit": edits}))
+    return path

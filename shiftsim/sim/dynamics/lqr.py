@@ -24,7 +24,7 @@ from shiftsim.errors import InvalidTrajectoryError
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.geometry.polylines import interpolate as between
 from shiftsim.kernels import FloatArray, IntArray, kernel
-from shiftsim.sim.dynamics.bicycle import step_bicycle, step_seconds
+from shiftsim.sim.dynamics.bicycle import command_and_step
 from shiftsim.sim.dynamics.perfect import interpolate, unwrap_correction
 from shiftsim.world.state import HEADING, NUM_STATE, PACIFICA, STEERING, VX, X, Y
 
@@ -223,20 +223,33 @@ def reference(
     params: LqrParameters,
 ) -> Reference:
     """Errors of the ego against the plan, and the speeds and curvatures to aim at."""
-    curvature = np.zeros(params.horizon)
-    target = np.empty(NUM_STATE)
+    target, curvature = np.empty(NUM_STATE), np.zeros(params.horizon)
     if not interpolate(traj_time_us, traj_states, now_us, target):
         return Reference(NOT_COVERED, 0.0, 0.0, 0.0, curvature)
     if num_resampled(traj_time_us, params.step_us) < MIN_POSES:
         return Reference(TOO_SHORT, 0.0, 0.0, 0.0, curvature)
-    heading = target[HEADING]
+    profiles = fit_profiles(traj_time_us, traj_states, params)
+    return aim(now_us, state, target, traj_time_us[0], profiles, params, curvature)
+
+
+@kernel
+def aim(
+    now_us: int,
+    state: FloatArray,
+    target: FloatArray,  # (11,) state of the plan now
+    start_us: int,  # of the plan
+    profiles: tuple[FloatArray, FloatArray],  # its speeds and curvatures
+    params: LqrParameters,
+    ahead: FloatArray,  # (horizon,) receives the next curvatures
+) -> Reference:
+    """The reference where a plan is at a target; what is not described is as of `reference`."""
+    speeds, curvatures = profiles
+    heading, dt, now = target[HEADING], params.step_us / 1e6, now_us * 1e-6
     lateral = -(state[X] - target[X]) * np.sin(heading) + (state[Y] - target[Y]) * np.cos(heading)
-    speeds, curvatures = fit_profiles(traj_time_us, traj_states, params)
-    start_us, dt, now = traj_time_us[0], params.step_us / 1e6, now_us * 1e-6
     for step in range(params.horizon):
-        curvature[step] = profile_at(curvatures, start_us, params.step_us, now + step * dt)
+        ahead[step] = profile_at(curvatures, start_us, params.step_us, now + step * dt)
     speed = profile_at(speeds, start_us, params.step_us, now + params.horizon * dt)
-    return Reference(TRACKED, lateral, wrap_angle(state[HEADING] - heading), speed, curvature)
+    return Reference(TRACKED, lateral, wrap_angle(state[HEADING] - heading), speed, ahead)
 
 
 @kernel
@@ -330,12 +343,7 @@ def track_and_step(
     if status != TRACKED:
         return status
     out_command[0], out_command[1] = accel, rate
-    if noise_accel != 0.0:
-        accel += noise_accel
-    if noise_rate != 0.0:
-        rate += noise_rate
-    dt = step_seconds(now_us, next_us)
-    step_bicycle(state, accel, rate, NUPLAN.wheel_base, dt, out_state)
+    command_and_step(now_us, next_us, state, out_command, noise_accel, noise_rate, out_state)
     return TRACKED
 
 

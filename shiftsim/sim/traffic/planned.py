@@ -145,10 +145,7 @@ class PlannedTraffic:
     def _show(self, driver: _Driver, tracks: Tracks, row: int) -> None:
         """Write what a driver sees of a row: everybody, and the ego where he is himself."""
         seen, track = driver.tracks, driver.track
-        arrays = (tracks.valid, tracks.poses, tracks.velocities, tracks.sizes)
-        for target, source in zip(
-            (seen.valid, seen.poses, seen.velocities, seen.sizes), arrays, strict=True
-        ):
+        for target, source in zip(seen.arrays, tracks.arrays, strict=True):
             target[row] = source[row]
         ego = self._seen_ego[row]
         seen.valid[row, track] = True

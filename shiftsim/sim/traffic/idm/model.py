@@ -35,7 +35,6 @@ from shiftsim.sim.traffic.idm.scene import (
     Scene,
     lane_graph,
     make_scene,
-    row_of,
     with_longer_paths,
 )
 from shiftsim.sim.traffic.idm.step import LEFT_PATH, LONGER_PATHS, advance_steps, write_agents
@@ -45,7 +44,7 @@ from shiftsim.world.events import CAUTIOUS, LOGGED, OFF
 from shiftsim.world.lanes import Start, find_start, find_starts
 from shiftsim.world.map import NONE, VectorMap
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import PACIFICA, VX, VY, AgentKind, Tracks, center_poses
+from shiftsim.world.state import PACIFICA, VX, VY, AgentKind, TrackArrays, Tracks, center_poses
 
 _MIN_VERTICES = 3  # of a baseline: a path of fewer than two cannot be driven, and one is lost
 _EGO_SIZE = np.array([PACIFICA.length, PACIFICA.width])
@@ -125,7 +124,7 @@ class IdmTraffic:
         # nuPlan rule 11: a difference of epoch seconds
         self._spans = np.diff(scenario.iteration_times * 1e-6)
         _remove(tracks, row, ~is_replayed)
-        write_agents(fleet, agents, row_of(tracks, row))
+        write_agents(fleet, agents, TrackArrays(*(array[row] for array in tracks.arrays)))
 
     def step(self, iteration: int, ego: FloatArray, tracks: Tracks, row: int) -> None:
         """Move the agents; replayed tracks and lights are those of the next iteration.
@@ -137,7 +136,7 @@ class IdmTraffic:
 
     def step_many(self, iteration: int, egos: FloatArray, tracks: Tracks, row: int) -> None:
         """Several steps, with the ego states (S, 11) at their beginnings; else as `step`."""
-        scene, rows = self._scene, row_of(tracks, slice(None))
+        scene = self._scene
         if scene is None:
             raise ConfigError("traffic was stepped before it was started", hint="call start first")
         done, looks = 0, scene.yielding.policy != OFF
@@ -151,7 +150,7 @@ class IdmTraffic:
             stop = done + 1 if looks or len(self._stopped) else len(egos)
             known = self._spans, self._light_edges, self._lights
             given = row + done, egos[done:stop], iteration + done
-            count, end, what = advance_steps(scene, rows, *given, *known)
+            count, end, what = advance_steps(scene, tracks.arrays, *given, *known)
             done += count
             if end == LEFT_PATH:
                 raise TrafficError(
@@ -191,7 +190,7 @@ def _copied(scene: Scene) -> Scene:
 def _remove(tracks: Tracks, row: int, which: np.ndarray) -> None:
     """Remove tracks (a mask) from a row on."""
     tracks.valid[row:] &= ~which
-    for values in (tracks.poses, tracks.velocities, tracks.sizes):
+    for values in tracks.arrays[1:]:
         np.copyto(values[row:], np.nan, where=which[:, None])
 
 

@@ -12,7 +12,7 @@ from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.sim.traffic.idm.buffer import curve_capacity
 from shiftsim.world.layers import Lists, Polygons, Polylines
 from shiftsim.world.map import VectorMap
-from shiftsim.world.state import AgentKind, Tracks
+from shiftsim.world.state import AgentKind
 
 # Kinds that are replayed from the log, in nuPlan's order of observation.
 REPLAYED_KINDS = (
@@ -113,20 +113,6 @@ class Scene(NamedTuple):
     footprints: Footprints  # of agents, ego and replayed tracks
     yielding: Yielding  # how agents treat the ego
     scratch: Scratch  # intermediate results
-
-
-class Row(NamedTuple):
-    """A row of tracks, as in `Tracks`: (N,), (N, 3), (N, 2), (N, 2); or several rows of them."""
-
-    valid: BoolArray
-    poses: FloatArray
-    velocities: FloatArray
-    sizes: FloatArray
-
-
-def row_of(tracks: Tracks, row: int | slice) -> Row:
-    """One row of tracks, or several, as kernels take them."""
-    return Row(tracks.valid[row], tracks.poses[row], tracks.velocities[row], tracks.sizes[row])
 
 
 def lane_graph(map: VectorMap) -> LaneGraph:

@@ -18,11 +18,11 @@ from shiftsim.sim.traffic.idm.paths import (
     needs_longer_path,
     set_box,
 )
-from shiftsim.sim.traffic.idm.scene import PROGRESS, Fleet, Row, Scene
+from shiftsim.sim.traffic.idm.scene import PROGRESS, Fleet, Scene
 from shiftsim.sim.traffic.idm.yielding import ignores_ego_ahead, place_ego_ahead
 from shiftsim.sim.traffic.lanes import RED
 from shiftsim.world.state import HEADING as EGO_HEADING
-from shiftsim.world.state import PACIFICA, VX, VY, YAW_RATE
+from shiftsim.world.state import PACIFICA, VX, VY, YAW_RATE, TrackArrays
 
 DONE, LONGER_PATHS, LEFT_PATH = 0, 1, 2  # how a step ends
 _EGO_LENGTH, _EGO_WIDTH, _EGO_CENTER = PACIFICA.length, PACIFICA.width, PACIFICA.rear_axle_to_center
@@ -31,7 +31,7 @@ _EGO_LENGTH, _EGO_WIDTH, _EGO_CENTER = PACIFICA.length, PACIFICA.width, PACIFICA
 @kernel
 def advance_steps(
     scene: Scene,
-    tracks: Row,  # all rows of them
+    tracks: TrackArrays,  # all rows of them
     row: int,  # the one in which the first step ends
     egos: FloatArray,  # (S, 11) ego states at the beginnings of the steps
     iteration: int,  # at which the first step begins
@@ -41,11 +41,12 @@ def advance_steps(
 ) -> tuple[int, int, int]:
     """`advance` for several steps: how many were done, and how the last one ended."""
     # nuPlan rule 130: the ego is one step old, lights and replayed tracks are one step ahead
+    valid, poses, velocities, sizes = tracks
     for step in range(len(egos)):
         for index in range(len(edges)):
             scene.graph.lights[edges[index]] = lights[iteration + step + 1, index]
         at = row + step
-        now = Row(tracks.valid[at], tracks.poses[at], tracks.velocities[at], tracks.sizes[at])
+        now = TrackArrays(valid[at], poses[at], velocities[at], sizes[at])
         end, what = advance(scene, now, egos[step], spans[iteration + step])
         if end != DONE:
             return step, end, what
@@ -53,7 +54,7 @@ def advance_steps(
 
 
 @kernel
-def advance(scene: Scene, row: Row, ego: FloatArray, span: float) -> tuple[int, int]:
+def advance(scene: Scene, row: TrackArrays, ego: FloatArray, span: float) -> tuple[int, int]:
     """Move every agent by one step, `span` [s] long, and write where it is.
 
     The scene has the lights of the end of the step, and the row of tracks is that of the end of the
@@ -141,7 +142,7 @@ def advance(scene: Scene, row: Row, ego: FloatArray, span: float) -> tuple[int, 
 
 
 @kernel
-def write_agents(fleet: Fleet, tracks: IntArray, row: Row) -> None:
+def write_agents(fleet: Fleet, tracks: IntArray, row: TrackArrays) -> None:
     """Write the agents, whose tracks are given (A,), into a row; the gone as absent."""
     for agent in range(len(tracks)):
         track = tracks[agent]
