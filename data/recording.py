@@ -1,7 +1,7 @@
 """What a reader hands to the store: a recording once, and scenarios as windows into it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -94,14 +94,9 @@ def scenario(
 def visible_tracks(tracks: Tracks, *, without: str) -> Tracks:
     """The tracks that occur in the rows given, in nuPlan's order, except the one named."""
     index = visible_columns(tracks.valid, tracks.kinds, tracks.tokens, without)
-    return Tracks(
-        tracks.valid.take(index, axis=1),
-        tracks.poses.take(index, axis=1),
-        tracks.velocities.take(index, axis=1),
-        tracks.sizes.take(index, axis=1),
-        tracks.kinds[index],
-        tuple(tracks.tokens[i] for i in index.tolist()),
-    )
+    seen = tracks.map_arrays(lambda array: array.take(index, axis=1))
+    names = tuple(tracks.tokens[i] for i in index.tolist())
+    return replace(seen, kinds=tracks.kinds[index], tokens=names)
 
 
 def visible_columns(

@@ -20,7 +20,6 @@ from shiftsim.metrics.result import Collision, MetricPart, MetricRow, Thresholds
 from shiftsim.world.state import (
     LAST_AGENT_KIND,
     AgentKind,
-    TrackArrays,
     Tracks,
     VehicleParameters,
     center_poses,
@@ -80,7 +79,7 @@ def flat_ego(states: FloatArray, vehicle: VehicleParameters) -> Ego:
 
 def flat_tracks(tracks: Tracks) -> FlatTracks:
     """Contiguous arrays of the tracks, without a copy where they already are."""
-    arrays = TrackArrays._make(map(np.ascontiguousarray, tracks.arrays))
+    arrays = tracks.map_arrays(np.ascontiguousarray).arrays
     return FlatTracks(*arrays, tracks.kinds > LAST_AGENT_KIND)
 
 

@@ -72,7 +72,7 @@ def make_forecast(tracks: Tracks, chosen: IntArray, lights: RedLights) -> Foreca
     moves, headings = np.empty(count, np.bool_), np.empty(count)
     known = lights.xy, lights.ptr, lights.bounds
     forecast = Forecast(others, moves, headings, ignored, *known)
-    now = TrackArrays(*(array[-1].copy() for array in tracks.arrays))
+    now = tracks.map_arrays(lambda array: array[-1].copy()).arrays
     _forecast(chosen, tracks.kinds.copy(), now, forecast)
     return forecast
 

@@ -127,20 +127,11 @@ class ScenarioBuilder:
         """Add N tracks of one kind."""
         shape = (len(self.scenario.time_us), len(tokens))
         blank = np.where(np.broadcast_to(valid, shape), 0.0, np.nan)[..., None]
-        new = Tracks(
-            ~np.isnan(blank[..., 0]),
-            poses + blank,
-            (velocities if kind <= LAST_AGENT_KIND else np.nan) + np.repeat(blank, 2, axis=2),
-            sizes + blank,
-            np.full(len(tokens), kind, np.int64),
-            tuple(tokens),
-        )
-        parts = (self.tracks, new)
-        there, places, moves, boxes = (
-            np.concatenate([getattr(part, name) for part in parts], axis=1)
-            for name in ("valid", "poses", "velocities", "sizes")
-        )
-        kinds = np.concatenate([part.kinds for part in parts])
+        moves = velocities if kind <= LAST_AGENT_KIND else np.nan
+        new = (~np.isnan(blank[..., 0]), poses + blank, moves + np.repeat(blank, 2, axis=2))
+        pairs = zip(self.tracks.arrays, (*new, sizes + blank), strict=True)
+        there, places, moves, boxes = (np.concatenate(pair, axis=1) for pair in pairs)
+        kinds = np.append(self.tracks.kinds, np.full(len(tokens), kind, np.int64))
         names = (*self.tracks.tokens, *tokens)
         self.tracks = Tracks(there, places, moves, boxes, kinds, names)
         self.behaviors = np.append(self.behaviors, np.broadcast_to(behaviors, len(tokens)))

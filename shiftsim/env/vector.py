@@ -99,10 +99,8 @@ class VectorBuilder:
         road, ego, tracks = self._scene.map, observation.history.ego[-1], observation.history.tracks
         route = self._route = self._route or self._start(ego)
         around = Around(
-            np.array(tracks.valid[-1]),  # copies: the kernel sees one type of array
-            np.array(tracks.poses[-1]),
-            np.array(tracks.velocities[-1]),
-            np.array(tracks.sizes[-1]),
+            # copies: the kernel sees one type of array
+            *tracks.map_arrays(lambda array: array[-1].copy()).arrays,
             np.array(tracks.kinds),
             road.baselines,
             road.edges.polygons.bounds,

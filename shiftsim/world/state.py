@@ -134,40 +134,33 @@ class Tracks:
         """The four arrays over the rows."""
         return TrackArrays(self.valid, self.poses, self.velocities, self.sizes)
 
-    def _with(self, change: Callable[[np.ndarray], np.ndarray]) -> "Tracks":
-        """The same tracks, all arrays over the rows changed."""
+    def map_arrays(self, change: Callable[[np.ndarray], np.ndarray]) -> "Tracks":
+        """The same tracks, all four arrays over the rows changed."""
         return Tracks(*TrackArrays._make(map(change, self.arrays)), self.kinds, self.tokens)
 
     def rows(self, index: slice | IntArray) -> "Tracks":
         """The same tracks over other rows: a view for a slice, a copy for an index array."""
-        return self._with(lambda array: array[index])
+        return self.map_arrays(lambda array: array[index])
 
     def select(self, index: BoolArray | IntArray) -> "Tracks":
         """A subset (or another order) of the tracks, over the same rows."""
         where = np.flatnonzero(index) if index.dtype == np.bool_ else index
         tokens = tuple(self.tokens[i] for i in where)
-        chosen = self._with(lambda array: array[:, where])
+        chosen = self.map_arrays(lambda array: array[:, where])
         return replace(chosen, kinds=self.kinds[where], tokens=tokens)
 
     def copy(self) -> "Tracks":
         """The same tracks in arrays of their own, which can be written."""
-        return self._with(np.copy)
+        return self.map_arrays(np.copy)
 
     def readonly(self) -> "Tracks":
         """The same tracks in arrays that cannot be written."""
-        return replace(self._with(readonly), kinds=readonly(self.kinds))
+        return replace(self.map_arrays(readonly), kinds=readonly(self.kinds))
 
     @staticmethod
     def empty(num_rows: int) -> "Tracks":
         """No tracks at all, over `num_rows` rows."""
-        return Tracks(
-            np.zeros((num_rows, 0), np.bool_),
-            np.zeros((num_rows, 0, 3)),
-            np.zeros((num_rows, 0, 2)),
-            np.zeros((num_rows, 0, 2)),
-            np.zeros(0, np.int64),
-            (),
-        )
+        return tracks_of_boxes(np.zeros((num_rows, 0, 7)), (), ())
 
 
 def tracks_of_boxes(

@@ -34,7 +34,7 @@ from shiftsim.sim.traffic.lanes import GREEN, RED
 from shiftsim.world.events import OFF
 from shiftsim.world.lanes import Start
 from shiftsim.world.layers import make_lists, make_polygons, make_polylines
-from shiftsim.world.state import NUM_STATE, AgentKind, TrackArrays
+from shiftsim.world.state import NUM_STATE, AgentKind
 
 ROAD = straight_road()
 
@@ -153,7 +153,7 @@ def test_routes_go_on_until_paths_are_long_enough(seed):
     ego = np.zeros(NUM_STATE)
     ego[:2] = fleet.pose[0, :2] + 60.0  # far beside it
     tracks = standing_tracks(1, np.zeros((1, 3)), [AgentKind.VEHICLE])
-    row = TrackArrays(*(array[0] for array in tracks.arrays))
+    row = tracks.map_arrays(lambda array: array[0]).arrays
     end, needed = advance(scene, row, ego, 0.1)
     while end == LONGER_PATHS:  # then it goes on where there is more room
         scene = with_longer_paths(scene, needed)

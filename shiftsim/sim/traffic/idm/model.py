@@ -44,7 +44,7 @@ from shiftsim.world.events import CAUTIOUS, LOGGED, OFF
 from shiftsim.world.lanes import Start, find_start, find_starts
 from shiftsim.world.map import NONE, VectorMap
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import PACIFICA, VX, VY, AgentKind, TrackArrays, Tracks, center_poses
+from shiftsim.world.state import PACIFICA, VX, VY, AgentKind, Tracks, center_poses
 
 _MIN_VERTICES = 3  # of a baseline: a path of fewer than two cannot be driven, and one is lost
 _EGO_SIZE = np.array([PACIFICA.length, PACIFICA.width])
@@ -124,7 +124,7 @@ class IdmTraffic:
         # nuPlan rule 11: a difference of epoch seconds
         self._spans = np.diff(scenario.iteration_times * 1e-6)
         _remove(tracks, row, ~is_replayed)
-        write_agents(fleet, agents, TrackArrays(*(array[row] for array in tracks.arrays)))
+        write_agents(fleet, agents, tracks.map_arrays(lambda array: array[row]).arrays)
 
     def step(self, iteration: int, ego: FloatArray, tracks: Tracks, row: int) -> None:
         """Move the agents; replayed tracks and lights are those of the next iteration.
