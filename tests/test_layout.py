@@ -19,28 +19,28 @@ BUDGETS = {
     "shiftsim": 1_930,  # goal 900
     "shiftsim/geometry": 1_030,  # goal 1_000
     "shiftsim/world": 2_070,  # goal 1_800
-    "shiftsim/edits": 2_110,  # goal 2_100
-    "shiftsim/sim": 2_560,  # goal 1_600
-    "shiftsim/sim/traffic": 2_380,  # goal 2_200
-    "metrics": 2_930,
-    "shiftsim/runs": 5_440,  # goal 3_300
-    "planners": 4_355,  # goal 4_300
+    "shiftsim/edits": 2_105,  # goal 2_100
+    "shiftsim/sim": 2_525,  # goal 1_600
+    "shiftsim/sim/traffic": 2_365,  # goal 2_200
+    "metrics": 2_895,
+    "shiftsim/runs": 5_385,  # goal 3_300
+    "planners": 4_310,  # goal 4_300
     "planners/learned": 4_900,  # goal 4_600; attention of all scenes at once on a GPU brings 40
     "data/maps": 3_620,  # goal 3_000
-    "data": 5_010,  # goal 3_900
+    "data": 5_005,  # goal 3_900
     "data/nuplan": 2_720,  # goal 2_400
     "data/store": 2_200,
     "data/synthetic": 2_575,  # goal 2_100
     "shiftsim/report": 3_195,  # goal 2_200
-    "shiftsim/view": 2_375,  # goal 1_800
-    "shiftsim/env": 1_465,
+    "shiftsim/view": 2_365,  # goal 1_800
+    "shiftsim/env": 1_455,
     "shiftsim/train": 3_330,  # goal 1_600; rasters and rounds on a GPU, faster samples bring 30
     "shiftsim/compat": 3_730,  # goal 2_300
     "shiftsim/verify": 1_215,  # goal 1_200
     "shiftsim/cli": 2_680,  # goal 2_300
     "benchmarks": 755,  # goal 700; the tracks finding and sensor-drift bring 40
 }
-MOST_LINES, MOST_MODULES, MOST_KERNELS = 64_250, 300, 220  # the goal is 52_000 lines
+MOST_LINES, MOST_MODULES, MOST_KERNELS = 64_025, 300, 220  # the goal is 52_000 lines
 LONGEST_MODULE, CROWDED = 450, 16
 # modules of under 80 lines that one other module imports, and why they stand alone
 SMALL_AND_ALONE = {

@@ -210,16 +210,13 @@ class Rollout:
         """
         if self.done:
             raise DataError(f"the rollout of {self.scenario.token!r} has ended")
-        # views: nobody writes to the rows that lie behind
-        past, end = slice(self.iteration), self._start + self.iteration + 1
         names: Any = {}
         for name in ("noise", "perception", "localization", "traffic"):
             if not isinstance(given := getattr(self.setting, name), str):
                 names[name] = type(given).__name__ if name == "traffic" else given.name
-        named, ego = replace(self.setting, **names), self._ego[self._start : end]
-        parts = self._commands[past], self._seconds[past], self._degraded[past]
-        waiting = tuple(self._waiting)
-        return Snapshot(self.scenario.token, named, ego, *parts, waiting, action, self.scenario)
+        # views: nobody writes to the rows that lie behind
+        past = self.log().snapshot(self.iteration, replace(self.setting, **names))
+        return replace(past, plans=tuple(self._waiting), action=action, scenario=self.scenario)
 
     def resume(self, snapshot: Snapshot) -> None:
         """Come to where another rollout was that has been where this one is, or is fresh.
