@@ -32,12 +32,7 @@ BOX_SIZE = 8  # numbers that make a box in kernels
 GROUPS = {
     "VRUs": (AgentKind.PEDESTRIAN, AgentKind.BICYCLE),
     "vehicles": (AgentKind.VEHICLE,),
-    "objects": (
-        AgentKind.TRAFFIC_CONE,
-        AgentKind.BARRIER,
-        AgentKind.CZONE_SIGN,
-        AgentKind.GENERIC_OBJECT,
-    ),
+    "objects": tuple(kind for kind in AgentKind if kind > LAST_AGENT_KIND),
 }
 
 

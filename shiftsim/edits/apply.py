@@ -243,8 +243,8 @@ def _begin_at(scenario: Scenario, start: spec.Start, replay: Replay | None) -> S
             raise ConfigError(what, hint="write the edit into a file, and run that")
         seen, tracks = replay(scenario, driven, start.traffic), tracks.copy()
         at = np.searchsorted(known, past, side="right") - 1
-        for name in ("valid", "poses", "velocities", "sizes"):
-            getattr(tracks, name)[past] = getattr(seen, name)[at]
+        for target, values in zip(tracks.arrays, seen.arrays, strict=True):
+            target[past] = values[at]
     left = float(times[rows[-1]] - times[known[-1]]) * 1e-6
     mapping = (round(left, 1), *scenario.mapping[1:])
     later = rows[len(driven) - 1 :]

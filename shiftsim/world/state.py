@@ -149,6 +149,11 @@ class Tracks:
         chosen = self.map_arrays(lambda array: array[:, where])
         return replace(chosen, kinds=self.kinds[where], tokens=tokens)
 
+    def put(self, row: int, track: int | IntArray, *values: ArrayLike) -> None:
+        """Write pose, velocity and size of tracks in a row, where they are present then."""
+        for array, value in zip(self.arrays, (True, *values), strict=True):
+            array[row, track] = value
+
     def copy(self) -> "Tracks":
         """The same tracks in arrays of their own, which can be written."""
         return self.map_arrays(np.copy)

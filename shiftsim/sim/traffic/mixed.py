@@ -48,12 +48,9 @@ class ConstantVelocity:
         if self._moving is None:
             raise ConfigError("traffic was stepped before it was started", hint="call start first")
         who = np.flatnonzero(self._moving & tracks.valid[row - 1])
-        velocities = tracks.velocities[row - 1, who]
-        tracks.valid[row, who] = True
-        tracks.poses[row, who] = tracks.poses[row - 1, who]
-        tracks.poses[row, who, :2] += self._spans[iteration] * np.nan_to_num(velocities)
-        tracks.velocities[row, who] = velocities
-        tracks.sizes[row, who] = tracks.sizes[row - 1, who]
+        _, poses, velocities, sizes = (array[row - 1, who] for array in tracks.arrays)
+        poses[:, :2] += self._spans[iteration] * np.nan_to_num(velocities)
+        tracks.put(row, who, poses, velocities, sizes)
 
 
 class AgentPolicy(Protocol):
@@ -172,19 +169,12 @@ class Scripted:
                     continue
                 self._active[number] = iteration
             share = share_walked(iteration, self._active[number], len(self._seconds))
-            track = crossing.track
-            tracks.valid[row, track] = True
-            tracks.poses[row, track] = crossing.start
-            tracks.poses[row, track, :2] += share * (crossing.end - crossing.start[:2])
-            tracks.velocities[row, track] = 0.0
-            tracks.sizes[row, track] = CROSSING_SIZE
+            pose = crossing.start.copy()
+            pose[:2] += share * (crossing.end - crossing.start[:2])
+            tracks.put(row, crossing.track, pose, 0.0, CROSSING_SIZE)
 
     def _move_pedestrians(self, seconds: float, tracks: Tracks, row: int) -> None:
         for pedestrian, start_time in zip(self._pedestrians, self._start_times, strict=True):
             poses, velocities, present = pedestrian.walk(np.array([seconds]), start_time)
             if present[0]:
-                track = pedestrian.track
-                tracks.valid[row, track] = True
-                tracks.poses[row, track] = poses[0]
-                tracks.velocities[row, track] = velocities[0]
-                tracks.sizes[row, track] = pedestrian.size
+                tracks.put(row, pedestrian.track, poses[0], velocities[0], pedestrian.size)

@@ -90,11 +90,9 @@ class PlannedTraffic:
                     hint="leave the scenario out, or use other traffic",
                 ) from error
         for driver in self._drivers:
-            track, state = driver.track, driver.ego[row]
-            tracks.valid[row, track] = True
-            tracks.poses[row, track] = center_poses(state[None, :3])[0]
-            tracks.velocities[row, track] = map_velocity(state)
-            tracks.sizes[row, track] = tracks.sizes[row - 1, track]
+            state, size = driver.ego[row], tracks.sizes[row - 1, driver.track]
+            pose = center_poses(state[None, :3])[0]
+            tracks.put(row, driver.track, pose, map_velocity(state), size)
 
     def _route(self, pose: FloatArray) -> tuple[str, ...]:
         """Roadblocks along the lanes ahead of a pose; none where it is on no lane."""
@@ -148,10 +146,7 @@ class PlannedTraffic:
         for target, source in zip(seen.arrays, tracks.arrays, strict=True):
             target[row] = source[row]
         ego = self._seen_ego[row]
-        seen.valid[row, track] = True
-        seen.poses[row, track] = center_poses(ego[None, :3])[0]
-        seen.velocities[row, track] = map_velocity(ego)
-        seen.sizes[row, track] = _EGO_SIZE
+        seen.put(row, track, center_poses(ego[None, :3])[0], map_velocity(ego), _EGO_SIZE)
 
     def _move(self, driver: _Driver, iteration: int, row: int) -> None:
         """Write the next state of a driver."""

@@ -167,11 +167,9 @@ class LearnedTraffic:
         move_agents(motion, own, out, self._spans[iteration], self._moved)
         there = motion.present[own]
         who, moved = own[there], self._moved[there]
-        tracks.valid[row, who] = True
-        tracks.poses[row, who] = moved[:, :3]
-        tracks.velocities[row, who, 0] = moved[:, 3] * np.cos(moved[:, 2])
-        tracks.velocities[row, who, 1] = moved[:, 3] * np.sin(moved[:, 2])
-        tracks.sizes[row, who] = tracks.sizes[row - 1, who]
+        x, y = moved[:, 3] * np.cos(moved[:, 2]), moved[:, 3] * np.sin(moved[:, 2])
+        sizes = tracks.sizes[row - 1, who]
+        tracks.put(row, who, moved[:, :3], np.column_stack([x, y]), sizes)
 
     def _seen(self, iteration: int, ego: FloatArray, tracks: Tracks, row: int) -> Motion:
         """Everyone at a row, the ego last."""
