@@ -176,14 +176,9 @@ def tracks_of_boxes(
     `boxes` (T, N, 7) are centre x [m], y [m], heading [rad], velocity x, y in the map frame [m/s],
     length, width [m]; x is NaN where a track is absent.
     """
-    return Tracks(
-        valid=~np.isnan(boxes[..., 0]),
-        poses=np.ascontiguousarray(boxes[..., :3]),
-        velocities=np.ascontiguousarray(boxes[..., 3:5]),
-        sizes=np.ascontiguousarray(boxes[..., 5:]),
-        kinds=np.array(kinds, np.int64),
-        tokens=tuple(tokens),
-    )
+    valid = ~np.isnan(boxes[..., 0])
+    poses, velocities, sizes = map(np.ascontiguousarray, np.split(boxes, [3, 5], axis=-1))
+    return Tracks(valid, poses, velocities, sizes, np.array(kinds, np.int64), tuple(tokens))
 
 
 @dataclass(frozen=True, slots=True)
