@@ -21,8 +21,8 @@ BUDGETS = {
     "shiftsim/world": 2_070,  # goal 1_800
     "shiftsim/edits": 2_105,  # goal 2_100
     "shiftsim/sim": 2_525,  # goal 1_600
-    "shiftsim/sim/traffic": 2_365,  # goal 2_200
-    "metrics": 2_895,
+    "shiftsim/sim/traffic": 2_350,  # goal 2_200
+    "metrics": 2_890,
     "shiftsim/runs": 5_385,  # goal 3_300
     "planners": 4_310,  # goal 4_300
     "planners/learned": 4_900,  # goal 4_600; attention of all scenes at once on a GPU brings 40
@@ -40,7 +40,7 @@ BUDGETS = {
     "shiftsim/cli": 2_680,  # goal 2_300
     "benchmarks": 755,  # goal 700; the tracks finding and sensor-drift bring 40
 }
-MOST_LINES, MOST_MODULES, MOST_KERNELS = 64_025, 300, 220  # the goal is 52_000 lines
+MOST_LINES, MOST_MODULES, MOST_KERNELS = 64_005, 300, 220  # the goal is 52_000 lines
 LONGEST_MODULE, CROWDED = 450, 16
 # modules of under 80 lines that one other module imports, and why they stand alone
 SMALL_AND_ALONE = {
