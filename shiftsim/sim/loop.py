@@ -215,8 +215,10 @@ class Rollout:
             if not isinstance(given := getattr(self.setting, name), str):
                 names[name] = type(given).__name__ if name == "traffic" else given.name
         # views: nobody writes to the rows that lie behind
-        past = self.log().snapshot(self.iteration, replace(self.setting, **names))
-        return replace(past, plans=tuple(self._waiting), action=action, scenario=self.scenario)
+        past, ego = slice(self.iteration), self._ego[self._start :][: self.iteration + 1]
+        parts = ego, self._commands[past], self._seconds[past], self._degraded[past]
+        token, setting = self.scenario.token, replace(self.setting, **names)
+        return Snapshot(token, setting, *parts, tuple(self._waiting), action, self.scenario)
 
     def resume(self, snapshot: Snapshot) -> None:
         """Come to where another rollout was that has been where this one is, or is fresh.

@@ -118,7 +118,7 @@ class Sensing:
         begins = self._draw("dropout", model.lost) < model.lost * DT
         spans = _spans(begins, max(round(model.lost_for / DT), 1), len(tokens))
         table = np.array([span[1:] for span in spans], np.int64).reshape(-1, 3)
-        self._model = _Model(
+        drawn = _Model(
             keeps=exp(-DT / model.tau),
             missed=model.missed,
             leaves=DT / model.gap,
@@ -139,6 +139,7 @@ class Sensing:
         boxes = [np.full((*shape, width), np.nan) for width in (3, 2, 2)]
         arrays = TrackArrays._make([np.zeros(shape, np.bool_), *boxes])
         self.tracks = Tracks(*arrays, kinds[table[:, 0]], names)
+        self._given = drawn, self._tracks.arrays, arrays
 
     def _draw(self, channel: str, share: float, *shape: int) -> FloatArray:
         """(N, R) uniform numbers, or (N, R, *shape) normals; (0, …) where the share is 0.
@@ -159,7 +160,6 @@ class Sensing:
 
     def see(self, row: int) -> None:
         """Make what is seen of the rows up to one, whose truth is there."""
-        given = self._model, self._tracks.arrays, self.tracks.arrays
         for one in range(self._rows, row + 1):
             pose = believed = self._ego[one, :3]
             if self._shift is not None:
@@ -167,7 +167,7 @@ class Sensing:
                 believed = self.ego[one, :3]
                 believed += self._shift[one]
                 believed[HEADING] = wrap_angles(believed[HEADING])
-            see_boxes(one, pose, believed, *given)
+            see_boxes(one, pose, believed, *self._given)
         self._rows = max(self._rows, row + 1)
 
     def to_truth(self, plan: Plan, row: int) -> Plan:
