@@ -1,6 +1,5 @@
 """Small planners: straight on, nuPlan's SimplePlanner, the recording, and given poses."""
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -50,19 +49,20 @@ class ConstantVelocity:
 
     def plan(self, observation: Observation) -> Trajectory:
         """Poses every 0.1 s along the present heading."""
-        ego, states = observation.ego, np.zeros((len(_TIMES), NUM_STATE))
-        heading = ego.heading
-        _straight(states, ego.values, ego.speed, math.cos(heading), math.sin(heading))
+        states = np.zeros((len(_TIMES), NUM_STATE))
+        _straight(states, observation.history.ego[-1])
         return Trajectory(_TIMES.copy(), states, relative=True)
 
 
 @kernel
-def _straight(states: FloatArray, start: FloatArray, speed: float, cos: float, sin: float) -> None:
+def _straight(states: FloatArray, start: FloatArray) -> None:
     """Write the states (H, 11) every 0.1 s from one on."""
+    speed, heading = np.hypot(start[VX], start[VY]), start[HEADING]
+    cos, sin = np.cos(heading), np.sin(heading)
     for row in range(len(states)):
         distance = speed * 0.1 * row
         states[row, X], states[row, Y] = start[X] + distance * cos, start[Y] + distance * sin
-        states[row, HEADING], states[row, VX] = start[HEADING], speed
+        states[row, HEADING], states[row, VX] = heading, speed
 
 
 class Simple:

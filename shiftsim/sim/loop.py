@@ -130,33 +130,48 @@ class Rollout:
 
         The plan took `seconds`; it is None only under log playback without a planner.
         """
-        move = self._follow(plan, seconds)
-        if move is not None:
-            self._traffic.step(*move)
+        if self._follow(plan, seconds):
+            row = self._start + self.iteration
+            self._traffic.step(self.iteration, self._ego[row], self._tracks, row + 1)
         self._go_on()
 
-    def _follow(self, plan: Plan, seconds: float) -> Move | None:
-        """Store this sample and move the ego; what the traffic is to do, None after the last."""
-        iteration, row = self.iteration, self._start + self.iteration
+    def _follow(self, plan: Any, seconds: float) -> bool:
+        """Store this sample and move the ego; whether the traffic is to move, too."""
+        iteration, controller = self.iteration, self.setting.controller
+        row = self._start + iteration
+        now_us, next_us = self._clock[row : row + 2]
+        state, after = self._ego[row], self._ego[row + 1]
         self._seconds[iteration] = seconds
         if self.planner is not None:
-            if reason := getattr(self.planner, "degraded", ""):  # by its own account
-                if self.setting.strict:
-                    raise PlannerError(
-                        f"the planner fell back at iteration {iteration}: {reason}",
-                        hint="without --strict it continues, and the step is counted as degraded",
-                    )
-                self._degraded[iteration] = True
-            plan = self._checked(plan)
+            self._note_fallback()
+            plan = executable(plan, now_us, next_us, f"iteration {iteration}: ")
+            if self._sensing is not None:
+                plan = self._sensing.to_truth(plan, row)
+            if isinstance(plan, Trajectory):
+                poses = self._plans[iteration]
+                sample_poses(plan.time_us, plan.states, now_us, KEPT_US, poses)
+                if iteration == 0 and controller == "lqr":
+                    self.warning = find_warning(plan, poses[0], state)
         if iteration + 1 == self.num_samples:
-            return None
+            return False
         if plan is not None and self._waiting:
             from shiftsim.sim.sensing import exchange
 
-            plan = exchange(self._waiting, plan, self._clock[row + 1])
+            plan = exchange(self._waiting, plan, next_us)
         # nuPlan rule 13: the ego moves first, and the traffic sees where it was before
-        self._move_ego(plan)
-        return Move(iteration, self._ego[row], self._tracks, row + 1)
+        if plan is None or controller == "log-playback":
+            after[:] = self.scenario.ego[self.scenario.iteration_rows[iteration + 1]]
+        elif controller == "lqr":
+            command, noise = self._commands[iteration], self._noise[iteration]
+            follow(plan, (now_us, next_us), (state, after), command, noise)
+        elif isinstance(plan, Command):
+            raise ConfigError(
+                "perfect tracking needs a planner that returns a trajectory, not a command",
+                hint="use the controller 'lqr', which sends commands to the motion model",
+            )
+        else:
+            follow_perfectly(plan, next_us, after)
+        return True
 
     def _go_on(self) -> None:
         """Go to the next sample, which may be the last one."""
@@ -170,37 +185,15 @@ class Rollout:
             # nuPlan rule 719: interPlan asks the planner once more where the goal is reached
             self.num_samples = self.iteration + 1
 
-    def _checked(self, plan: Any) -> Trajectory | Command:
-        """The plan in log time; its poses are noted."""
-        iteration, row = self.iteration, self._start + self.iteration
-        now_us = self._clock[row]
-        plan = executable(plan, now_us, self._clock[row + 1], f"iteration {iteration}: ")
-        if isinstance(plan, Command):
-            return plan
-        plan = self._sensing.to_truth(plan, row) if self._sensing else plan
-        poses = self._plans[iteration]
-        sample_poses(plan.time_us, plan.states, now_us, KEPT_US, poses)
-        if iteration == 0 and self.setting.controller == "lqr":
-            self.warning = find_warning(plan, poses[0], self._ego[row])
-        return plan
-
-    def _move_ego(self, plan: Plan) -> None:
-        """Write the next state of the ego, and note the command."""
-        iteration, row = self.iteration, self._start + self.iteration
-        now_us, next_us = self._clock[row : row + 2]
-        after, controller = self._ego[row + 1], self.setting.controller
-        if plan is None or controller == "log-playback":
-            after[:] = self.scenario.ego[self.scenario.iteration_rows[iteration + 1]]
-        elif controller == "lqr":
-            states, command = (self._ego[row], after), self._commands[iteration]
-            follow(plan, (now_us, next_us), states, command, self._noise[iteration])
-        elif isinstance(plan, Command):
-            raise ConfigError(
-                "perfect tracking needs a planner that returns a trajectory, not a command",
-                hint="use the controller 'lqr', which sends commands to the motion model",
-            )
-        else:
-            follow_perfectly(plan, next_us, after)
+    def _note_fallback(self) -> None:
+        """Note whether the plan is a fallback by the planner's own account."""
+        if reason := getattr(self.planner, "degraded", ""):
+            if self.setting.strict:
+                raise PlannerError(
+                    f"the planner fell back at iteration {self.iteration}: {reason}",
+                    hint="without --strict it continues, and the step is counted as degraded",
+                )
+            self._degraded[self.iteration] = True
 
     def snapshot(self, action: Any = None) -> Snapshot:
         """What a rollout can go on from as this one would; `action` is kept with it.
@@ -303,8 +296,8 @@ def executable(plan: Any, now_us: int, next_us: int, where: str = "") -> Traject
         raise InvalidTrajectoryError(f"{where}{fault.message}", fault.hint)
     if isinstance(plan, Command):
         return plan
-    times, states = contiguous(plan.time_us), contiguous(plan.states)
-    return Trajectory(times + now_us if plan.relative else times, states)
+    times = plan.time_us + now_us if plan.relative else contiguous(plan.time_us)
+    return Trajectory(times, contiguous(plan.states))
 
 
 def follow(
@@ -315,7 +308,7 @@ def follow(
     noise: FloatArray,
 ) -> None:
     """Move a vehicle by an executable plan: tracker and kinematic bicycle, or that alone."""
-    (now_us, next_us), (state, after), (accel, rate) = step, states, noise
+    (now_us, next_us), (state, after), (accel, rate) = step, states, noise.tolist()
     if isinstance(plan, Command):
         command[:] = plan.acceleration, plan.steering_rate
         command_and_step(now_us, next_us, state, command, accel, rate, after)
@@ -393,11 +386,12 @@ def simulate_together(
         moves: dict[int, Move] = {}
         for index, plan, share in zip(active, plans, seconds, strict=True):
             rollout = rollouts[index]
-            move = plan if isinstance(plan, Exception) else _attempt(rollout._follow, plan, share)
-            if isinstance(move, Exception):
-                ended[index] = move
-            elif move is not None:
-                moves[index] = move
+            moved = plan if isinstance(plan, Exception) else _attempt(rollout._follow, plan, share)
+            if isinstance(moved, Exception):
+                ended[index] = moved
+            elif moved:
+                at, row = rollout.iteration, rollout._start + rollout.iteration
+                moves[index] = Move(at, rollout._ego[row], rollout._tracks, row + 1)
         batch = [i for i in moves if isinstance(rollouts[i]._traffic, BatchTraffic)]
         if batch:
             models = [cast(BatchTraffic, rollouts[i]._traffic) for i in batch]

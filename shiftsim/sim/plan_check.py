@@ -40,9 +40,15 @@ def find_fault(plan: Any, now_us: int, next_us: int) -> Fault | None:
             "return shiftsim.Trajectory.from_poses(times, poses) or a shiftsim.Command",
         )
     times, states = plan.time_us, plan.states
-    if not (_is_array(times, 1, np.int64) and _is_array(states, 2, np.float64)) or (
-        states.shape != (len(times), NUM_STATE)
-    ):
+    fits = (
+        isinstance(times, np.ndarray)
+        and isinstance(states, np.ndarray)
+        and times.ndim == 1
+        and times.dtype == np.int64
+        and states.dtype == np.float64
+        and states.shape == (len(times), NUM_STATE)
+    )
+    if not fits:
         return Fault(
             "shapes",
             f"time_us is {_describe(times)} and states is {_describe(states)}; "
@@ -51,8 +57,8 @@ def find_fault(plan: Any, now_us: int, next_us: int) -> Fault | None:
         )
     if plan.relative:
         now_us, next_us = 0, next_us - now_us
-    code, row, column = check_values(contiguous(times), contiguous(states), now_us, next_us)
-    return None if code == GOOD else _explain(code, row, column, plan, now_us, next_us)
+    code = check_values(contiguous(times), contiguous(states), now_us, next_us)
+    return None if code == GOOD else _explain(code, plan, now_us, next_us)
 
 
 def is_short(plan: object) -> bool:
@@ -87,10 +93,6 @@ def _find_command_fault(command: Command) -> Fault | None:
     return None
 
 
-def _is_array(value: object, ndim: int, dtype: type) -> bool:
-    return isinstance(value, np.ndarray) and value.ndim == ndim and value.dtype == dtype
-
-
 def contiguous(array: Any) -> Any:
     """The array, or a contiguous writable copy: kernels are compiled for that kind alone."""
     return array if array.flags.carray else array.copy()
@@ -103,33 +105,31 @@ def _describe(value: object) -> str:
 
 
 @kernel
-def check_values(
-    time_us: IntArray, states: FloatArray, now_us: int, next_us: int
-) -> tuple[int, int, int]:
-    """GOOD, or what is wrong with a plan, and the row and column where."""
+def check_values(time_us: IntArray, states: FloatArray, now_us: int, next_us: int) -> int:
+    """GOOD, or what is wrong with a plan."""
     for row in range(1, len(time_us)):
         if time_us[row] <= time_us[row - 1]:
-            return _NOT_INCREASING, row, 0
-    for row in range(len(states)):
-        for column in range(states.shape[1]):
-            if not abs(states[row, column]) <= LARGEST:  # NaN is not, either
-                return _TOO_LARGE, row, column
+            return _NOT_INCREASING
+    num_good = 0
+    for value in states.flat:
+        num_good += 1 if abs(value) <= LARGEST else 0  # NaN is not
+    if num_good < states.size:
+        return _TOO_LARGE
     if len(time_us) < 2 or float(time_us[-1]) - float(time_us[0]) < MIN_SPAN_US:
-        return _TOO_SHORT, 0, 0
+        return _TOO_SHORT
     if float(time_us[-1]) - float(time_us[0]) > MAX_SPAN_US:  # a difference of integers wraps
-        return _TOO_LONG, 0, 0
+        return _TOO_LONG
     if time_us[0] > now_us:
-        return _STARTS_LATE, 0, 0
+        return _STARTS_LATE
     if time_us[-1] < next_us:
-        return _ENDS_EARLY, 0, 0
-    return GOOD, 0, 0
+        return _ENDS_EARLY
+    return GOOD
 
 
-def _explain(
-    code: int, row: int, column: int, plan: Trajectory, now_us: int, next_us: int
-) -> Fault:
+def _explain(code: int, plan: Trajectory, now_us: int, next_us: int) -> Fault:
     times = plan.time_us
     if code == _NOT_INCREASING:
+        row = int(np.argmax(times[1:] <= times[:-1])) + 1
         return Fault(
             "times",
             f"time {row} of the plan is {times[row]} us, not after time {row - 1} "
@@ -137,6 +137,7 @@ def _explain(
             "times must increase strictly",
         )
     if code == _TOO_LARGE:
+        row, column = np.argwhere(~(np.abs(plan.states) <= LARGEST))[0]
         return Fault(
             "finite",
             f"{STATE_COLUMNS[column]} of state {row} is {plan.states[row, column]}",

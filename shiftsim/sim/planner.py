@@ -27,6 +27,7 @@ from shiftsim.world.state import (
 
 # nuPlan rule 10: 2.1 s and the present, not 2.0 s
 HISTORY_SAMPLES = 22
+_share: Any = np.from_dlpack if KEEPS_READ_ONLY else readonly  # read-only views, without a way back
 Made = TypeVar("Made")
 
 
@@ -299,17 +300,17 @@ class ObservationBuilder:
         self, time_us: IntArray, ego: FloatArray, tracks: Tracks, lights: TrafficLights
     ) -> None:
         """Arrays of a rollout."""
-        self._arrays = [array.view() for array in (time_us, ego, *tracks.arrays)]
-        self._lights = lights
-        for view in self._arrays:
+        views = [array.view() for array in (time_us, ego, *tracks.arrays, lights.status)]
+        for view in views:
             view.flags.writeable = not KEEPS_READ_ONLY  # once, not step by step
+        *self._arrays, self._status = views
         self._whose = readonly(tracks.kinds), tracks.tokens
+        self._connectors = lights.connector_ids
 
     def at(self, iteration: int, row: int) -> Observation:
         """What a planner sees at an iteration, which is a row of the arrays."""
         past = slice(max(row + 1 - HISTORY_SAMPLES, 0), row + 1)
-        time_us, ego, valid, poses, velocities, sizes = [readonly(a[past]) for a in self._arrays]
+        time_us, ego, valid, poses, velocities, sizes = [_share(a[past]) for a in self._arrays]
         tracks = Tracks(valid, poses, velocities, sizes, *self._whose)
-        status = readonly(self._lights.status[row : row + 1])
-        lights = TrafficLights(self._lights.connector_ids, status)
+        lights = TrafficLights(self._connectors, _share(self._status[row : row + 1]))
         return Observation(iteration, int(time_us[-1]), History(time_us, ego, tracks), lights)

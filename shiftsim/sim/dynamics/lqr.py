@@ -22,10 +22,9 @@ import numpy as np
 
 from shiftsim.errors import InvalidTrajectoryError
 from shiftsim.geometry.boxes import wrap_angle
-from shiftsim.geometry.polylines import interpolate as between
 from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.sim.dynamics.bicycle import command_and_step
-from shiftsim.sim.dynamics.perfect import interpolate, unwrap_correction
+from shiftsim.sim.dynamics.perfect import interpolate, sample_poses
 from shiftsim.world.state import HEADING, NUM_STATE, PACIFICA, STEERING, VX, X, Y
 
 INITIAL_CURVATURE_PENALTY = 1e-10  # nuPlan tracker utilities
@@ -75,34 +74,6 @@ class Reference(NamedTuple):
 def num_resampled(traj_time_us: IntArray, step_us: int) -> int:
     """Number of poses of a trajectory at whole steps from its start."""
     return (traj_time_us[-1] - traj_time_us[0]) // step_us + 1
-
-
-@kernel
-def resample_poses(
-    traj_time_us: IntArray, traj_states: FloatArray, step_us: int, out: FloatArray
-) -> None:
-    """Poses at whole steps from the start of a trajectory, into `out` (N, 3).
-
-    The same numbers as `perfect.interpolate` at each time, in one sweep.
-    """
-    end, turn, query = 1, 0.0, traj_time_us[0]
-    next_turn = unwrap_correction(traj_states[0, HEADING], traj_states[1, HEADING])
-    for row in range(len(out)):
-        while traj_time_us[end] < query:
-            end += 1
-            turn = next_turn
-            next_turn = turn + unwrap_correction(
-                traj_states[end - 1, HEADING], traj_states[end, HEADING]
-            )
-        begin = end - 1
-        span = float(traj_time_us[end] - traj_time_us[begin])
-        ahead = float(query - traj_time_us[begin])
-        x, y, heading = traj_states[begin, X], traj_states[begin, Y], traj_states[begin, HEADING]
-        out[row, 0] = between(x, traj_states[end, X], span, ahead)
-        out[row, 1] = between(y, traj_states[end, Y], span, ahead)
-        last = traj_states[end, HEADING] + next_turn
-        out[row, 2] = wrap_angle(between(heading + turn, last, span, ahead))
-        query += step_us
 
 
 @kernel
@@ -206,8 +177,9 @@ def fit_profiles(
     """Speed [m/s] and curvature [1/m] profiles (M,) at whole steps from the plan's start."""
     # nuPlan rule 20: the whole plan is fitted, not the second that the tracker looks ahead
     dt = params.step_us / 1e6
-    poses = np.empty((num_resampled(traj_time_us, params.step_us), 3))
-    resample_poses(traj_time_us, traj_states, params.step_us, poses)
+    ahead_us = np.arange(0, traj_time_us[-1] - traj_time_us[0] + 1, params.step_us)
+    poses = np.empty((len(ahead_us), 3))
+    sample_poses(traj_time_us, traj_states, traj_time_us[0], ahead_us, poses)
     speed, curvature = np.empty(len(poses) - 1), np.empty(len(poses) - 1)
     fit_speed(poses, dt, params.jerk_penalty, speed)
     fit_curvature(poses, speed, dt, params.curvature_rate_penalty, curvature)

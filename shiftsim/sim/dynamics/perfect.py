@@ -13,7 +13,6 @@ from shiftsim.geometry.polylines import interpolate as between
 from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.world.state import (
     HEADING,
-    NUM_STATE,
     STEERING,
     STEERING_RATE,
     VX,
@@ -91,16 +90,32 @@ def interpolate(
 def sample_poses(
     traj_time_us: IntArray,
     traj_states: FloatArray,
-    now_us: int,
+    start_us: int,
     ahead_us: IntArray,
     out: FloatArray,
 ) -> None:
-    """Poses of a trajectory at times (P,) from now on, into `out` (P, 3); NaN where it has none."""
-    state = np.empty(NUM_STATE)
+    """Poses of a trajectory at ascending times (P,) after a start, into `out` (P, 3).
+
+    The same numbers as `interpolate` at each time, in one sweep; NaN where it covers none.
+    """
+    last, end, turn, next_turn = len(traj_time_us) - 1, 0, 0.0, 0.0
     for row in range(len(out)):
-        covered = interpolate(traj_time_us, traj_states, now_us + ahead_us[row], state)
-        for column in range(3):
-            out[row, column] = state[column] if covered else np.nan
+        query = start_us + ahead_us[row]
+        if last < 1 or query < traj_time_us[0] or query > traj_time_us[last]:
+            out[row] = np.nan
+            continue
+        while end < 1 or traj_time_us[end] < query:
+            end, turn = end + 1, next_turn
+            before, after = traj_states[end - 1, HEADING], traj_states[end, HEADING]
+            next_turn = turn + unwrap_correction(before, after)
+        begin = end - 1
+        span = float(traj_time_us[end] - traj_time_us[begin])
+        ahead = float(query - traj_time_us[begin])
+        for column in range(HEADING):
+            first, final = traj_states[begin, column], traj_states[end, column]
+            out[row, column] = between(first, final, span, ahead)
+        first, final = traj_states[begin, HEADING] + turn, traj_states[end, HEADING] + next_turn
+        out[row, HEADING] = wrap_angle(between(first, final, span, ahead))
 
 
 def follow_perfectly(plan: Trajectory, next_us: int, out: FloatArray) -> None:

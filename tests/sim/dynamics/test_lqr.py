@@ -86,21 +86,6 @@ def test_other_steps_and_penalties_give_other_fits(dt, jerk, rate, rng):
     np.testing.assert_allclose(curvatures, expected, rtol=0.0, atol=1e-9)
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(3, 40))
-def test_resampling_in_one_sweep_is_interpolation_at_each_time(seed, count):
-    rng = np.random.default_rng(seed)
-    time_us = NOW + np.cumsum(rng.integers(5_000, 400_000, count))
-    states = rng.uniform(-3.0, 3.0, (count, NUM_STATE))
-    poses = np.empty((lqr.num_resampled(time_us, STEP_US), 3))
-
-    lqr.resample_poses(time_us, states, STEP_US, poses)
-
-    one = np.empty(NUM_STATE)
-    for row, pose in enumerate(poses):
-        assert interpolate(time_us, states, int(time_us[0]) + row * STEP_US, one)
-        np.testing.assert_array_equal(pose, one[:3])
-
-
 @given(st.integers(0, 2**32 - 1), st.floats(-1.0, 5.0))
 def test_a_profile_is_read_as_numpy_interpolates(seed, seconds):
     profile = np.random.default_rng(seed).normal(size=30)

@@ -122,6 +122,24 @@ def test_nothing_is_extrapolated(query):
     np.testing.assert_array_equal(out, 7.0)
 
 
+@given(st.integers(0, 2**32 - 1), st.integers(1, 40))
+def test_poses_are_sampled_in_one_sweep_as_at_each_time(seed, count):
+    rng = np.random.default_rng(seed)
+    time_us = 1_630_000_000_000_000 + np.cumsum(rng.integers(5_000, 400_000, count))
+    states = rng.uniform(-3.0, 3.0, (count, NUM_STATE))
+    start_us = int(time_us[0]) - 200_000
+    ahead_us = np.append(100_000 * np.arange(count), [200_000, time_us[-1] - start_us])
+    ahead_us.sort()
+    poses = np.empty((len(ahead_us), 3))
+
+    sample_poses(time_us, states, start_us, ahead_us, poses)
+
+    for ahead, pose in zip(ahead_us.tolist(), poses, strict=True):
+        one = np.full(NUM_STATE, np.nan)
+        interpolate(time_us, states, start_us + ahead, one)
+        np.testing.assert_array_equal(pose, one[:3])
+
+
 def test_poses_behind_the_end_of_a_plan_are_absent():
     time_us, states = two_states()
     states[1, 0] = 10.0
