@@ -8,6 +8,7 @@ rewrites rows as the rollout proceeds. A model is any object with the two method
 
 import inspect
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from shiftsim.errors import ConfigError, one_of
@@ -120,6 +121,7 @@ def make_traffic(name: str, device: str = "") -> Traffic:
     return model
 
 
+@cache  # takes as long as ten steps
 def _takes_device(make: Any) -> bool:
     try:
         return "device" in inspect.signature(make).parameters
