@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from shiftsim.errors import DataError
+from shiftsim.errors import DataError, missing_attribute
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.metrics import (
     collision,
@@ -104,6 +104,9 @@ class MetricResult:
     thresholds: str  # name of the threshold profile
     measurements: Measurements  # routes, collisions, signals and distances behind the scores
     extra: tuple[MetricRow, ...] = ()  # rows of the user's own metrics; they never enter the score
+
+
+setattr(MetricResult, "__getattr__", missing_attribute)  # noqa: B010
 
 
 def measure(log: SimulationLog, map: VectorMap) -> Measurements:

@@ -4,8 +4,10 @@ import copy
 import pickle
 import re
 import shutil
+import subprocess
 import sys
 import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -119,6 +121,21 @@ def test_a_planner_is_made_or_driven_by_its_name(scenario, log):
     assert (again.ego == log.ego).all()
     with pytest.raises(shiftsim.ShiftsimError, match="did you mean 'idm'"):
         shiftsim.simulate(scenario, "idmm")
+
+
+@pytest.mark.slow
+def test_a_rollout_loads_what_it_needs(store):
+    code = (
+        "import shiftsim, sys\n"
+        f"scenario = shiftsim.open_store({str(store.path)!r})[{store.tokens[0]!r}]\n"
+        "shiftsim.simulate(scenario, 'idm')\n"
+        "ours = (m for name, m in sys.modules.items() if name.split('.')[0] == 'shiftsim')\n"
+        "print(*(m.__file__ for m in ours if m.__file__))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    paths = [Path(path) for path in done.stdout.split()]
+    assert len(paths) <= 55
+    assert sum(len(path.read_text().splitlines()) for path in paths) <= 10_500
 
 
 def test_a_run_explains_and_plots_a_scenario(run, scenario, tmp_path):

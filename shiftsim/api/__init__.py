@@ -16,7 +16,6 @@ from shiftsim.data import open_store as open_store
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.errors import ConfigError, MissingExtraError, missing_attribute
 from shiftsim.files import DEFAULT_STORE, store_path
-from shiftsim.metrics import MetricResult
 from shiftsim.planners import registry
 from shiftsim.sim import loop
 from shiftsim.sim.log import DEFAULT, Setting, SimulationLog
@@ -333,7 +332,7 @@ for _kind in (Scenario, VectorMap):
     setattr(_kind, "plot", _plot)  # noqa: B010
 _kinds: tuple[type, ...] = (
     *(Scenario, ScenarioStore, Observation, SceneInfo, EgoState, Tracks),
-    *(SimulationLog, Trajectory, MetricResult, VectorMap),
+    *(SimulationLog, Trajectory, VectorMap),
 )
 for _answering in _kinds:
     setattr(_answering, "__getattr__", missing_attribute)  # noqa: B010
