@@ -133,7 +133,11 @@ def fill(raster: Raster, xy: IntArray, value: int, is_box: bool) -> None:
             columns[row, counts[row]] = (start + (row - first) * slope) >> 16
             counts[row] += 1
     for row in range(max(top, 0), min(bottom, height - 1) + 1):
-        ends = np.sort(columns[row, : counts[row]])
+        ends = columns[row, : counts[row]]
+        if len(ends) > 2:
+            ends.sort()
+        elif len(ends) == 2 and ends[0] > ends[1]:
+            ends[0], ends[1] = ends[1], ends[0]
         for index in range(0, len(ends) - 1, 2):
             for column in range(max(ends[index], 0), min(ends[index + 1] + 1, width)):
                 raster[row, column] = value

@@ -129,10 +129,11 @@ def _draw_edge(
         if line == NONE or value == 0:
             continue
         xy = roads.lines.xy[roads.lines.ptr[line] : roads.lines.ptr[line + 1]]
-        for vertex in range(len(xy) - 1):
-            x0, y0 = _to_pixel(frame, xy[vertex, 0], xy[vertex, 1])
-            x1, y1 = _to_pixel(frame, xy[vertex + 1, 0], xy[vertex + 1, 1])
+        x0, y0 = _to_pixel(frame, xy[0, 0], xy[0, 1])
+        for vertex in range(1, len(xy)):
+            x1, y1 = _to_pixel(frame, xy[vertex, 0], xy[vertex, 1])
             draw_line(rasters[channel], x0, y0, x1, y1, value)
+            x0, y0 = x1, y1
 
 
 @kernel
