@@ -59,9 +59,11 @@ def static_objects(tracks: Tracks, drivable: Drivable, x: float, y: float) -> St
     distances = np.hypot(poses[here, 0] - x, poses[here, 1] - y)
     here, distances = here[distances <= SEEN_RADIUS], distances[distances <= SEEN_RADIUS]
     if len(here):
-        areas, near = drivable.areas.polygons, drivable.selected
+        areas = drivable.areas.polygons
+        is_near = np.zeros(len(areas.bounds), np.bool_)
+        is_near[drivable.selected] = True
         corners = boxes_to_corners(poses[here], sizes[here])
-        on_road = [np.isin(meeting(areas, box), near).any() for box in corners]
+        on_road = [is_near[meeting(areas, box)].any() for box in corners]
         here, distances = here[on_road], distances[on_road]
     order = np.argsort(categories[here], kind="stable")
     here = here[order]
