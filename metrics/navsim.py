@@ -221,8 +221,7 @@ def evaluate(
     met = (meet(places.ProposalStates(*a), *b, SIZE, ground.intersections) for a, b in pairs)
     fault, fault_index, ttc_index = map(np.concatenate, zip(*met, strict=True))
     points = shapely.points(at.centers)
-    with np.errstate(invalid="ignore"):  # shapely 2.0 leaves a flag behind
-        along = shapely.line_locate_point(ground.centerline, points[:, [0, -1]])
+    along = shapely.line_locate_point(ground.centerline, points[:, [0, -1]])
     # nuPlan rule 743: v2 has no wrong direction within intersections
     wrong_way = flags[..., places.OFF_ROUTE] & ~(crosses & (version == "v2"))
     way, off_road_index = way_off_route(at.centers, wrong_way), _first(off_road)

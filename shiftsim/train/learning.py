@@ -119,8 +119,9 @@ def _sum(parts: Iterable[BatchGradient]) -> BatchGradient:
     first, *others = parts
     loss, numbers = first.loss, first.numbers
     for other in others:
-        for total, gradient in zip(first.gradients, other.gradients, strict=True):
-            total.add_(gradient)
+        with torch.no_grad():  # torch 2.6 fills in zeros that want a gradient of their own
+            for total, gradient in zip(first.gradients, other.gradients, strict=True):
+                total.add_(gradient)
         loss, numbers = loss + other.loss, numbers + other.numbers
     return BatchGradient(first.gradients, loss, numbers)
 

@@ -1,4 +1,5 @@
 import json
+import re
 from functools import partial
 from itertools import pairwise
 
@@ -301,11 +302,11 @@ def test_the_command_makes_converts_and_filters(tmp_path):
         (("--seed", "1"), "--seed is of random towns only"),
         (("--domain", "home"), "--domain is of random towns only"),
         (("--towns", "1", "--limit", "2"), "--limit is of runs, --towns runs nothing"),
-        (("--towns", "0"), "'--towns': Input should be greater than or equal to 1"),
+        (("--towns", "0"), r"'--towns'.*(greater than or equal to 1|x>=1)"),  # as typer says it
     ],
 )
 def test_options_that_do_not_go_together_are_refused(tmp_path, words, told):
     done = call(tmp_path, "demo", *words)
     assert done.returncode == 1
-    assert told in done.stderr
+    assert re.search(told, done.stderr)
     assert list(tmp_path.iterdir()) == []
