@@ -27,7 +27,7 @@ from shiftsim.world.scenario import Scenario
 if TYPE_CHECKING:
     from shiftsim.data.store.review import Reviews
 
-_OPEN_FILES = 64  # recordings and egos whose files stay open
+_MOST_MAPPED = 64  # recordings, and egos, whose files stay mapped
 
 
 class ScenarioStore:
@@ -218,8 +218,8 @@ class ScenarioStore:
 
 
 def _limit(opened: dict[Any, Any]) -> None:
-    """Forget the oldest of too many open files."""
-    if len(opened) >= _OPEN_FILES:
+    """Forget the oldest of too many mapped files."""
+    if len(opened) >= _MOST_MAPPED:
         opened.pop(next(iter(opened)))
 
 

@@ -163,9 +163,9 @@ class Table:
             name for name in _NAMED if name in expected.names and "row" in expected.names
         ]
         try:
-            self._file = pq.ParquetFile(
-                path, memory_map=True, pre_buffer=False, read_dictionary=self._named
-            )
+            with pa.memory_map(str(path)) as file:
+                content = pa.BufferReader(file.read_buffer())  # mapped; the file need not stay open
+            self._file = pq.ParquetFile(content, pre_buffer=False, read_dictionary=self._named)
         except (OSError, ValueError, KeyError, pa.ArrowException) as error:  # KeyError: a name
             what = (
                 "is missing"

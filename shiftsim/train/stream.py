@@ -165,6 +165,7 @@ def pack(block: Block) -> Packed:
     parts = [buffer.raw() for buffer in found]
     starts = np.cumsum([0, *(-(-len(part) // ALIGNED) * ALIGNED for part in parts)]).tolist()
     memory = torch.empty(starts.pop(), dtype=torch.uint8)
+    memory.share_memory_()  # type: ignore[no-untyped-call]
     places = [(start, start + len(part)) for start, part in zip(starts, parts, strict=True)]
     for (start, end), part in zip(places, parts, strict=True):
         memory.numpy().data[start:end] = part

@@ -14,11 +14,8 @@ from processes import children
 from stores import write_toy_store
 
 import shiftsim
-from shiftsim.data.store.reading import _OPEN_FILES
 
 PLANNERS = ("constant-velocity", "idm", "log-future", "pdm-closed")
-# a worker keeps as many open: frames, lights and tracks of recordings, and egos
-FILES = 4 * _OPEN_FILES
 WORKERS = int(os.environ.get("SOAK_WORKERS", "2"))
 
 
@@ -88,8 +85,7 @@ def check(folder, traffic, *, scenarios, seeds, warm, growth):
         before, after = (np.median([s.memory for s in part]) for part in (early, late))
         print(f"{name}: {before:.1f} MB, then {after:.1f} MB; {late[-1].handles} handles")
         assert after <= growth * before, name
-        kept = 0 if pid == os.getpid() else FILES
-        allowed = max(seen[0].handles + kept, *(s.handles for s in early))
+        allowed = max(seen[0].handles, *(s.handles for s in early))
         assert max(s.handles for s in late) <= allowed, name
     keep = [token in last for token in rows(run)["token"].to_pylist()]
     assert rows(run).filter(keep).equals(rows(again))
