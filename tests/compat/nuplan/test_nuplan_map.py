@@ -5,8 +5,7 @@ import pytest
 import shapely
 from worlds import straight_road
 
-from shiftsim.compat.nuplan.bridge import map_objects
-from shiftsim.compat.nuplan.bridge.map import BridgeMap
+from shiftsim.compat.nuplan.bridge.map import _KINDS, BridgeMap
 from shiftsim.errors import MapError
 from shiftsim.world.build import AreaSpec, BlockSpec, EdgeSpec, build_map
 from shiftsim.world.layers import make_polylines
@@ -69,7 +68,7 @@ def test_planners_tell_objects_by_the_names_of_their_classes(road, layer, object
 def test_lines_stop_lines_and_areas_have_the_names_of_nuplan_too(road):
     lane = road.get_map_object("11", SemanticMapLayer.LANE)
     assert type(lane.baseline_path).__name__ == "NuPlanPolylineMapObject"
-    kinds = {name: kind.__name__ for name, kind in map_objects.KINDS.items()}
+    kinds = {name: kind.__name__ for name, kind in _KINDS.values()}
     assert kinds["stop_polygons"] == "NuPlanStopLine"
     assert kinds["crosswalks"] == kinds["car_parks"] == "NuPlanPolygonMapObject"
 
