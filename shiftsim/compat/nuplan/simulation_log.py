@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from shiftsim._version import __version__
+from shiftsim.compat.nuplan.shims.boxes import dimensions_of
 from shiftsim.data.nuplan.export_log import HEIGHTS, connector_number
 from shiftsim.files import atomic_write
 from shiftsim.kernels import FloatArray, IntArray
@@ -33,7 +34,6 @@ from shiftsim.world.state import PACIFICA, AgentKind, LightStatus
 MAP_VERSION = "nuplan-maps-v1.0"
 T = TypeVar("T")
 _FLOAT64 = np.dtype(np.float64)
-_COG = 1.67  # m, rear axle to centre of gravity, which nothing here depends on
 _ACTOR, _SIMULATION = "nuplan.common.actor_state", "nuplan.planning.simulation"
 _STATES = f"{_ACTOR}.state_representation"
 _SCENARIO, _MAPS = "nuplan.planning.scenario_builder.nuplan_db", "nuplan.common.maps"
@@ -165,10 +165,7 @@ def write_simulation_log(
         part.write_bytes(lzma.compress(b"\xc6" + pack(">I", len(data)) + data, preset=0))
 
 
-_VEHICLE = _DEVKIT.VehicleParameters(
-    *(PACIFICA.width, PACIFICA.front_length, PACIFICA.rear_length, _COG, PACIFICA.wheel_base),
-    *("pacifica", "gen1", PACIFICA.height),
-)
+_VEHICLE = _DEVKIT.VehicleParameters(*dimensions_of(PACIFICA))
 
 
 def _scenario_of(scenario: Scenario, database: Path, maps: Path) -> Any:

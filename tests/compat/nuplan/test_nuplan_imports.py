@@ -9,7 +9,7 @@ import pytest
 from commands import call
 
 from shiftsim.compat import nuplan
-from shiftsim.compat.nuplan.finder import MODULES
+from shiftsim.compat.nuplan import MODULES
 from shiftsim.errors import ConfigError, InvalidTrajectoryError, MissingExtraError, PlannerError
 from shiftsim.planners.registry import load_planner, planner_fingerprint
 
@@ -206,8 +206,8 @@ def test_all_missing_names_are_told_at_once(tmp_path, monkeypatch):
 
 def test_only_modules_that_need_torch_import_it(tmp_path):
     code = (
-        "import sys\nfrom shiftsim.compat.nuplan import finder\nfinder.install()\n"
-        "for name in finder.MODULES:\n    'torch' in name or __import__(name)\n"
+        "import sys\nfrom shiftsim.compat import nuplan as shims\nshims.install()\n"
+        "for name in shims.MODULES:\n    'torch' in name or __import__(name)\n"
         "print('torch' in sys.modules)\n"
     )
     assert _python(tmp_path, code).stdout.strip() == "False"

@@ -4,6 +4,6 @@ They are the devkit's where it is installed and the shims otherwise, so that thi
 same for both. Importing this package sees to it that the names exist.
 """
 
-from shiftsim.compat.nuplan.finder import install
+from shiftsim.compat.nuplan import install
 
 install()

@@ -29,6 +29,7 @@ from nuplan.planning.simulation.simulation_time_controller.simulation_iteration 
 from nuplan.planning.simulation.trajectory.abstract_trajectory import AbstractTrajectory
 from nuplan.planning.simulation.trajectory.interpolated_trajectory import InterpolatedTrajectory
 from shiftsim.compat.nuplan.bridge.map import BridgeMap
+from shiftsim.compat.nuplan.shims.boxes import dimensions_of
 from shiftsim.errors import ConfigError, PlannerError
 from shiftsim.kernels import FloatArray
 from shiftsim.sim.planner import HISTORY_SAMPLES, Observation, SceneInfo
@@ -39,16 +40,12 @@ from shiftsim.world.state import VehicleParameters as Dimensions
 HEIGHT = 1.8  # m, of all objects: the arrays of a scenario have none
 ROW_SECONDS = 0.05  # s, between the rows of a log
 _STEP_US = 100_000  # us, between the poses that the tracker reads
-_DIMENSIONS = ("width", "front_length", "rear_length", "wheel_base", "height")
-_COG = 1.67  # m, rear axle to the centre of gravity, nuPlan's pacifica
 _maps = PerMap(BridgeMap)
 
 
 def vehicle_parameters(vehicle: Dimensions) -> Any:
     """Dimensions of the ego."""
-    size = {name: getattr(vehicle, name) for name in _DIMENSIONS}
-    kind = {"vehicle_name": "pacifica", "vehicle_type": "gen1"}
-    return VehicleParameters(cog_position_from_rear_axle=_COG, **size, **kind)
+    return VehicleParameters(*dimensions_of(vehicle))
 
 
 def ego_state(time_us: int, row: FloatArray, vehicle: Any) -> Any:

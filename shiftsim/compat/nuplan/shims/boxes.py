@@ -1,7 +1,7 @@
 """Vehicle dimensions and oriented boxes."""
 
 import math
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, field
 from enum import IntEnum
 from functools import cached_property
 from typing import Any
@@ -14,9 +14,7 @@ from shiftsim.compat.nuplan.shims.transforms import (
     translate_longitudinally,
     translate_longitudinally_and_laterally,
 )
-from shiftsim.world.state import PACIFICA
-
-_DIMENSIONS = ("width", "front_length", "rear_length", "wheel_base", "height")
+from shiftsim.world import state
 
 
 class _Halves:
@@ -37,25 +35,21 @@ class BoxParameters(_Halves):
     length: float
 
 
+@dataclass(unsafe_hash=True)
 class VehicleParameters(BoxParameters):
     """Dimensions of a vehicle [m]."""
 
-    def __init__(
-        self,
-        width: float,
-        front_length: float,
-        rear_length: float,
-        cog_position_from_rear_axle: float,
-        wheel_base: float,
-        vehicle_name: str,
-        vehicle_type: str,
-        height: float | None = None,
-    ) -> None:
-        super().__init__(width, front_length + rear_length)
-        self.front_length, self.rear_length = front_length, rear_length
-        self.cog_position_from_rear_axle = cog_position_from_rear_axle
-        self.wheel_base, self.height = wheel_base, height
-        self.vehicle_name, self.vehicle_type = vehicle_name, vehicle_type
+    length: float = field(init=False)
+    front_length: float
+    rear_length: float
+    cog_position_from_rear_axle: float
+    wheel_base: float
+    vehicle_name: str
+    vehicle_type: str
+    height: float | None = None
+
+    def __post_init__(self) -> None:
+        self.length = self.front_length + self.rear_length
 
     rear_axle_to_center = derived(
         lambda self: self.half_length - self.rear_length,
@@ -66,22 +60,18 @@ class VehicleParameters(BoxParameters):
         "From the centre of gravity forward to the front axle [m].",
     )
 
-    def __hash__(self) -> int:
-        return hash(tuple(vars(self).values()))
 
-    def __repr__(self) -> str:
-        inside = ", ".join(f"{name}={value}" for name, value in vars(self).items())
-        return f"VehicleParameters({inside})"
+def dimensions_of(vehicle: state.VehicleParameters) -> tuple[Any, ...]:
+    """What nuPlan makes its own parameters of; a part of shiftsim."""
+    # rear axle to the centre of gravity [m], nuPlan's pacifica
+    axles = 1.67, vehicle.wheel_base
+    bumpers = vehicle.front_length, vehicle.rear_length
+    return vehicle.width, *bumpers, *axles, "pacifica", "gen1", vehicle.height
 
 
 def get_pacifica_parameters() -> VehicleParameters:
     """The car of nuPlan, which is also shiftsim's ego."""
-    return VehicleParameters(
-        **{name: getattr(PACIFICA, name) for name in _DIMENSIONS},
-        cog_position_from_rear_axle=1.67,
-        vehicle_name="pacifica",
-        vehicle_type="gen1",
-    )
+    return VehicleParameters(*dimensions_of(state.PACIFICA))
 
 
 class OrientedBoxPointType(IntEnum):
