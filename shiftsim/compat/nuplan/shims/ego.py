@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import InitVar, dataclass
 from functools import cached_property
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from shiftsim.compat.nuplan.shims.boxes import CarFootprint, OrientedBox, Vehicl
 from shiftsim.compat.nuplan.shims.geometry import StateSE2, StateVector2D, TimePoint, part
 from shiftsim.compat.nuplan.shims.objects import AgentState, SceneObjectMetadata, TrackedObjectType
 from shiftsim.compat.nuplan.shims.transforms import (
+    absolute_to_relative_poses,
     approximate_derivatives,
     lateral_projection,
     longitudinal_projection,
@@ -19,7 +21,6 @@ from shiftsim.compat.nuplan.shims.transforms import (
 )
 from shiftsim.kernels import FloatArray
 from shiftsim.sim.dynamics.bicycle import step_bicycle
-from shiftsim.world.state import NUM_STATE, STEERING, STEERING_RATE, YAW_ACCEL, YAW_RATE
 
 
 @dataclass
@@ -95,11 +96,9 @@ class Waypoint(InterpolatableState):
         time, x, y, *velocity = split_state.linear_states
         width, length, height = split_state.fixed_states
         known = all(v is not None and not np.isnan(v) for v in velocity)
-        return Waypoint(
-            TimePoint(int(time)),
-            OrientedBox(StateSE2(x, y, split_state.angular_states[0]), length, width, height),
-            StateVector2D(*velocity) if known else None,
-        )
+        moving = velocity if known else (None, None)
+        pose = x, y, split_state.angular_states[0]
+        return Waypoint.deserialize([time, *pose, length, width, height, *moving])
 
 
 def get_velocity_shifted(
@@ -283,24 +282,18 @@ class KinematicBicycleModel:
         self, state: EgoState, ideal_dynamic_state: DynamicCarState, sampling_time: TimePoint
     ) -> EgoState:
         """The next state, under the acceleration and steering rate of the ideal one."""
-        time, x, y, *others = state._numbers()
-        motion = state.dynamic_car_state
-        row = np.zeros(NUM_STATE)
-        row[: STEERING + 1] = x, y, state.rear_axle.heading, *others
-        row[STEERING_RATE] = motion.tire_steering_rate
-        row[[YAW_RATE, YAW_ACCEL]] = motion.angular_velocity, motion.angular_acceleration
+        time, *values = state
+        turning = attrgetter("tire_steering_rate", "angular_velocity", "angular_acceleration")
+        row = np.array([*values, *turning(state.dynamic_car_state)], np.float64)
         accel = float(ideal_dynamic_state.rear_axle_acceleration_2d.x)
         rate = float(ideal_dynamic_state.tire_steering_rate)
         step_bicycle(row, accel, rate, self._vehicle.wheel_base, sampling_time.time_s, row)
-        x, y, heading, vx, vy, ax, ay, steering, *turning = row.tolist()
-        steering_rate, yaw_rate, yaw_accel = turning
-        pose, velocity = StateSE2(x, y, heading), StateVector2D(vx, vy)
-        reached = StateVector2D(ax, ay)
-        now = TimePoint(time + sampling_time.time_us)
-        turn = (yaw_rate, yaw_accel, steering_rate)
-        return EgoState.build_from_rear_axle(
-            pose, velocity, reached, steering, now, self._vehicle, True, *turn
-        )
+        *values, steering_rate, yaw_rate, yaw_accel = row.tolist()
+        reached = EgoState.deserialize([time + sampling_time.time_us, *values], self._vehicle)
+        motion = reached.dynamic_car_state
+        motion.angular_velocity, motion.angular_acceleration = yaw_rate, yaw_accel
+        motion.tire_steering_rate = steering_rate
+        return reached
 
 
 # nuplan.planning.simulation.planner.ml_planner.transform_utils
@@ -376,6 +369,5 @@ def convert_absolute_to_relative_poses(
     origin_absolute_state: StateSE2, absolute_states: Sequence[StateSE2]
 ) -> Any:
     """(N, 3) float32 poses in the frame of an origin."""
-    inverse = np.linalg.inv(origin_absolute_state.as_matrix())
-    moved = (StateSE2.from_matrix(inverse @ pose.as_matrix()) for pose in absolute_states)
+    _, *moved = absolute_to_relative_poses([origin_absolute_state, *absolute_states])
     return np.array([pose.serialize() for pose in moved], np.float32)

@@ -110,31 +110,18 @@ class GraphEdgeMapObject(PolygonMapObject):
 class LaneGraphEdgeMapObject(GraphEdgeMapObject):
     """A lane or a lane connector."""
 
-    left_boundary: Any
-    right_boundary: Any
-
-    def get_roadblock_id(self) -> str:
-        """Id of its roadblock or roadblock connector."""
-        raise NotImplementedError
+    get_roadblock_id: Any  # of its roadblock or roadblock connector
 
     def is_same_roadblock(self, other: "LaneGraphEdgeMapObject") -> bool:
-        return self.get_roadblock_id() == other.get_roadblock_id()
+        return bool(self.get_roadblock_id() == other.get_roadblock_id())
 
 
 class Lane(LaneGraphEdgeMapObject):
     """A lane."""
 
-    stop_lines: Any = ()
-
-    def has_traffic_lights(self) -> bool:
-        """False: lights belong to connectors."""
-        return False
-
 
 class LaneConnector(LaneGraphEdgeMapObject):
     """A lane across an intersection."""
-
-    adjacent_edges: Any = (None, None)
 
 
 class RoadBlockGraphEdgeMapObject(GraphEdgeMapObject):

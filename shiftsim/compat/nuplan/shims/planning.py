@@ -111,9 +111,12 @@ class InterpolatedTrajectory(AbstractTrajectory):
 class TrajectorySampling:
     """How a trajectory is sampled; the third value follows from two."""
 
-    num_poses: int | None = None  # states beyond the present one
-    time_horizon: float | None = None  # from now to the last state [s]
-    interval_length: float | None = None  # between states [s]
+    # int, float and float: given, or found
+    num_poses: Any = None  # states beyond the present one
+    time_horizon: Any = None  # from now to the last state [s]
+    interval_length: Any = None  # between states [s]
+
+    step_time = part("interval_length", "Between states [s].")
 
     def __post_init__(self) -> None:
         count, horizon, interval = self.num_poses, self.time_horizon, self.interval_length
@@ -133,22 +136,12 @@ class TrajectorySampling:
             rest = math.fmod(horizon, interval)
             if min(rest, abs(interval - rest)) > _SAMPLING_TOLERANCE:
                 raise ValueError(f"the horizon is not a multiple of the interval: {self}")
-        assert horizon
-        assert interval
         self.num_poses, self.time_horizon = count, float(horizon)
         self.interval_length = float(interval)
-
-    @property
-    def step_time(self) -> float:
-        """Between states [s]."""
-        assert self.interval_length is not None
-        return self.interval_length
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, TrajectorySampling):
             return NotImplemented
-        assert self.time_horizon is not None
-        assert other.time_horizon is not None
         return (
             math.isclose(self.time_horizon, other.time_horizon)
             and math.isclose(self.step_time, other.step_time)
