@@ -9,7 +9,7 @@ nuPlan knows neither noise nor seeds, so each of them has a folder:
 """
 
 import pickle
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import datetime
@@ -154,40 +154,31 @@ def _write_tables(folder: Path, found: Mapping[Task, Row], began: datetime) -> N
         scenarios.append(result["key"] | scores | {"score": closed_loop_score(scores)})
     for metric, members in rows.items():
         _write_table(folder / _METRICS / f"{metric}.parquet", members)
-    metrics, means = sorted(rows), list[Row]()
+    metrics, table = sorted(rows), list[Row]()
     for planner in sorted({row["planner_name"] for row in scenarios}):
         own = [row for row in scenarios if row["planner_name"] == planner]
-        means += [{"scenario": row["scenario_name"], "num_scenarios": None, **row} for row in own]
+        for row in own:
+            name = row["scenario_name"], row["log_name"], row["scenario_type"], None
+            table.append(_scores(name, [row], metrics))
         for kind in dict.fromkeys(row["scenario_type"] for row in own):
             members = [row for row in own if row["scenario_type"] == kind]
             # nuPlan rule 606: metrics of a scenario type are added up, only the score is a mean
-            means.append(_several(kind, members, metrics, 1))
-        means.append(_several("final_score", own, metrics, len(own)))
-    if means:
-        columns = ("scenario", "log_name", "scenario_type", "num_scenarios", "planner_name")
-        tail = {"aggregator_type": "weighted_average"}
-        table = [
-            {name: row[name] for name in columns} | tail | {m: row[m] for m in (*metrics, "score")}
-            for row in means
-        ]
-        name = f"{folder.parent.name}_weighted_average_metrics_{began:%Y.%m.%d.%H.%M.%S}.parquet"
-        _write_table(folder / _MEANS / name, table)
+            table.append(_scores((kind, None, kind, float(len(members))), members, metrics))
+        final = "final_score", None, "final_score", float(len(own))
+        table.append(_scores(final, own, metrics, len(own)))
+    if table:
+        file = f"{folder.parent.name}_weighted_average_metrics_{began:%Y.%m.%d.%H.%M.%S}.parquet"
+        _write_table(folder / _MEANS / file, table)
 
 
-def _several(name: str, rows: Sequence[Row], metrics: Iterable[str], count: int) -> Row:
-    """A row of several scenarios: sums over a count, and the mean of the score."""
-    out = {
-        "scenario": name,
-        "log_name": None,
-        "scenario_type": name,
-        "num_scenarios": float(len(rows)),
-        "planner_name": rows[0]["planner_name"],
-        "score": float(np.mean([row["score"] for row in rows])),
-    }
+def _scores(name: tuple[Any, ...], rows: list[Row], metrics: list[str], count: int = 1) -> Row:
+    """A row of scores: its names, sums of metrics over a count, and the mean of the score."""
+    out = dict(zip(("scenario", "log_name", "scenario_type", "num_scenarios"), name, strict=True))
+    out |= {"planner_name": rows[0]["planner_name"], "aggregator_type": "weighted_average"}
     for metric in metrics:
         values = [row[metric] for row in rows if row[metric] is not None]
         out[metric] = float(np.sum(values)) / count if values else None
-    return out
+    return out | {"score": float(np.mean([row["score"] for row in rows]))}
 
 
 def _runner_row(row: Row, result: Row | None, names: Mapping[str, str]) -> Row:

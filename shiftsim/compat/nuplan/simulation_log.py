@@ -35,13 +35,9 @@ MAP_VERSION = "nuplan-maps-v1.0"
 T = TypeVar("T")
 _FLOAT64 = np.dtype(np.float64)
 _ACTOR, _SIMULATION = "nuplan.common.actor_state", "nuplan.planning.simulation"
-_STATES = f"{_ACTOR}.state_representation"
 _SCENARIO, _MAPS = "nuplan.planning.scenario_builder.nuplan_db", "nuplan.common.maps"
-_SLOTS = {  # attributes of classes that keep them in slots, all of one module
-    "StateSE2": ("heading", "x", "y"),
-    "StateVector2D": ("_x", "_y", "_array"),
-    "TimePoint": ("time_us",),
-}
+# classes that keep their attributes in slots
+_SLOTTED = {f"{_ACTOR}.state_representation": "StateSE2 StateVector2D TimePoint"}
 _PLAIN = {  # classes whose objects are made of their attributes, by module
     f"{_ACTOR}.agent": "Agent",
     f"{_ACTOR}.car_footprint": "CarFootprint",
@@ -79,14 +75,11 @@ class _Plain:
         self.__dict__ = attributes
 
 
-class _Slotted:
+class _Slotted(_Plain):
     """An object whose attributes are in slots."""
 
-    __slots__ = ()
-
-    def __init__(self, **attributes: Any) -> None:
-        for name, value in attributes.items():
-            setattr(self, name, value)
+    def __getstate__(self) -> tuple[None, dict[str, Any]]:
+        return None, self.__dict__
 
 
 class _Called:
@@ -102,14 +95,10 @@ class _Called:
 _DEVKIT: Any = SimpleNamespace(
     **{
         name: type(name, (base,), {"__module__": module})
-        for base, classes in ((_Plain, _PLAIN), (_Called, _CALLED))
+        for base, classes in ((_Plain, _PLAIN), (_Slotted, _SLOTTED), (_Called, _CALLED))
         for module, names in classes.items()
         for name in names.split()
-    },
-    **{
-        name: type(name, (_Slotted,), {"__module__": _STATES, "__slots__": slots})
-        for name, slots in _SLOTS.items()
-    },
+    }
 )
 
 
@@ -130,23 +119,13 @@ def _importable() -> Iterator[None]:
         sys.modules.update(before)
 
 
-@contextmanager
-def _without_collector() -> Iterator[None]:
-    """Look for no garbage: among so many objects that takes as long as all the rest."""
-    was_enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_enabled:
-            gc.enable()
-
-
 def write_simulation_log(
     path: Path, task: Task, scenario: Scenario, log: SimulationLog, *, database: Path, maps: Path
 ) -> None:
     """Write a rollout as a simulation log; nuPlan's tools look in `database` and `maps`."""
-    with _without_collector():
+    was_enabled = gc.isenabled()
+    gc.disable()  # among so many objects that takes as long as all the rest
+    try:
         planner = _DEVKIT.SimplePlanner(
             _compute_trajectory_runtimes=log.planning_seconds.tolist(),
             name=partial(str, task.planner),
@@ -160,6 +139,9 @@ def write_simulation_log(
         )
         with _importable():
             data = pickle.dumps(found, 5)
+    finally:
+        if was_enabled:
+            gc.enable()
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as part:
         part.write_bytes(lzma.compress(b"\xc6" + pack(">I", len(data)) + data, preset=0))
