@@ -96,39 +96,6 @@ def traffic_lights(time_us: int, lights: TrafficLights) -> list[Any]:
     ]
 
 
-class HistoryKeeper:
-    """The history of a rollout; it grows by one sample per step, as nuPlan's own does."""
-
-    def __init__(self, scene: SceneInfo) -> None:
-        self._vehicle = vehicle_parameters(scene.vehicle)
-        step = float(np.median(np.diff(scene.times))) * 1e-6
-        self._interval = ROW_SECONDS * round(step / ROW_SECONDS)
-        self._buffer: Any = None
-        self._iteration = -1
-
-    def planner_input(self, observation: Observation) -> Any:
-        """What nuPlan's planner is given at this iteration."""
-        history = observation.history
-        last = len(history.time_us) - 1
-        if self._buffer is None or observation.iteration != self._iteration + 1:
-            samples = [self._sample(observation, row) for row in range(last + 1)]
-            egos, seen = (list(part) for part in zip(*samples, strict=True))
-            make = SimulationHistoryBuffer.initialize_from_list
-            self._buffer = make(HISTORY_SAMPLES, egos, seen, self._interval)
-        else:
-            self._buffer.append(*self._sample(observation, last))
-        self._iteration = observation.iteration
-        now_us = int(observation.time_us)
-        now = SimulationIteration(TimePoint(now_us), observation.iteration)
-        return PlannerInput(now, self._buffer, traffic_lights(now_us, observation.lights))
-
-    def _sample(self, observation: Observation, row: int) -> tuple[Any, Any]:
-        history = observation.history
-        time_us = int(history.time_us[row])
-        seen = ObservedTracks(time_us, history.tracks.rows(slice(row, row + 1)))
-        return ego_state(time_us, history.ego[row], self._vehicle), seen
-
-
 def to_trajectory(plan: Any, now_us: int, next_us: int, planner: str) -> Trajectory:
     """What a planner returned, as ours; the times are those of this iteration and the next [us].
 
@@ -177,7 +144,9 @@ class NuplanPlanner:
         self.name = str(self._planner.name())
         self.report: Any = None  # what the planner reported of the scenario before
         self._scene: SceneInfo | None = None
-        self._history: HistoryKeeper | None = None
+        self._vehicle: Any = None
+        self._buffer: Any = None
+        self._iteration = -1
 
     def _make(self) -> Any:
         fresh = inspect.isclass(self._source)
@@ -195,19 +164,41 @@ class NuplanPlanner:
                 hint="shiftsim has tracks, no sensor data: observation_type() must be "
                 "DetectionsTracks",
             )
-        self._scene, self._history = scene, HistoryKeeper(scene)
+        self._scene, self._vehicle, self._buffer = scene, vehicle_parameters(scene.vehicle), None
         goal: Any = None if scene.goal is None else StateSE2(*scene.goal.tolist())
         self._planner.initialize(PlannerInitialization(list(scene.route), goal, _maps(scene.map)))
 
     def plan(self, observation: Observation) -> Trajectory:
         """The planner's trajectory; a PlannerError where it returned something else."""
-        if self._scene is None or self._history is None:
+        if self._scene is None:
             raise PlannerError(f"planner {self.name!r}: plan() was called before reset()")
-        found = self._planner.compute_trajectory(self._history.planner_input(observation))
-        times = self._scene.times
-        following = min(observation.iteration + 1, len(times) - 1)
-        now_us, next_us = int(observation.time_us), int(times[following])
+        now_us, times = int(observation.time_us), self._scene.times
+        self._remember(observation, self._scene)
+        now = SimulationIteration(TimePoint(now_us), observation.iteration)
+        given = PlannerInput(now, self._buffer, traffic_lights(now_us, observation.lights))
+        found = self._planner.compute_trajectory(given)
+        next_us = int(times[min(observation.iteration + 1, len(times) - 1)])
         return to_trajectory(found, now_us, next_us, self.name)
+
+    def _remember(self, observation: Observation, scene: SceneInfo) -> None:
+        """Let the history grow by one sample per step, as nuPlan's own does."""
+        history = observation.history
+
+        def sample(row: int) -> tuple[Any, Any]:
+            time_us = int(history.time_us[row])
+            seen = ObservedTracks(time_us, history.tracks.rows(slice(row, row + 1)))
+            return ego_state(time_us, history.ego[row], self._vehicle), seen
+
+        last = len(history.time_us) - 1
+        if self._buffer is None or observation.iteration != self._iteration + 1:
+            step = float(np.median(np.diff(scene.times))) * 1e-6
+            interval = ROW_SECONDS * round(step / ROW_SECONDS)
+            egos, seen = (list(part) for part in zip(*map(sample, range(last + 1)), strict=True))
+            make = SimulationHistoryBuffer.initialize_from_list
+            self._buffer = make(HISTORY_SAMPLES, egos, seen, interval)
+        else:
+            self._buffer.append(*sample(last))
+        self._iteration = observation.iteration
 
     def close(self) -> None:
         """Take the last report."""

@@ -288,11 +288,9 @@ def extract_ego_yaw_rate(
 
 def longitudinal_projection(state_vectors: FloatArray, headings: FloatArray) -> FloatArray:
     """(K,) parts of vectors (K, 2) along headings (K,)."""
-    found: FloatArray = np.cos(headings) * state_vectors[:, 0]
-    return found + np.sin(headings) * state_vectors[:, 1]
+    return np.cos(headings) * state_vectors[:, 0] + np.sin(headings) * state_vectors[:, 1]
 
 
 def lateral_projection(state_vectors: FloatArray, headings: FloatArray) -> FloatArray:
     """(K,) parts of vectors (K, 2) to the left of headings (K,)."""
-    found: FloatArray = -np.sin(headings) * state_vectors[:, 0]
-    return found + np.cos(headings) * state_vectors[:, 1]
+    return -np.sin(headings) * state_vectors[:, 0] + np.cos(headings) * state_vectors[:, 1]
