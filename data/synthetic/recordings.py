@@ -150,9 +150,14 @@ def usable(store: ScenarioStore) -> list[Window]:
 def _annotations(boxes: list[Box], parked: FloatArray) -> pa.Table:
     """Rows of `annotations.parquet`, by frame and track; cars parked at (n, 3) stay throughout."""
     names = sorted({*(box[2] for box in boxes), *(("car", "van") if len(parked) else ())})
-    moving = np.array([(*box[:2], names.index(box[2]), *box[3:]) for box in boxes])
-    rows = np.concatenate([moving, _parked_rows(moving, parked, names)])
-    rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
+    free = max(box[1] for box in boxes) + 1  # the first number that no track has
+    still = [
+        (frame, free + place, "van" if place % 7 == 5 else "car", *pose, 0.0, 0.0, 0.0)
+        for frame in range(boxes[-1][0] + 1)
+        for place, pose in enumerate(parked.tolist())
+    ]
+    every = sorted([*boxes, *still])
+    rows = np.array([(*box[:2], names.index(box[2]), *box[3:]) for box in every])
     kinds = rows[:, 2].astype(np.int32)
     heading = wrap_angles(rows[:, 5])
     along = np.column_stack([np.cos(heading), np.sin(heading)])
@@ -179,30 +184,16 @@ def _annotations(boxes: list[Box], parked: FloatArray) -> pa.Table:
     return pa.table(columns)
 
 
-def _parked_rows(moving: FloatArray, parked: FloatArray, names: list[str]) -> FloatArray:
-    if not len(parked):
-        return np.zeros((0, moving.shape[1]))
-    frames = round(float(moving[:, 0].max())) + 1
-    tracks = moving[:, 1].max() + 1.0 + np.arange(len(parked))
-    kinds = np.where(np.arange(len(parked)) % 7 == 5, names.index("van"), names.index("car"))
-    still = np.column_stack([tracks, kinds, parked, np.zeros((len(parked), 3))])
-    return np.column_stack([np.repeat(np.arange(frames), len(parked)), np.tile(still, (frames, 1))])
-
-
 def _write_recording(folder: Path, start: datetime, table: pa.Table) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    _write(table, folder / "annotations.parquet")
     frames = np.arange(round(DURATION / DT) + 1)
     begin = int(start.timestamp()) * 1_000_000
     stamps = begin + np.rint(frames * _FRAME_DISTANCE / _FRAME_RATE * 1e6).astype(np.int64)
     ids = pa.array(_FRAME_DISTANCE * frames, pa.uint32())
-    times = pa.array(stamps, pa.timestamp("us", "UTC"))
-    _write(pa.table({"frame_id": ids, "time": times}), folder / "frames.parquet")
-
-
-def _write(table: pa.Table, path: Path) -> None:
-    schema = pa.schema([field.with_nullable(False) for field in table.schema])
-    pq.write_table(table.cast(schema), path, compression="zstd")
+    clock = pa.table({"frame_id": ids, "time": pa.array(stamps, pa.timestamp("us", "UTC"))})
+    for name, columns in (("annotations", table), ("frames", clock)):
+        schema = pa.schema([field.with_nullable(False) for field in columns.schema])
+        pq.write_table(columns.cast(schema), folder / f"{name}.parquet", compression="zstd")
 
 
 def _add_lights(store: Path, recording: str, town: Town, offset: FloatArray) -> None:
@@ -224,15 +215,12 @@ def _lit_connectors(
     road: VectorMap, town: Town, offset: FloatArray
 ) -> Iterator[tuple[int, Lights, int]]:
     """Connectors of the map that have a light, whose lights, and their phase."""
-    ends = {
-        spec.id: (spec.center_of(-1, np.array([0.0, spec.length]))[:, :2] + offset).ravel()
-        for spec in town.connectors.values()
-    }
-    numbers, places = list(ends), np.array(list(ends.values()))
+    specs = list(town.connectors.values())
+    ends = [spec.center_of(-1, np.array([0.0, spec.length]))[:, :2] + offset for spec in specs]
     for edge in range(road.num_lanes, len(road.edges)):
         line = road.baselines.at(edge)
-        gaps = np.hypot(*(places - np.concatenate([line[0], line[-1]])).reshape(-1, 2, 2).T).sum(0)
-        number = numbers[int(gaps.argmin())]
+        gaps = np.hypot(*(np.array(ends) - line[[0, -1]]).T).sum(0)
+        number = specs[int(gaps.argmin())].id
         assert gaps.min() < _SAME_PLACE, f"{road.name}: connector {road.edges.ids[edge]}"
         for lights in town.lights:
             for phase, group in enumerate(lights.phases):

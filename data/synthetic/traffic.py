@@ -41,6 +41,9 @@ class Traffic:
     # frame, track, category, x [m], y [m], heading [rad], speed [m/s], acceleration [m/s^2], yaw
     # rate [rad/s]
     boxes: list[Box] = field(default_factory=list)
+    # who is there now
+    _driving: list[Driver] = field(default_factory=list)
+    _on_foot: list[Pedestrian] = field(default_factory=list)
     # where pedestrians on a way over a crossing have left the way of drivers on a path [m]
     _passed: dict[tuple[int, int], float] = field(default_factory=dict)
     # connecting roads with a light that is not green
@@ -56,34 +59,35 @@ class Traffic:
         for number, agent in enumerate(everybody, start=1):
             agent.track = number
         waiting = list(self.drivers)
-        active: list[Driver] = []
         for frame in range(round(duration / DT) + 1):
             time = frame * DT
             for driver in [d for d in waiting if d.start <= time]:
-                if driver.has_room(active):
-                    active.append(driver)
+                if driver.has_room(self._driving):
+                    self._driving.append(driver)
                     waiting.remove(driver)
-            on_foot = [x for x in self.pedestrians if x.start <= time and x.s < x.walk.length - 0.5]
-            self.boxes += [
-                (frame, x.track, x.category, *x.pose, x.v, x.a, x.path.curvature(x.s) * x.v)
-                for x in active
+            begun = [x for x in self.pedestrians if x.start <= time]
+            self._on_foot = [x for x in begun if x.s < x.walk.length - 0.5]
+            for x in self._driving:
+                yaw_rate = x.path.curvature(x.s) * x.v
+                self.boxes.append((frame, x.track, x.category, *x.pose, x.v, x.a, yaw_rate))
+            for y in self._on_foot:
+                place = y.walk.at(y.s)
+                self.boxes.append((frame, y.track, "pedestrian", *place, y.v, 0.0, 0.0))
+            self._step(time)
+            self._driving = [
+                x for x in self._driving if x.path.is_parking or x.front < x.path.length - 1.0
             ]
-            self.boxes += [
-                (frame, x.track, "pedestrian", *x.walk.at(x.s), x.v, 0.0, 0.0) for x in on_foot
-            ]
-            self._step(active, on_foot, time)
-            active = [x for x in active if x.path.is_parking or x.front < x.path.length - 1.0]
         return self.boxes
 
-    def _step(self, drivers: list[Driver], pedestrians: list[Pedestrian], time: float) -> None:
+    def _step(self, time: float) -> None:
         lights = self.town.lights
         self._closed = {number for x in lights for number in x.closed(time)}
         self._waits = {name: wait for x in lights for name, wait in x.waits(time).items()}
-        self._admit(drivers)
-        bodies = _bodies(drivers)
-        wanted = [self._acceleration(d, drivers, pedestrians, bodies, time) for d in drivers]
-        self._let_walk(drivers, pedestrians)
-        for driver, accel in zip(drivers, wanted, strict=True):
+        self._admit()
+        bodies = _bodies(self._driving)
+        wanted = [self._acceleration(driver, bodies, time) for driver in self._driving]
+        self._let_walk()
+        for driver, accel in zip(self._driving, wanted, strict=True):
             driver.a += min(max(accel - driver.a, -1.5 * _JERK * DT), _JERK * DT)
             if driver.v + driver.a * DT < 0.0 or (driver.v < 0.02 and accel <= 0.0):
                 driver.move_to(driver.s + 0.5 * driver.v * DT)
@@ -91,11 +95,12 @@ class Traffic:
                 continue
             driver.move_to(driver.s + driver.v * DT + 0.5 * driver.a * DT * DT)
             driver.v += driver.a * DT
-        for pedestrian in pedestrians:
+        for pedestrian in self._on_foot:
             pedestrian.s += pedestrian.v * DT
 
-    def _admit(self, drivers: list[Driver]) -> None:
+    def _admit(self) -> None:
         """Let drivers into zones, by priority, where nobody in there is in their way."""
+        drivers = self._driving
         for driver in drivers:
             for admitted in driver.path.zones if driver.admitted else ():
                 must_stop = (  # a light has turned, and who was let in before can still stop
@@ -131,33 +136,24 @@ class Traffic:
             if (wanted.id, zone.id) in self.town.conflicts
         )
 
-    def _acceleration(
-        self,
-        driver: Driver,
-        drivers: list[Driver],
-        pedestrians: list[Pedestrian],
-        bodies: FloatArray,
-        time: float,
-    ) -> float:
+    def _acceleration(self, driver: Driver, bodies: FloatArray, time: float) -> float:
         index = min(int(driver.s / STEP), len(driver.path.speed) - 1)
         depth, period = driver.wave
         pace = driver.eager * (1.0 - depth * (0.5 - 0.5 * cos(2.0 * pi * time / period)))
         target = max(pace * float(driver.path.speed[index]), 0.5)
         free = _MAX_ACCEL * (1.0 - (driver.v / target) ** 4)
         accel = max(free, -1.8)
-        gap, lead_speed = _leader(driver, drivers, bodies)
+        gap, lead_speed = _leader(driver, self._driving, bodies)
         if gap < inf:
             closing = driver.v * (driver.v - lead_speed) / (2 * sqrt(_MAX_ACCEL * _BRAKING))
             wanted = _MIN_GAP + max(0.0, driver.v * _HEADWAY + closing)
             following = free - _MAX_ACCEL * (wanted / max(gap, 0.3)) ** 2
             accel = min(accel, max(following, -_HARDEST))
-        for name, place in self._places_to_wait(driver, drivers, pedestrians):
+        for name, place in self._places_to_wait(driver):
             accel = min(accel, _even_braking(driver, name, place))
         return accel
 
-    def _places_to_wait(
-        self, driver: Driver, drivers: list[Driver], pedestrians: list[Pedestrian]
-    ) -> list[tuple[int | str, float]]:
+    def _places_to_wait(self, driver: Driver) -> list[tuple[int | str, float]]:
         """Zones by number, other places by name, and the arc lengths to stop at [m]."""
         places: list[tuple[int | str, float]] = []
         path = driver.path
@@ -168,27 +164,23 @@ class Traffic:
                 driver.waiting.discard(zone.id)
         for name, first, _ in path.crossings:
             place = first - 1.5
-            if driver.front <= first - 0.3 and self._is_claimed(driver, name, place, pedestrians):
+            if driver.front <= first - 0.3 and self._is_claimed(driver, name, place):
                 places.append((name, place))
             else:
                 driver.waiting.discard(name)
         if driver.halt[1] > 0.0 and driver.front <= driver.halt[0]:
             places.append(("halt", driver.halt[0]))
-            waits = driver.is_parked and any(_comes(x, driver) for x in drivers)
+            waits = driver.is_parked and any(_comes(x, driver) for x in self._driving)
             if driver.v < 0.1 and driver.halt[0] - driver.front < 3.0 and not waits:
                 driver.halt = driver.halt[0], driver.halt[1] - DT
         if path.is_parking:
             places.append(("end", path.length + 0.5 * driver.length + 0.9))
         return places
 
-    def _is_claimed(
-        self, driver: Driver, name: str, place: float, pedestrians: list[Pedestrian]
-    ) -> bool:
+    def _is_claimed(self, driver: Driver, name: str, place: float) -> bool:
         """Whether a driver must wait before a crossing."""
-        for pedestrian in pedestrians:
-            if pedestrian.walk.crossing != name or pedestrian.s > self._place_passed(
-                driver, pedestrian
-            ):
+        for pedestrian in [x for x in self._on_foot if x.walk.crossing == name]:
+            if pedestrian.s > self._place_passed(driver, pedestrian):
                 continue
             if pedestrian.is_crossing:
                 return True
@@ -209,11 +201,11 @@ class Traffic:
             self._passed[key] = min(place + _PASSED, pedestrian.walk.across)
         return self._passed[key]
 
-    def _let_walk(self, drivers: list[Driver], pedestrians: list[Pedestrian]) -> None:
-        for pedestrian in pedestrians:
+    def _let_walk(self) -> None:
+        for pedestrian in self._on_foot:
             walk = pedestrian.walk
             at_kerb = walk.kerb - 0.9 <= pedestrian.s <= walk.kerb + 0.2
-            if at_kerb and not pedestrian.is_crossing and not self._may_cross(pedestrian, drivers):
+            if at_kerb and not pedestrian.is_crossing and not self._may_cross(pedestrian):
                 pedestrian.v = max(pedestrian.v - 2.2 * DT, 0.0)
                 continue
             if pedestrian.s >= walk.kerb - 0.9:
@@ -225,11 +217,11 @@ class Traffic:
         walk = pedestrian.walk
         return self._waits.get(walk.crossing, inf) > (walk.across - walk.kerb) / WALKING
 
-    def _may_cross(self, pedestrian: Pedestrian, drivers: list[Driver]) -> bool:
+    def _may_cross(self, pedestrian: Pedestrian) -> bool:
         if not self._has_time(pedestrian):
             return False
         needed = (pedestrian.walk.across - pedestrian.walk.kerb) / WALKING + 2.0
-        for driver in drivers:
+        for driver in self._driving:
             for name, first, last in driver.path.crossings:
                 if name != pedestrian.walk.crossing or driver.rear > last + 0.5:
                     continue
