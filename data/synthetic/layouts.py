@@ -28,6 +28,7 @@ from shiftsim.data.synthetic.town import Leg, Lights, Street, Town, build_town
 _TRIES = 300
 # km/h, of main roads by lanes per direction
 _LIMITS = ((30.0, 40.0, 50.0), (40.0, 50.0, 60.0), (50.0, 60.0, 70.0))
+_KERBS = (10.0, 15.0)  # m, radii at junctions
 _RINGS = ("moss", "nettle", "oak", "pine")
 
 
@@ -61,7 +62,7 @@ def _junction(rng: np.random.Generator, *, lit: bool) -> list[Street]:
     lanes = min(lanes, 2) if count == 5 else lanes
     share = float(rng.uniform(0.3, 1.0))
     arms = _arms(rng, range(1, count + 1), angles, lit=lit, lanes=lanes, crossings=share)
-    return junction_arms(arms, angles, _rounding(rng))
+    return junction_arms(arms, angles, rng.uniform(*_KERBS))
 
 
 def _pair(rng: np.random.Generator, *, lanes: int) -> list[Street]:
@@ -86,7 +87,7 @@ def _pair(rng: np.random.Generator, *, lanes: int) -> list[Street]:
             lit=lit, lanes=lanes, crossings=float(rng.uniform(0.3, 1.0)),
             like=mid, alike=(0, onward),
         )  # fmt: skip
-        rounding = _rounding(rng)
+        rounding = rng.uniform(*_KERBS)
         if junction == 101:
             mid, *others = junction_arms([mid, *arms[1:]], angles, rounding)
             mid = replace(mid, junctions=(101, 102))
@@ -203,7 +204,7 @@ def _street(rng: np.random.Generator) -> list[Street]:
             if all(last < begin - 12.0 or first > end + 12.0 for first, last in arm.crossings):
                 arm = replace(arm, narrow=(begin, end))
         arms.append(arm)
-    return junction_arms(arms, angles, _rounding(rng))
+    return junction_arms(arms, angles, rng.uniform(*_KERBS))
 
 
 def _car_park(rng: np.random.Generator) -> list[Street]:
@@ -252,12 +253,7 @@ def _shared(rng: np.random.Generator) -> list[Street]:
         places = tuple((round(x, 1), round(x + 3.0, 1)) for x in spots.tolist() if x < 52.0)
         arm = random_street(rng, number, limit=20.0, length=length, parking=0.0)
         arms.append(replace(arm, sidewalk=4.0, stop=1.0, is_marked=False, crossings=places))
-    return junction_arms(arms, angles, _rounding(rng))
-
-
-def _rounding(rng: np.random.Generator) -> float:
-    """Radius of the kerbs of a junction [m]."""
-    return float(rng.uniform(10.0, 15.0))
+    return junction_arms(arms, angles, rng.uniform(*_KERBS))
 
 
 def _random_lights(town: Town, junction: int, rng: np.random.Generator) -> Lights:

@@ -244,9 +244,8 @@ def touching(boxes: list[Box], parked: FloatArray, drivers: list[Driver]) -> set
     """
     rows = np.array([(x[0], x[1] - 1, *x[3:6], *SIZES[x[2]][:2]) for x in boxes]).reshape(-1, 7)
     out: set[int] = set()
-    size = np.array(SIZES["car"][:2])
-    numbers = np.full((len(parked), 2), float(_PARKED))
-    still = np.column_stack([numbers, parked, np.tile(size, (len(parked), 1))])
+    car = SIZES["car"][:2]
+    still = np.array([(0, _PARKED, *pose, *car) for pose in parked.tolist()]).reshape(-1, 7)
     for frame in range(0, round(rows[:, 0].max(initial=-1.0)) + 1, _EVERY):
         low, high = np.searchsorted(rows[:, 0], (frame, frame + 1))
         now = np.concatenate([rows[low:high], still])

@@ -6,7 +6,8 @@ is sampled from the same pieces that go into the file.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
+from itertools import accumulate
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from shiftsim.kernels import FloatArray
 
 STEP = 0.5  # m between the points of a line
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
+
+Pose = tuple[float, float, float]  # x [m], y [m], heading [rad]
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,7 @@ class RoadSpec:
     """One road."""
 
     id: int  # road id
-    start: tuple[float, float, float]  # x [m], y [m], heading [rad]
+    start: Pose
     pieces: tuple[Piece, ...]  # geometry
     lanes: tuple[LaneSpec, ...]  # all lanes except the centre one
     limit_kmh: float  # speed limit [km/h]
@@ -71,14 +74,11 @@ class RoadSpec:
         return sum(piece.length for piece in self.pieces)
 
     @cached_property
-    def records(self) -> list[tuple[float, tuple[float, ...], Piece]]:
+    def records(self) -> list[tuple[float, Pose, Piece]]:
         """Where each piece begins along the road [m], the pose there, and the piece."""
-        begin, out = 0.0, list[tuple[float, tuple[float, ...], Piece]]()
-        pose: tuple[float, ...] = self.start
-        for piece in self.pieces:
-            out.append((begin, pose, piece))
-            begin, pose = begin + piece.length, _end(piece, pose)
-        return out
+        begins = accumulate((piece.length for piece in self.pieces), initial=0.0)
+        poses = accumulate(self.pieces, _end, initial=self.start)
+        return list(zip(begins, poses, self.pieces, strict=False))
 
     @cached_property
     def line(self) -> FloatArray:
@@ -110,7 +110,6 @@ class RoadSpec:
     def center_of(self, lane: int, s: FloatArray) -> FloatArray:
         """(n, 3) centre of a lane at s; the heading is that of the road."""
         share = s / self.length
-
         inner, lane_width = np.zeros(len(s)), np.zeros(len(s))
         for spec in self.lanes:
             width = spec.width + share * (spec.end_width - spec.width)
@@ -147,10 +146,8 @@ def _turn(turn: float, tangent: float, ease: bool) -> list[Piece]:
         curvature = float(np.sign(turn) / radius)
         return [Piece(float(radius * abs(turn)), curvature, curvature)]
     unit = [Piece(1.0, 0.0, turn / 2), Piece(1.0, turn / 2, turn / 2), Piece(1.0, turn / 2, 0.0)]
-    pose: tuple[float, ...] = (0.0, 0.0, 0.0)
-    for piece in unit:
-        pose = _end(piece, pose)
-    scale = float(tangent * 2 * np.cos(turn / 2) / np.hypot(pose[0], pose[1]))
+    x, y, _ = reduce(_end, unit, (0.0, 0.0, 0.0))
+    scale = float(tangent * 2 * np.cos(turn / 2) / np.hypot(x, y))
     return [Piece(p.length * scale, p.start / scale, p.end / scale) for p in unit]
 
 
@@ -174,12 +171,13 @@ def _cubic_arc(c: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
     return p, np.r_[0.0, np.cumsum(rate @ _WEIGHTS * 0.5 * p[1])]
 
 
-def _end(piece: Piece, pose: Sequence[float]) -> tuple[float, ...]:
+def _end(pose: Pose, piece: Piece) -> Pose:
     """The pose at the end of a piece that starts at `pose`."""
-    return tuple(_along(piece, pose, np.array([piece.length]))[0].tolist())
+    x, y, heading = _along(piece, pose, np.array([piece.length]))[0].tolist()
+    return x, y, heading
 
 
-def _along(piece: Piece, pose: Sequence[float], d: FloatArray) -> FloatArray:
+def _along(piece: Piece, pose: Pose, d: FloatArray) -> FloatArray:
     """(n, 3) poses at distances d along a piece that starts at `pose`."""
     if piece.cubic:
         p_grid, arc_grid = _cubic_arc(piece.cubic)

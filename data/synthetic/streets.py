@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
@@ -174,28 +175,16 @@ def reaches(streets: Sequence[Street], angles: Sequence[float], rounding: float)
 
 def are_apart(streets: Sequence[Street]) -> bool:
     """Whether no two streets come too close away from the junctions that they share."""
-    baselines = {}
-    for street in streets:
-        places = np.append(np.arange(0.0, street.length, _STEP), street.length)
-        baselines[street.id] = street.road.at(places)[:, :2]
-    return not any(
-        _come_close(one, two, baselines)
-        for one in streets
-        for two in streets
-        if one.id < two.id and not (one.is_one_way or two.is_one_way)
-    )
+    for one, two in combinations([x for x in streets if not x.is_one_way], 2):
+        gaps = np.hypot(*np.moveaxis(_away(one, two)[:, None] - _away(two, one), -1, 0))
+        wide = one.half + two.half + max(one.sidewalk, two.sidewalk) + _APART
+        if gaps.min(initial=np.inf) < wide:
+            return False
+    return True
 
 
-def _come_close(one: Street, two: Street, baselines: dict[int, FloatArray]) -> bool:
-    a, b = (_away(baselines[x.id], x, y) for x, y in ((one, two), (two, one)))
-    if not len(a) or not len(b):
-        return False
-    gaps = np.hypot(*np.moveaxis(a[:, None] - b[None], -1, 0))
-    wide = one.half + two.half + max(one.sidewalk, two.sidewalk) + _APART
-    return bool(gaps.min() < wide)
-
-
-def _away(points: FloatArray, street: Street, other: Street) -> FloatArray:
+def _away(street: Street, other: Street) -> FloatArray:
     """Points of a street that are not near a junction that it shares with another one."""
     first, last = (x in other.junctions and x > 0 for x in street.junctions)
-    return points[_SKIPPED * first : len(points) - _SKIPPED * last]
+    places = np.append(np.arange(0.0, street.length, _STEP), street.length)
+    return street.road.at(places)[_SKIPPED * first : len(places) - _SKIPPED * last, :2]
