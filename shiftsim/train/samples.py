@@ -9,6 +9,7 @@ planner to planner is in `KINDS`.
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
+from functools import partial
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -28,7 +29,7 @@ from shiftsim.planners.learned.plantf import planner as plantf
 from shiftsim.planners.learned.pluto import planner as pluto
 from shiftsim.planners.learned.pluto.world import red_lights
 from shiftsim.planners.proposals.contacts import touches_boxes
-from shiftsim.sim.planner import History, Observation, observe_log, past_rows
+from shiftsim.sim.planner import Observation, observe_log, past_rows
 from shiftsim.world.layers import contains
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import PACIFICA, VX, VY, center_poses
@@ -47,8 +48,9 @@ MOVED_POSE = NOISE * [0, 1, 1, 0, 0, 0, 0]
 MOVING = 2.0
 NEIGHBOURS = 10  # agents that the ego must not be moved into, and that Diffusion Planner predicts
 
-# a driven ego is a sample if it is this near to the path [m], and at most so many steps late
-MOST_AHEAD, MOST_ASIDE, MOST_LATE = 2.5, 1.5, 80
+# a driven ego is a sample if it is so far ahead and aside [m] and turned [rad] from the path, and
+# so many steps late, at most
+MOST_AWAY, MOST_LATE = np.array([2.5, 1.5, NOISE[2]]), 80
 
 
 class Sample(NamedTuple):
@@ -82,11 +84,11 @@ class Batch(NamedTuple):
 
     def tensors(self) -> dict[str, Tensor]:
         """All by name; `counts` (parts, B) are how many rows of a part are not padding."""
-        parts, labels = self._parts, self._asdict()
-        del labels["inputs"]
+        parts = {**self._parts, **self._asdict()}
+        del parts["inputs"]
         if "counts" in parts:
             parts["counts"] = torch.tensor(parts["counts"])
-        return parts | {name: value for name, value in labels.items() if value is not None}
+        return {name: value for name, value in parts.items() if value is not None}
 
     @property
     def _parts(self) -> dict[str, Any]:
@@ -363,53 +365,42 @@ def make_sample(
     row, kind = int(scenario.iteration_rows[iteration]), KINDS[planner.name]
     if row + STEPS * scenario.row_step >= len(scenario.time_us):
         return "less than 8 s recorded after it"
+    ego = beside = None
     if driven is not None:
-        return _driven_sample(planner, scenario, iteration, driven)
-    observation = observe_log(scenario, iteration)
+        ego, beside = _drive(scenario, iteration, driven)
+        if beside is None:
+            return "driven far from the recording"
+    observation = observe_log(scenario, iteration, ego=ego)
+    history = observation.history
     # recordings know no steering angle and no yaw rate: they are derived, and not from a jump
-    state = plantf.current_state(observation.history).astype(np.float64)
-    moved = None
-    if random.random() < PERTURBED and state[3] >= kind.slowest:
+    state = plantf.current_state(history).astype(np.float64)
+    if driven is None and random.random() < PERTURBED and state[3] >= kind.slowest:
         noise = random.uniform(-kind.noise, kind.noise)
         if kind.noise[3] and not as_published and random.random() < SLOWED:
             noise[3] = -random.random() * state[3]
-        moved = _perturb(observation.history, state, noise, kind.tries)
+        ego, tracks = history.ego.copy(), history.tracks
+        near = features.nearest_agents(tracks, center_poses(ego[-1, :3]), NEIGHBOURS)
+        boxes = tracks.poses[-1, near], tracks.sizes[-1, near]
+        place = partial(features.map_poses, ego=history.ego[-1])
+        moved = free_state(state, noise, lambda at: is_free(place(at), *boxes), kind.tries)
         if moved is not None:
-            ego, state = observation.history.ego.copy(), moved
-            ego[-1, :3] = features.map_poses(state[:3], ego[-1])
-            observation = replace(observation, history=replace(observation.history, ego=ego))
-    goes_back = moved is not None and not (as_published and kind.noise[3])
-    now = Moment(scenario, row, observation, state, row if goes_back else None)
+            state, ego[-1, :3] = moved, place(moved[:3])
+            observation = replace(observation, history=replace(history, ego=ego))
+            beside = None if as_published and kind.noise[3] else row
+    now = Moment(scenario, row, observation, state, beside)
     return kind.label(planner, planner.features(observation), now)
 
 
-def _driven_sample(
-    planner: LearnedPlanner[Any, Any], scenario: Scenario, iteration: int, driven: FloatArray
-) -> Sample | str:
-    """Of an ego that a planner has driven near the recorded path, maybe late."""
-    row, step = int(scenario.iteration_rows[iteration]), scenario.row_step
+def _drive(scenario: Scenario, iteration: int, driven: FloatArray) -> tuple[FloatArray, int | None]:
+    """Past states of a driven ego, and the row that it is beside, maybe late; None where far."""
+    row = int(scenario.iteration_rows[iteration])
     ego = scenario.ego[past_rows(scenario, iteration)].copy()
     states = driven[max(iteration + 1 - len(ego), 0) : iteration + 1]
     ego[len(ego) - len(states) :] = states
-    observation = observe_log(scenario, iteration, ego=ego)
-    before = np.arange(row, -1, -step)[: MOST_LATE + 1]
+    before = np.arange(row, -1, -scenario.row_step)[: MOST_LATE + 1]
     near = int(np.hypot(*(scenario.ego[before, :2] - ego[-1, :2]).T).argmin())
-    ahead, aside, turn = np.abs(to_frame(ego[-1, :3], scenario.ego[before[near], :3]))
-    if ahead > MOST_AHEAD or aside > MOST_ASIDE or turn > NOISE[2]:
-        return "driven far from the recording"
-    state = plantf.current_state(observation.history).astype(np.float64)
-    now = Moment(scenario, row, observation, state, int(before[near]))
-    return KINDS[planner.name].label(planner, planner.features(observation), now)
-
-
-def _perturb(
-    history: History, state: FloatArray, noise: FloatArray, tries: int
-) -> FloatArray | None:
-    """(7,) the state moved by noise (7,), in its own frame; None where that is no place."""
-    ego, tracks = history.ego[-1], history.tracks
-    near = features.nearest_agents(tracks, center_poses(ego[:3]), NEIGHBOURS)
-    boxes = tracks.poses[-1, near], tracks.sizes[-1, near]
-    return free_state(state, noise, lambda at: is_free(features.map_poses(at, ego), *boxes), tries)
+    away = np.abs(to_frame(ego[-1, :3], scenario.ego[before[near], :3]))
+    return ego, None if (away > MOST_AWAY).any() else int(before[near])
 
 
 def free_state(

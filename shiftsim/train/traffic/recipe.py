@@ -47,29 +47,26 @@ def train_traffic(settings: TrafficSettings, on_message: OnMessage) -> Path:
     torch.set_num_threads(1)  # sums in one order
     network, parts, losses = new_network(seed), list[States](), list[dict[str, Any]]()
     file = out / WEIGHTS
+    write_weights(file, weights_of(network))
     for number in range(settings.rounds):
-        write_weights(file, weights_of(network))
         traffic = LearnedTraffic(file)  # which drives from the second round on
         chosen = np.random.default_rng([seed, 3, number]).permutation(trained)
         for place, token in enumerate(chosen[: settings.scenarios].tolist()):
             random = np.random.default_rng([seed, number, place])
             parts.append(states_of(store.read(token), traffic, random, drives=number > 0))
         found = learn(network, join(parts), settings.epochs, seed + number)
-        losses += [
-            {"round": number + 1, "epoch": epoch + 1, "loss": loss}
-            for epoch, loss in enumerate(found)
-        ]
+        write_weights(file, weights_of(network))
+        epochs = enumerate(found, start=1)
+        losses += [{"round": number + 1, "epoch": epoch, "loss": loss} for epoch, loss in epochs]
         count = sum(len(part.features) for part in parts)
         on_message(f"round {number + 1} of {settings.rounds}: {count} states, loss {found[-1]:.3f}")
-    write_weights(file, weights_of(network))
     write_table(out / CURVE, losses)
     order = np.random.default_rng([seed, 4]).permutation(tested)[: settings.tests].tolist()
     models: dict[str, Callable[[], Traffic]] = {
         "learned": partial(LearnedTraffic, file),
         **{name: partial(make_traffic, name) for name in ("reactive", "constant-velocity")},
     }
-    rows = compare((store.read(token) for token in order), models)
-    write_table(out / TABLE, rows)
+    write_table(out / TABLE, compare(map(store.read, order), models))
     return file
 
 
@@ -90,11 +87,9 @@ def new_network(seed: int) -> nn.Sequential:
 
 
 def weights_of(network: nn.Sequential) -> Weights:
-    """Its weights, as the traffic takes them."""
-    arrays: list[np.ndarray] = []
-    for parameter in network.parameters():  # a weight, transposed, and a bias of each layer
-        arrays.append(np.ascontiguousarray(parameter.detach().numpy().T))
-    return Weights(*arrays)
+    """Its weights, as the traffic takes them: of each layer a matrix, transposed, and a bias."""
+    arrays = (parameter.detach().numpy().T for parameter in network.parameters())
+    return Weights(*map(np.ascontiguousarray, arrays))
 
 
 def learn(network: nn.Sequential, states: States, epochs: int, seed: int) -> list[float]:

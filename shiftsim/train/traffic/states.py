@@ -42,62 +42,49 @@ def states_of(
     scenario: Scenario, traffic: LearnedTraffic, random: np.random.Generator, *, drives: bool
 ) -> States:
     """States of one scenario: recorded and pushed aside, or, if it `drives`, of the network."""
-    collector = _Collector(scenario, traffic, random)
-    return join(list(collector.driven() if drives else collector.pushed()))
+    rows, start = rollout_rows(scenario)
+    recorded, ego = scenario.tracks.rows(rows), scenario.ego[scenario.iteration_rows]
+    last = scenario.num_iterations - 1
 
+    def pushed() -> Iterator[tuple[int, Tracks]]:
+        for iteration in range(int(random.integers(EVERY)), last, EVERY):
+            tracks = recorded.copy()
+            if random.random() < 0.5:
+                _push(tracks, start + iteration, random)
+            traffic.start(scenario, tracks, start)
+            yield iteration, tracks
 
-def join(parts: list[States]) -> States:
-    """Several as one."""
-    if not parts:
-        return States(np.zeros((0, NUM_FEATURES), np.float32), np.zeros((0, 3), np.float32))
-    return States(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
-
-
-class _Collector:
-    def __init__(
-        self, scenario: Scenario, traffic: LearnedTraffic, random: np.random.Generator
-    ) -> None:
-        self.scenario, self.traffic, self.random = scenario, traffic, random
-        rows, self.start = rollout_rows(scenario)
-        self.recorded, self.ego = scenario.tracks.rows(rows), scenario.ego[scenario.iteration_rows]
-        self.last = scenario.num_iterations - 1
-
-    def pushed(self) -> Iterator[States]:
-        """As recorded, half of them pushed aside."""
-        for iteration in range(int(self.random.integers(EVERY)), self.last, EVERY):
-            tracks = self.recorded.copy()
-            if self.random.random() < 0.5:
-                _push(tracks, self.start + iteration, self.random)
-            self.traffic.start(self.scenario, tracks, self.start)
-            yield self._labelled(tracks, iteration)
-
-    def driven(self) -> Iterator[States]:
-        """Where the network brings the agents."""
-        first = int(self.random.integers(max(self.last - SEGMENT, 1)))
-        for begin in range(first, self.last, SEGMENT):
-            tracks = self.recorded.copy()
-            self.traffic.start(self.scenario, tracks, self.start)
-            for iteration in range(begin, min(begin + SEGMENT, self.last)):
+    def driven() -> Iterator[tuple[int, Tracks]]:
+        first = int(random.integers(max(last - SEGMENT, 1)))
+        for begin in range(first, last, SEGMENT):
+            tracks = recorded.copy()
+            traffic.start(scenario, tracks, start)
+            for iteration in range(begin, min(begin + SEGMENT, last)):
                 if (iteration - begin) % EVERY == EVERY - 1:
-                    yield self._labelled(tracks, iteration)
-                row = self.start + iteration + 1
-                self.traffic.step(iteration, self.ego[iteration], tracks, row)
+                    yield iteration, tracks
+                traffic.step(iteration, ego[iteration], tracks, start + iteration + 1)
 
-    def _labelled(self, tracks: Tracks, iteration: int) -> States:
-        """The agents of one iteration with their labels."""
-        row = self.start + iteration
-        features = self.traffic.observe(iteration, self.ego[iteration], tracks, row)
-        own = self.traffic.own
-        speeds = features[:, 0] * 10.0
+    parts = []
+    for iteration, tracks in driven() if drives else pushed():
+        row = start + iteration
+        features = traffic.observe(iteration, ego[iteration], tracks, row)
+        own, speeds = traffic.own, features[:, 0] * 10.0
         gap = (1.0 - features[:, _LEADER + 1]) * REACH
         leads = features[:, _LEADER] > 0.0
         shrinking = np.where(leads, features[:, _LEADER + 2] * 5.0, 0.0)
         closing = np.column_stack([np.where(leads, gap, np.inf), shrinking])
         poses = tracks.poses[row, own]
-        labels = compute_labels(self.recorded.select(own), row, poses, speeds, closing)
+        labels = compute_labels(recorded.select(own), row, poses, speeds, closing)
         rests = (np.abs(speeds) < 0.2) & (np.abs(labels[:, 0]) < 0.1)
-        chosen = ~np.isnan(labels[:, 0]) & (~rests | (self.random.random(len(own)) < STANDING))
-        return States(features[chosen].astype(np.float32), labels[chosen].astype(np.float32))
+        chosen = ~np.isnan(labels[:, 0]) & (~rests | (random.random(len(own)) < STANDING))
+        parts.append(States(*(x[chosen].astype(np.float32) for x in (features, labels))))
+    return join(parts)
+
+
+def join(parts: list[States]) -> States:
+    """Several as one."""
+    none = States(np.zeros((0, NUM_FEATURES), np.float32), np.zeros((0, 3), np.float32))
+    return States(*(np.concatenate(arrays) for arrays in zip(none, *parts, strict=True)))
 
 
 def _push(tracks: Tracks, row: int, random: np.random.Generator) -> None:
