@@ -139,7 +139,7 @@ class DrivenScenario:
         self.expert = Expert(self.episode.scene, job.tau)
         self.states: list[State] = []
         self.features: carl.CarlFeatures | None = None  # what the network is asked about
-        self.action: carl.Action | None = None  # what is done in this step
+        self.action = np.zeros(2, np.float32)  # what is done in this step
 
     @property
     def is_over(self) -> bool:
@@ -160,18 +160,19 @@ class DrivenScenario:
         step, observation = self.episode.iteration, self.episode.observe()
         is_expert = self.start.expert_steps < 0 or step < self.start.expert_steps
         is_kept = not self.job.is_test and step % EVERY == 0
-        self.action = self.expert.act(observation) if is_expert or is_kept else None
+        if is_expert or is_kept:
+            self.action = self.expert.act(observation)
         features = self.policy.features(observation) if is_kept or not is_expert else None
-        if is_kept and features is not None and self.action is not None:
+        if is_kept and features is not None:
             state = State(compress_raster(features.pictures), features.measurements, self.action)
             self.states.append(state)
         self.features = None if is_expert else features
 
-    def advance(self, action: carl.Action) -> None:
+    def advance(self) -> None:
         """Drive one step."""
-        self.policy.last_action = action  # also where it is somebody else's
+        self.policy.last_action = self.action  # also where it is somebody else's
         ego = self.episode.log.ego[self.episode.iteration]
-        self.episode.advance(carl.command_of(action, ego))
+        self.episode.advance(carl.command_of(self.action, ego))
 
 
 class Driver:
@@ -190,33 +191,25 @@ class Driver:
                 scenarios.append(DrivenScenario(start, job, scenario, self._policy.fork()))
             except ShiftsimError as error:
                 failed.append(f"{start.token}: {error.message}")
-        active = list(scenarios)
+        active = scenarios
         while active := [one for one in active if not one.is_over]:
-            active = _step(active, self._policy, failed)
+            ready = []
+            for one in active:
+                try:
+                    one.prepare()
+                    ready.append(one)
+                except ShiftsimError as error:  # where the expert fails there is nothing to learn
+                    failed.append(f"{one.start.token}: {error.message}")
+            asked = [(one, one.features) for one in ready if one.features is not None]
+            actions = self._policy.infer([features for _, features in asked]) if asked else ()
+            for (one, _), action in zip(asked, actions, strict=True):
+                one.action = action
+            for one in ready:
+                one.advance()
+            active = ready
         states = [state for one in scenarios for state in one.labelled]
         ended = [one.episode for one in scenarios if job.is_test and one.episode.is_over]
         return Driven(states, [episode.scores.get("cls", 0.0) for episode in ended], failed)
-
-
-def _step(
-    scenarios: list[DrivenScenario], policy: carl.Carl, failed: list[str]
-) -> list[DrivenScenario]:
-    """Drive all of them one step; those that can go on."""
-    ready = []
-    for one in scenarios:
-        try:
-            one.prepare()
-            ready.append(one)
-        except ShiftsimError as error:  # a scenario in which the expert fails teaches nothing
-            failed.append(f"{one.start.token}: {error.message}")
-    asked = {i: one.features for i, one in enumerate(ready) if one.features is not None}
-    if asked:
-        for i, action in zip(asked, policy.infer([*asked.values()]), strict=True):
-            ready[i].action = action
-    for one in ready:
-        if one.action is not None:
-            one.advance(one.action)
-    return ready
 
 
 class Towns(NamedTuple):

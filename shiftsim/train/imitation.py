@@ -255,16 +255,14 @@ def diffusion_loss(said: Tensor, clean: Tensor, valid: Tensor) -> Losses:
     )
 
 
-def diffusion_losses(
-    network: DiffusionNetwork, batch: Batch, random: torch.Generator, draws: int = DRAWS
-) -> Losses:
-    """Of Diffusion Planner, mean over so many draws of time and noise, which share the encoder."""
+def diffusion_losses(network: DiffusionNetwork, batch: Batch, random: torch.Generator) -> Losses:
+    """Of Diffusion Planner, mean over `DRAWS` of time and noise, which share the encoder."""
     scene = network.normalise(batch.inputs)
     current, absent = network.present(scene)
     poses = motion(batch.target)
     clean = network.state_normaliser(torch.where(batch.valid[..., None], poses, 0.0))
     options: dict[str, Any] = {"device": clean.device, "generator": random}
-    times = EARLIEST + (1.0 - EARLIEST) * torch.rand((draws, len(clean)), **options)
+    times = EARLIEST + (1.0 - EARLIEST) * torch.rand((DRAWS, len(clean)), **options)
     context = network.context(scene, absent, times)
     found = []
     for call, time in enumerate(times):
@@ -277,16 +275,14 @@ def diffusion_losses(
     return {name: torch.stack([one[name] for one in found]).mean() for name in found[0]}
 
 
-def parameter_groups(network: nn.Module, decay: float = 1e-4) -> list[dict[str, Any]]:
+def parameter_groups(network: nn.Module) -> list[dict[str, Any]]:
     """Groups of an optimiser: weights of products decay, all else does not."""
-    decayed: list[Tensor] = []
-    plain: list[Tensor] = []
+    decayed, plain = list[Tensor](), list[Tensor]()
     for module in network.modules():
         products = isinstance(module, nn.Linear | nn.Conv1d | Attention)
         for name, value in module.named_parameters(recurse=False):
-            is_weight = products and "weight" in name
-            (decayed if is_weight else plain).append(value)
-    return [{"params": decayed, "weight_decay": decay}, {"params": plain, "weight_decay": 0.0}]
+            (decayed if products and "weight" in name else plain).append(value)
+    return [{"params": decayed, "weight_decay": 1e-4}, {"params": plain, "weight_decay": 0.0}]
 
 
 def rate_of_epoch(epoch: float, epochs: int = 25, warm_up: float = 3, rate: float = 1e-3) -> float:

@@ -75,13 +75,9 @@ class GradientPool:
         """The rasters that `read` gives for some rows; those of a GPU are read on all threads."""
         if self._device == "cpu":
             return torch.from_numpy(read(rows))
-
-        def load_part(part: IntArray) -> Tensor:
-            return torch.from_numpy(read(part)).to(self._device)
-
-        return torch.cat(
-            [*self._pool.map(load_part, np.array_split(rows, min(self._threads, len(rows))))]
-        )
+        parts = np.array_split(rows, min(self._threads, len(rows)))
+        loaded = self._pool.map(lambda part: torch.from_numpy(read(part)).to(self._device), parts)
+        return torch.cat([*loaded])
 
     def compute(
         self,

@@ -6,7 +6,7 @@ critic, which imitation leaves untrained, learns alone at first.
 
 from functools import partial
 from time import monotonic
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -37,19 +37,6 @@ _WRITE_EVERY = 120.0  # s
 _EDGE = 1e-7  # actions are kept so far from the ends of [0, 1]
 
 
-class RolloutBuffer(NamedTuple):
-    """What was done in all environments for some steps. M steps, the environments in turn."""
-
-    pictures: list[bytes]
-    measurements: Values  # (M, 10)
-    critic: Values  # (M, 4)
-    actions: Values  # (M, 2) in [0, 1]
-    density: Values  # (M,) logarithm
-    values: Values  # (M,) what the critic expected
-    returns: Values  # (M,)
-    advantages: Values  # (M,)
-
-
 def advantages_of(
     rewards: FloatArray, values: FloatArray, ended: NDArray[np.bool_], last: FloatArray
 ) -> FloatArray:
@@ -71,7 +58,7 @@ def advantages_of(
 def ppo_loss(
     policy: Policy, values: Tensor, part: dict[str, Tensor], *, critic_only: bool
 ) -> tuple[Tensor, Tensor]:
-    """Loss summed over some steps of a `RolloutBuffer`; (1,) those with a clipped ratio."""
+    """Loss summed over some steps of a rollout; (1,) those with a clipped ratio."""
     x = part["actions"].clamp(_EDGE, 1.0 - _EDGE)
     density = learning.log_density(policy.alpha, policy.beta, x).sum(1)
     ratio = (density - part["density"]).exp()
@@ -153,19 +140,23 @@ class Trainer:
         """Drive one rollout and learn from it: mean loss, share of steps with a clipped ratio."""
         random = np.random.default_rng([self._settings.seed, 5, self.update])
         torch.manual_seed(int(random.integers(2**31)))
-        buffer = self._drive(ROLLOUT // ENVS)
+        pictures, arrays = self._drive(ROLLOUT // ENVS)
         loss = clipped = 0.0
         for _ in range(EPOCHS):
-            order = random.permutation(len(buffer.pictures))
+            order = random.permutation(len(pictures))
             for first in range(0, len(order), MINIBATCH):
                 rows = order[first : first + MINIBATCH]
-                mean_loss, count = self._learn(buffer, rows)
+                mean_loss, count = self._learn(pictures, arrays, rows)
                 loss, clipped = loss + mean_loss * len(rows), clipped + count
         self.update += 1
         return {"loss": loss / EPOCHS / len(order), "clipped": clipped / EPOCHS / len(order)}
 
-    def _drive(self, steps: int) -> RolloutBuffer:
-        """Act in all environments for so many steps."""
+    def _drive(self, steps: int) -> tuple[list[bytes], dict[str, Values]]:
+        """Act in all environments for so many steps; M steps in all, the environments in turn.
+
+        They come to M rasters, `measurements` (M, 10), `critic` (M, 4), `actions` (M, 2) in [0, 1];
+        (M,) `density`, a logarithm, `values` as the critic expected, `returns` and `advantages`.
+        """
         pictures: list[bytes] = []
         measured, critic = np.zeros((steps, ENVS, 10)), np.zeros((steps, ENVS, 4))
         actions, ended = np.zeros((steps, ENVS, 2)), np.zeros((steps, ENVS), np.bool_)
@@ -188,9 +179,11 @@ class Trainer:
                 self._sums[ended[step]] = 0.0
             last = self._evaluate(*_inputs(self._observations))[1].cpu().numpy().astype(np.float64)
         gains = advantages_of(rewards, values, ended, last)
-        numbers = (measured, critic, actions, density, values, gains + values, gains)
-        flat = [found.reshape(-1, *found.shape[2:]).astype(np.float32) for found in numbers]
-        return RolloutBuffer(pictures, *flat)
+        acted = {"actions": actions, "density": density, "values": values}
+        learnt = {"returns": gains + values, "advantages": gains}
+        found = {"measurements": measured, "critic": critic, **acted, **learnt}
+        flat = {name: x.reshape(-1, *x.shape[2:]).astype(np.float32) for name, x in found.items()}
+        return pictures, flat
 
     def _evaluate(self, *inputs: Any, critic_only: bool = False) -> tuple[Policy, Tensor]:
         """The policy and what the critic expects (B,); alone it does not change the features."""
@@ -199,9 +192,10 @@ class Trainer:
         read = features.detach() if critic_only else features
         return self.network.policy(features), self.network.value(read, critic)[:, 0]
 
-    def _learn(self, buffer: RolloutBuffer, order: IntArray) -> tuple[float, float]:
-        critic_only, arrays = self.update / self.total < ALONE, buffer._asdict()
-        pictures = arrays.pop("pictures")
+    def _learn(
+        self, pictures: list[bytes], arrays: dict[str, Values], order: IntArray
+    ) -> tuple[float, float]:
+        critic_only = self.update / self.total < ALONE
         chosen = {name: torch.from_numpy(values[order]) for name, values in arrays.items()}
         chosen["measurements"] /= torch.from_numpy(learning.UNITS)
         gain = chosen["advantages"]
