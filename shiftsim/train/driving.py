@@ -7,11 +7,9 @@ The angle is the present one and what the rate adds to it in `tau` seconds. CaRL
 within 0.1 s: a larger `tau` steers harder than the tracker.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import partial
 from itertools import chain
-from time import monotonic
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,15 +17,13 @@ import numpy as np
 from shiftsim.data import open_store
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.env.episode import Episode
-from shiftsim.errors import ConfigError, DataError, ShiftsimError
+from shiftsim.errors import DataError, ShiftsimError
 from shiftsim.kernels import FloatArray
 from shiftsim.planners.learned.carl import planner as carl
 from shiftsim.planners.pdm.planner import PdmClosed
-from shiftsim.runs.workers import map_unordered
 from shiftsim.sim.dynamics.lqr import NUPLAN, raise_for_status, track
 from shiftsim.sim.log import Setting
 from shiftsim.sim.planner import Observation, SceneInfo
-from shiftsim.train.folder import REPORT_EVERY, OnMessage, Settings
 from shiftsim.train.states import State, compress_raster
 from shiftsim.world.state import STEERING, VX
 
@@ -48,11 +44,8 @@ TESTED = ("none", "ou-high")
 LEFT_OUT = 0.1  # share of the towns that are tested on
 TOGETHER, TOGETHER_ON_GPU = 10, 32  # scenarios of a job
 _MIN_GROUPS = 5  # fewer towns are not left out, but recordings, or else scenarios
-_EXPECTED = 60  # states of a scenario, before any was driven
 # share of scenarios that PDM-Closed begins, and up to which step
 _BEGUN, _BEGUN_STEPS = 0.5, 75
-
-_SEE = "see whether `shiftsim run -p pdm-closed` works on the store"
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,9 +74,6 @@ class Driven(NamedTuple):
     states: list[State]
     scores: list[float]  # closed-loop score of each scenario that was driven to its end
     failed: list[str]  # why a scenario was not
-
-
-RunJobs = Callable[[list[Job]], list[Driven]]  # `run_jobs` for some weights
 
 
 def encode_action(
@@ -265,59 +255,3 @@ def collecting_jobs(
             starts.append(Start(token, noise, seed, -1 if by_expert else begun))
         jobs.append(Job(tuple(starts), False, tau))
     return jobs
-
-
-def run_jobs(
-    settings: Settings, checkpoint: str, what: str, on_message: OnMessage, jobs: list[Job]
-) -> list[Driven]:
-    """Drive jobs in worker processes: results in the order of the jobs, or a ConfigError."""
-    make, reported = partial(Driver, settings.store, checkpoint), monotonic()
-    found: dict[int, Driven] = {}
-    for outcome in map_unordered(make, jobs, workers=settings.workers):
-        if outcome.result is None:
-            raise ConfigError(f"{outcome.death}", hint="go on with --resume")
-        found[id(outcome.task)] = outcome.result
-        if monotonic() - reported > REPORT_EVERY or len(found) == len(jobs):
-            reported = monotonic()
-            on_message(f"{what} {len(found)} of {len(jobs)} jobs")
-    return [found[id(job)] for job in jobs]
-
-
-def collect(
-    settings: Settings, towns: Towns, number: int, tau: float, run: RunJobs, on_message: OnMessage
-) -> Iterator[State]:
-    """The labelled states of a round; PDM-Closed drives in the first if nobody else can."""
-    random = np.random.default_rng([settings.seed, 2, number])
-    wanted, count, jobs_done = settings.states // settings.rounds, 0, 0
-    while count < wanted:
-        sizes = [min(len(tokens), TOGETHER) for tokens in towns.trained.values()]
-        expected = count / jobs_done if jobs_done else _EXPECTED * float(np.mean(sizes))
-        needed = int(np.ceil((wanted - count) / max(expected, 1.0)))
-        by_expert = number == 0 and not settings.checkpoint
-        before, failed = count, list[str]()
-        for driven in run(collecting_jobs(towns, needed, tau, random, by_expert=by_expert)):
-            jobs_done += 1
-            count += len(driven.states)
-            failed += driven.failed
-            yield from driven.states
-        if failed:
-            on_message(f"{len(failed)} scenarios ended early, such as {failed[0]}")
-        if count == before:
-            raise DataError(f"no state could be collected: {failed[0]}", hint=_SEE)
-
-
-def mean_scores(
-    towns: Towns, count: int, tau: float, run: RunJobs, *, by_expert: bool
-) -> dict[str, float]:
-    """Mean closed-loop score by noise, on `count` scenarios at most of towns that are left out."""
-    out, tokens = {}, tested_tokens(towns, count)
-    for noise in TESTED:
-        starts = tuple(Start(token, noise, 0, -1 if by_expert else 0) for token in tokens)
-        first = range(0, len(starts), TOGETHER)
-        done = run([Job(starts[i : i + TOGETHER], True, tau) for i in first])
-        scores = [score for driven in done for score in driven.scores]
-        if not scores:
-            failed = [text for driven in done for text in driven.failed]
-            raise DataError(f"no scenario could be driven to its end: {failed[0]}", hint=_SEE)
-        out[noise] = float(np.mean(scores))
-    return out

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from shiftsim.data import open_store
-from shiftsim.errors import DataError
+from shiftsim.errors import ConfigError, DataError
 from shiftsim.files import write_text
 from shiftsim.metrics.open_loop import METRICS
 from shiftsim.planners.learned.checkpoint import load_weights, resolve_device
@@ -30,19 +30,22 @@ from shiftsim.runs.execute import execute
 from shiftsim.runs.prepare import prepare
 from shiftsim.runs.results import Run
 from shiftsim.runs.scenarios import open_split
+from shiftsim.runs.workers import map_unordered
 from shiftsim.train import driving, folder, learning
 from shiftsim.train.checks import check
 from shiftsim.train.folder import BEST, LATEST, OnMessage
 from shiftsim.train.imitation import ImitationLearner
 from shiftsim.train.samples import KINDS
-from shiftsim.train.states import States, write_part
+from shiftsim.train.states import State, States, write_part
 from shiftsim.train.stream import Stream, load_blocks
 
 _WRITE_EVERY = 120.0  # s
 _CURVE_EVERY = 50  # steps
 DRIVEN = 0.06  # of the scenarios that are trained on, in each round
 _BASELINE = "constant-velocity"  # driven beside a network, for comparison
-_NO_DRIVER = "deterministic:base"  # where the network does not drive
+_NO_DRIVER = "deterministic:base"  # where PDM-Closed drives, and no network
+_EXPECTED = 60  # states of a scenario, before any was driven
+_SEE = "see whether `shiftsim run -p pdm-closed` works on the store"
 
 
 @dataclass
@@ -202,26 +205,41 @@ class Training(Recipe):
 
     def _choose_tau(self) -> float:
         """The tau with which PDM-Closed drives best through its labels, with and without noise."""
-        settings, rows = self._settings, self.progress.taus
+        rows = self.progress.taus
         for tau in folder.TAUS:
-            run = self._run_jobs(_NO_DRIVER, f"tau {tau:g} s")
-            found = driving.mean_scores(self.towns, settings.tests, tau, run, by_expert=True)
+            found = self._mean_scores(_NO_DRIVER, f"tau {tau:g} s", tau)
             rows.append({"tau": tau, **found})
             self._on_message(f"tau {tau:g} s: {_in_words(found)}")
-        folder.write_table(settings.out / "tau.parquet", rows)
+        folder.write_table(self._settings.out / "tau.parquet", rows)
         return float(max(rows, key=lambda row: sum(row.values()) - row["tau"])["tau"])
 
     def _collect(self) -> None:
-        settings, progress = self._settings, self.progress
-        part = settings.part(progress.round)
-        if part.exists():
-            return
-        drives = progress.round or settings.checkpoint
-        checkpoint = str(settings.out / LATEST) if drives else _NO_DRIVER
-        run = self._run_jobs(checkpoint, f"{self._where} collecting")
-        number, tau = progress.round, progress.tau
-        write_part(part, driving.collect(settings, self.towns, number, tau, run, self._on_message))
-        self._write_state()
+        part = self._settings.part(self.progress.round)
+        if not part.exists():
+            write_part(part, self._states())
+            self._write_state()
+
+    def _states(self) -> Iterator[State]:
+        """The labelled states of a round; PDM-Closed drives in the first if nobody else can."""
+        settings, number = self._settings, self.progress.round
+        checkpoint = str(settings.out / LATEST) if number or settings.checkpoint else _NO_DRIVER
+        random = np.random.default_rng([settings.seed, 2, number])
+        wanted, count, jobs_done = settings.states // settings.rounds, 0, 0
+        while count < wanted:
+            sizes = [min(len(tokens), driving.TOGETHER) for tokens in self.towns.trained.values()]
+            expected = count / jobs_done if jobs_done else _EXPECTED * float(np.mean(sizes))
+            how = self.towns, int(np.ceil((wanted - count) / max(expected, 1.0))), self.progress.tau
+            jobs = driving.collecting_jobs(*how, random, by_expert=checkpoint == _NO_DRIVER)
+            before, failed = count, list[str]()
+            for driven in self._run_jobs(checkpoint, f"{self._where} collecting", jobs):
+                jobs_done += 1
+                count += len(driven.states)
+                failed += driven.failed
+                yield from driven.states
+            if failed:
+                self._on_message(f"{len(failed)} scenarios ended early, such as {failed[0]}")
+            if count == before:
+                raise DataError(f"no state could be collected: {failed[0]}", hint=_SEE)
 
     def _results(self) -> Iterator[learning.StepResult]:
         settings, progress, learner = self._settings, self.progress, self.learner
@@ -232,12 +250,39 @@ class Training(Recipe):
             yield learner.learn(states, learning.draw_batch(states, key))
 
     def _scores(self, network: Path, where: str) -> dict[str, float]:
-        run, count = self._run_jobs(str(network), f"{where} testing"), self._settings.tests
-        return driving.mean_scores(self.towns, count, self.progress.tau, run, by_expert=False)
+        return self._mean_scores(str(network), f"{where} testing", self.progress.tau)
 
-    def _run_jobs(self, checkpoint: str, what: str) -> driving.RunJobs:
-        """What drives jobs with some weights."""
-        return partial(driving.run_jobs, self._settings, checkpoint, what, self._on_message)
+    def _mean_scores(self, checkpoint: str, what: str, tau: float) -> dict[str, float]:
+        """Mean closed-loop score by noise in towns left out, of a network or the expert."""
+        out, tokens = {}, driving.tested_tokens(self.towns, self._settings.tests)
+        steps = -1 if checkpoint == _NO_DRIVER else 0
+        for noise in driving.TESTED:
+            starts = tuple(driving.Start(token, noise, 0, steps) for token in tokens)
+            first = range(0, len(starts), driving.TOGETHER)
+            jobs = [driving.Job(starts[i : i + driving.TOGETHER], True, tau) for i in first]
+            done = self._run_jobs(checkpoint, what, jobs)
+            scores = [score for driven in done for score in driven.scores]
+            if not scores:
+                failed = [text for driven in done for text in driven.failed]
+                raise DataError(f"no scenario could be driven to its end: {failed[0]}", hint=_SEE)
+            out[noise] = float(np.mean(scores))
+        return out
+
+    def _run_jobs(
+        self, checkpoint: str, what: str, jobs: list[driving.Job]
+    ) -> list[driving.Driven]:
+        """Drive jobs in worker processes: results in the order of the jobs, or a ConfigError."""
+        settings, reported = self._settings, monotonic()
+        make = partial(driving.Driver, settings.store, checkpoint)
+        found: dict[int, driving.Driven] = {}
+        for outcome in map_unordered(make, jobs, workers=settings.workers):
+            if outcome.result is None:
+                raise ConfigError(f"{outcome.death}", hint="go on with --resume")
+            found[id(outcome.task)] = outcome.result
+            if monotonic() - reported > folder.REPORT_EVERY or len(found) == len(jobs):
+                reported = monotonic()
+                self._on_message(f"{what} {len(found)} of {len(jobs)} jobs")
+        return [found[id(job)] for job in jobs]
 
 
 class ImitationTraining(Recipe):

@@ -15,7 +15,7 @@ from shiftsim.data.store.reading import open_store
 from shiftsim.errors import CheckpointError, ConfigError
 from shiftsim.planners.learned.carl.planner import Carl
 from shiftsim.train import recipe
-from shiftsim.train.driving import Driver, Job, Start, divide
+from shiftsim.train.driving import Driven, Driver, Job, Start, divide
 from shiftsim.train.folder import BEST, LATEST, STATE, Settings
 from shiftsim.train.recipe import Training
 
@@ -78,8 +78,13 @@ def test_what_comes_out_drives_and_says_how_it_came(trained, toy, tmp_path):
 
 def test_with_weights_to_begin_with_the_network_drives_at_once(small, trained, monkeypatch):
     asked = []
-    monkeypatch.setattr(recipe.driving, "collect", lambda *job: asked.append(job[4].args[1]) or [])
-    monkeypatch.setattr(recipe, "write_part", lambda folder, states: None)
+
+    def run_jobs(training, checkpoint, what, jobs):
+        asked.append(checkpoint)
+        return [Driven([None] * 20, [], [])]
+
+    monkeypatch.setattr(Training, "_run_jobs", run_jobs)
+    monkeypatch.setattr(recipe, "write_part", lambda folder, states: list(states))
     settings = small("more", checkpoint=str(trained[0].out / BEST))
     training = Training(settings, print)
     training._collect()
