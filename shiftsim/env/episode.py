@@ -174,19 +174,17 @@ class Observer(Protocol):
     space: Space[Any]  # of what `look` returns
 
     def start(self, episode: Episode) -> None:
-        """Prepare for a new episode."""
+        """Prepare for a new episode, which most need not."""
+        return
 
     def look(self, episode: Episode) -> Any:
         """The present observation, in arrays that nobody writes to later."""
 
 
-class NoObservation:
+class NoObservation(Observer):
     """No observation, for policies that need none."""
 
     space: Space[Any] = spaces.Discrete(1)
-
-    def start(self, episode: Episode) -> None:
-        """Nothing to prepare."""
 
     def look(self, episode: Episode) -> int:
         """Always the same."""

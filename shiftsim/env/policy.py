@@ -105,10 +105,8 @@ class PolicyPlanner:
             seen = {name: part for name, part in seen.items() if name in self._parts}
         if not hasattr(self._policy, "predict"):
             return bounded(self._policy(seen), self._high)
-        settings = {"deterministic": True} | (
-            {} if self._memory is None else {"state": self._memory}
-        )
-        action, self._memory = self._policy.predict(seen, **settings)
+        memory: dict[str, Any] = {} if self._memory is None else {"state": self._memory}
+        action, self._memory = self._policy.predict(seen, deterministic=True, **memory)
         return bounded(action, self._high)
 
 

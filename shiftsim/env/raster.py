@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium import Space, spaces
 from numpy.typing import ArrayLike
 
-from shiftsim.env.episode import Episode, as_command
+from shiftsim.env.episode import Episode, Observer, as_command
 from shiftsim.kernels import BoolArray
 from shiftsim.planners.learned.carl import view
 from shiftsim.planners.learned.carl.planner import draw, measure
@@ -64,7 +64,7 @@ def raster_observation(
     }
 
 
-class RasterObserver:
+class RasterObserver(Observer):
     """CaRL's raster and measurements, and what only its critic sees."""
 
     space: Space[Any] = spaces.Dict(
@@ -75,9 +75,6 @@ class RasterObserver:
             "value_measurements": spaces.Box(0.0, 1.0, (4,)),
         }
     )
-
-    def start(self, episode: Episode) -> None:
-        """Nothing to prepare: what there is, the scene keeps."""
 
     def look(self, episode: Episode) -> dict[str, Any]:
         """The present raster and measurements."""

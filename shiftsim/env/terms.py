@@ -76,8 +76,6 @@ class EpisodeState(NamedTuple):
 def make_state(log: SimulationLog, road: VectorMap) -> EpisodeState:
     """State at the start of a rollout; the arrays of `log` are filled while it is driven."""
     blocks = [road.blocks.index[name] for name in log.route if name in road.blocks.index]
-    on_route = np.zeros(len(road.blocks) + 1, np.bool_)  # the last one is of edges without block
-    on_route[blocks] = True
     expert = np.ascontiguousarray(center_poses(log.expert_ego[:, :3])[:, :2])
     steps = np.hypot(*np.diff(expert, axis=0).T)
     tracks = flat_tracks(log.tracks)
@@ -88,7 +86,7 @@ def make_state(log: SimulationLog, road: VectorMap) -> EpisodeState:
         right=road.right_boundaries,
         limits=road.speed_limits,
         num_lanes=road.num_lanes,
-        edge_on_route=on_route[road.block_of],
+        edge_on_route=np.isin(road.block_of, blocks),
         blocks=road.blocks.polygons,
         num_roadblocks=road.num_roadblocks,
         intersections=road.intersections.polygons,

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import Space, spaces
 from numpy.typing import ArrayLike, NDArray
 
-from shiftsim.env.episode import Episode, as_command
+from shiftsim.env.episode import Episode, Observer, as_command
 from shiftsim.geometry.polylines import arc_lengths, point_on_polyline, project_on_polyline
 from shiftsim.kernels import BoolArray, FloatArray, IntArray, kernel
 from shiftsim.planners.learned.map_features import LightLookup
@@ -89,9 +89,7 @@ class VectorBuilder:
         """Find the route's lanes; the line along them begins at the first observation."""
         self._scene = scene
         self._route: Route | None = None
-        on_route = np.zeros(len(scene.map.blocks) + 1, np.bool_)  # the last: edges without block
-        on_route[scene.route_blocks] = True
-        self._on_route: BoolArray = on_route[scene.map.block_of]
+        self._on_route: BoolArray = np.isin(scene.map.block_of, scene.route_blocks)
         self._lights = LightLookup(scene.map, LightStatus.ABSENT, ranked=(LightStatus.RED,))
 
     def at(self, observation: Observation, action: ArrayLike) -> Values:
@@ -128,13 +126,10 @@ def vector_observation(
     return scene.once(VectorBuilder).at(observation, action)
 
 
-class VectorObserver:
+class VectorObserver(Observer):
     """The compact observation: the parts of `Seen`, one after the other."""
 
     space: Space[Any] = spaces.Box(-LARGEST, LARGEST, (SIZE,))
-
-    def start(self, episode: Episode) -> None:
-        """Nothing to prepare: what there is, the scene keeps."""
 
     def look(self, episode: Episode) -> Values:
         """The present observation."""
