@@ -6,7 +6,6 @@ of cause and effect: the world as the planner saw it, its plan, the command, the
 """
 
 import math
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -220,7 +219,7 @@ def find_departure(
     tokens = sorted({*_track_tokens(first), *_track_tokens(second)})
     ours, theirs = (_quantities(table, rows, tokens) for table in (first, second))
     best: tuple[int, str] | None = None
-    for name in _ordered(ours.keys() & theirs.keys()):
+    for _, name in sorted(map(_ranked, ours.keys() & theirs.keys())):
         parted = (_gaps(name, ours[name], theirs[name]) > tolerance).any(axis=1)
         row = int(np.argmax(parted)) if parted.any() else rows
         if row < (best[0] if best else rows):
@@ -237,12 +236,9 @@ def find_departure(
     return Departure(row, seconds, _quantity(name, index), float(one[index]), float(other[index]))
 
 
-def _ordered(names: Iterable[str]) -> list[str]:
-    def rank(name: str) -> tuple[int, str]:
-        later = (i for i, start in enumerate(_LATER, 1) if name.startswith(start))
-        return (next(later, 0), name)
-
-    return sorted(names, key=rank)
+def _ranked(name: str) -> tuple[int, str]:
+    """A quantity behind its place in the order of cause and effect."""
+    return next((i for i, start in enumerate(_LATER, 1) if name.startswith(start)), 0), name
 
 
 def _track_tokens(table: pa.RecordBatch) -> list[str]:

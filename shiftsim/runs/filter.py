@@ -21,7 +21,7 @@ from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.tables import Table, digest, write_blocks
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.files import safe_join
-from shiftsim.metrics import METRIC_VERSION, MetricResult, compute_metrics, thresholds_of
+from shiftsim.metrics import METRIC_VERSION, compute_metrics, thresholds_of
 from shiftsim.runs.journal import Journal
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.tables import TaskResult
@@ -154,9 +154,10 @@ def judge_scenario(scenario: Scenario, config: FilterConfig) -> dict[str, Any]:
     centers = center_poses(log.expert_ego[:, :3])
     path = float(np.hypot(*np.diff(centers[:, :2], axis=0).T).sum())
     progress = next(s.value for s in result.statistics if s.name == _PROGRESS)
-    rows = {row.metric: row for row in result.rows}
+    rows, start_us = {row.metric: row for row in result.rows}, int(log.time_us[0])
     rules = {_COLLISIONS: COLLISION, _DRIVABLE: AREA}
-    broken = [rule for name, rule in rules.items() if rows[name].score != 1.0]
+    failed = [name for name in rules if rows[name].score != 1.0]
+    broken, violated = [rules[n] for n in failed], [v for n in failed if (v := rows[n].violation)]
     # nuPlan rule 551: too little progress is a short path, or a path beside the route
     if path < config.min_path_m:
         broken.append(STANDING)
@@ -171,16 +172,8 @@ def judge_scenario(scenario: Scenario, config: FilterConfig) -> dict[str, Any]:
         "max_outside_m": rows[_DRIVABLE].value,
         "path_m": path,
         "progress_m": progress,
-        **_first_violation(result, int(log.time_us[0])),
-    }
-
-
-def _first_violation(result: MetricResult, start_us: int) -> dict[str, Any]:
-    by_metric = {row.metric: row.violation for row in result.rows if row.score != 1.0}
-    found = [v for name in (_COLLISIONS, _DRIVABLE) if (v := by_metric.get(name)) is not None]
-    return {
-        "partner_token": next((v.partner for v in found if v.partner is not None), None),
-        "first_violation_s": (found[0].time_us - start_us) * 1e-6 if found else None,
+        "partner_token": next((v.partner for v in violated if v.partner is not None), None),
+        "first_violation_s": (violated[0].time_us - start_us) * 1e-6 if violated else None,
     }
 
 

@@ -104,22 +104,18 @@ def _git_state() -> str:
 
 def state_of(folder: Path) -> State:
     """How far the run in a folder is; `failed` has ended with failed tasks, `new` loses nothing."""
-    if not folder.exists() or (folder.is_dir() and not _has_content(folder)):
+    has_results, names = has_entries(folder / JOURNAL), {folder.name}
+    if folder.is_dir():  # one that was killed before it had begun leaves hidden files and a journal
+        names = {path.name for path in folder.iterdir() if path.name[0] != "."} - {JOURNAL}
+    if not folder.exists() or not (names or has_results):
         return "new"
     manifest = read_manifest(folder)
-    has_results = has_entries(folder / JOURNAL)
     if manifest["state"] == "running" and not has_results:
         return "new"
     if manifest["state"] != "finished" or has_results:
         return "unfinished"
     counts = manifest["counts"]
     return "complete" if counts["ok"] == counts["expected"] else "failed"
-
-
-def _has_content(folder: Path) -> bool:
-    """Whether there is more than what a process leaves that was killed before it had begun."""
-    names = {path.name for path in folder.iterdir() if not path.name.startswith(".")}
-    return names != {JOURNAL} or has_entries(folder / JOURNAL) if names else False
 
 
 def check_target(folder: Path, fingerprint: dict[str, Any], *, shard: str = "") -> State:

@@ -104,7 +104,12 @@ def prepare(
     }
     run = run_name(config, selection.split, fingerprint)
     folder = Path(config.out) if config.out else RUNS / run
-    before = _check_folder(config, folder, fingerprint)
+    before = check_target(folder, fingerprint, shard=config.shard)
+    if config.resumes and before == "new" and not config.out:
+        check_resumable(folder, fingerprint, shard=config.shard)
+    elif before == "unfinished" and not config.resumes:
+        what = f"{str(folder)!r} holds an unfinished run with these settings"
+        raise ConfigError(what, hint="--resume finishes it; remove the folder to begin anew")
     runs = [
         (entry.name, model.name, seed)
         for entry in entries
@@ -252,17 +257,6 @@ def _checkpoints(config: RunConfig, takers: Sequence[str]) -> dict[str, str]:
             raise ConfigError(f"planner {name!r} has two checkpoints: {out[name]!r} and {path!r}")
         out[name] = path
     return out
-
-
-def _check_folder(config: RunConfig, folder: Path, fingerprint: dict[str, Any]) -> State:
-    before = check_target(folder, fingerprint, shard=config.shard)
-    if config.resumes:
-        if before == "new" and not config.out:
-            check_resumable(folder, fingerprint, shard=config.shard)
-    elif before == "unfinished":
-        what = f"{str(folder)!r} holds an unfinished run with these settings"
-        raise ConfigError(what, hint="--resume finishes it; remove the folder to begin anew")
-    return before
 
 
 def _workers(

@@ -130,7 +130,14 @@ class TaskRunner:
         with _timed(seconds, "simulate_seconds"):
             planner = self._planner(task)
             try:
-                return Rollout(scenario, planner, self._setting(task))
+                setting = Setting(
+                    noise=self.noises[task.noise],
+                    seed=task.seed,
+                    traffic=self._make_traffic(),
+                    controller=self.config.controller,
+                    strict=self.config.strict,
+                )
+                return Rollout(scenario, planner, setting)
             except BaseException:
                 self._release(task, planner)
                 raise
@@ -185,15 +192,6 @@ class TaskRunner:
             self._release(task, planner)
         poses = [open_loop.Poses(plan.time_us, plan.states[:, :3]) for plan in plans]
         return open_loop.metric_rows(poses, scenario)
-
-    def _setting(self, task: Task) -> Setting:
-        return Setting(
-            noise=self.noises[task.noise],
-            seed=task.seed,
-            traffic=self._make_traffic(),
-            controller=self.config.controller,
-            strict=self.config.strict,
-        )
 
     def _planner(self, task: Task) -> Planner | None:
         """The planner of a task, which has nothing of other tasks."""

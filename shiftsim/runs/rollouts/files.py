@@ -346,19 +346,14 @@ def _row_groups(
         columns = [name for name in group[0][1].schema.names if name not in _KEY.names]
         batches = [rows.select(columns) for _, rows in group]
         table = pa.Table.from_batches(batches).combine_chunks()
+        owner = pa.array(np.repeat(np.arange(len(group)), [*map(len, batches)]))
+        keys = [
+            pa.array([getattr(task, name) for task, _ in group], kind).take(owner)
+            for name, kind in KEY.items()
+        ]
+        keys.append(pa.array(np.concatenate([np.arange(len(batch)) for batch in batches])))
         schema = pa.schema([*_KEY, *table.schema])
-        yield pa.Table.from_arrays([*_keys(group), *table.columns], schema=schema)
-
-
-def _keys(rollouts: list[tuple[Task, pa.RecordBatch]]) -> list[pa.Array]:
-    """The columns of `_KEY`."""
-    lengths = [len(rows) for _, rows in rollouts]
-    owner = pa.array(np.repeat(np.arange(len(rollouts)), lengths))
-    columns = [
-        pa.array([getattr(task, name) for task, _ in rollouts], kind).take(owner)
-        for name, kind in KEY.items()
-    ]
-    return [*columns, pa.array(np.concatenate([np.arange(length) for length in lengths]))]
+        yield pa.Table.from_arrays([*keys, *table.columns], schema=schema)
 
 
 def part_file(folder: Path, name: str) -> Path:
