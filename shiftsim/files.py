@@ -16,7 +16,7 @@ import traceback
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import cache
 from importlib import import_module
 from importlib.machinery import ModuleSpec, PathFinder
@@ -256,22 +256,16 @@ def import_named(module: str) -> ModuleType:
     return found
 
 
+@dataclass(frozen=True)
 class UserFolder:
     """Finds a module that the user names in a folder that is not on the search path.
 
     What it finds may import its neighbours; libraries, which try many names, may not.
     """
 
-    def __init__(self, folder: str, name: str) -> None:
-        self.folder, self.name = folder, name
-        self.found = set[str]()
-
-    def __eq__(self, other: object) -> bool:
-        mine = (self.folder, self.name)
-        return isinstance(other, UserFolder) and mine == (other.folder, other.name)
-
-    def __hash__(self) -> int:
-        return hash((self.folder, self.name))
+    folder: str  # the folder
+    name: str  # the module
+    found: set[str] = field(default_factory=set, compare=False)  # what it has found
 
     def find_spec(
         self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None

@@ -250,13 +250,13 @@ class Run(results.Run):
             DataError: It was not stored, cannot be read, or the scenario is another one.
         """
         from shiftsim.report.explain import select_tasks
-        from shiftsim.report.words import task_of, task_words
+        from shiftsim.report.words import task_of
         from shiftsim.runs.scenarios import open_run_store
 
         if isinstance(task, str):
             rows = select_tasks(self, task, **choice)
             if len(rows) > 1:
-                there = listed([task_words(row) for row in rows])
+                there = listed([task_of(row).words for row in rows])
                 raise ConfigError(f"{task!r} was driven {len(rows)} times", f"there are {there}")
             task = task_of(rows[0])
         driven = open_run_store(self).read(task.token) if scenario is None else scenario

@@ -10,7 +10,7 @@ from shiftsim import cli
 from shiftsim.cli import Json, Quiet, echo, plural, print_json, print_result, stdout_to_stderr
 from shiftsim.cli.run import DryRun, Live, announce, progress_of
 from shiftsim.errors import MissingExtraError
-from shiftsim.runs.config import split_label
+from shiftsim.runs.config import named_checkpoint, split_label
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -96,15 +96,10 @@ def _official(settings: cli.Settings) -> list[str]:
     """The official checkpoint, for planners that would take weights of our own unasked."""
     from shiftsim.planners.table import OFFICIAL, shipped_file
 
-    given = settings.get("checkpoints", ())
-    if any("=" not in text for text in given):  # of the only planner with one
-        return []
-    named = {text.partition("=")[0] for text in given}
-    arguments = settings.get("planner_args", {})
-    named |= {name for name, values in arguments.items() if "checkpoint" in values}
-    labels = map(split_label, settings.get("planners", ()))
-    names = [label for label, source in labels if shipped_file(source) is not None]
-    return [f"{name}={OFFICIAL}" for name in names if name not in named]
+    sources = dict(map(split_label, settings.get("planners", ())))
+    shipped = [name for name, source in sources.items() if shipped_file(source) is not None]
+    unnamed = (n for n in shipped if not named_checkpoint({**settings, "planners": sources}, n))
+    return [f"{name}={OFFICIAL}" for name in unnamed]
 
 
 def _plan_lines(plan: "Plan") -> "Iterator[str]":

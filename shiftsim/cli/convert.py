@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from shiftsim.data.readers.convert import ConversionReport
     from shiftsim.data.readers.scenarios import RecordingSummary
     from shiftsim.data.readers.tracks.reader import TracksReader
-    from shiftsim.data.readers.windows import ConversionConfig
 
 app = new_app("Make a scenario store from recordings.", no_args_is_help=True)
 MAX_NAMED = 20  # failures that are printed
@@ -150,6 +149,8 @@ def dsc3d(
     Planners need 2 s of history. A recording too short for that is converted with a made-up one,
     of constant velocity: --window-s 4.9 --overlap-s 0 --history-s 0 --padding-s 2.2
     """
+    from shiftsim.data.readers.windows import make_config
+
     for word in category or ():
         name, _, known = word.partition("=")
         if not (name and known):
@@ -159,7 +160,10 @@ def dsc3d(
         **cli.given(country=country, padding_s=padding_s, max_per_window=max_per_window),
         **cli.given(category_map=dict(word.split("=", 1) for word in category or ()) or None),
     }
-    options = _options(config, flags)
+    try:
+        options = make_config((read_toml(config) if config else {}) | flags)
+    except ConfigError as error:
+        raise ConfigError(f"{config or 'convert dsc3d'}: {error.message}", error.hint) from error
     rest: dict[str, Any] = {"site": site, "map_path": map_path, **settings, **vars(options)}
     make = partial(shiftsim.convert_dsc3d, source, **rest)
     lines = partial(_site_lines, is_short=options.is_short)
@@ -354,13 +358,3 @@ def _contents(report: "ConversionReport") -> dict[str, Any]:
     """The report as plain values, for JSON."""
     found = asdict(report)
     return {**found.pop("details"), **{k: v for k, v in found.items() if k != "name"}}
-
-
-def _options(path: Path | None, flags: dict[str, Any]) -> "ConversionConfig":
-    from shiftsim.data.readers.windows import make_config
-
-    values = read_toml(path) if path else {}
-    try:
-        return make_config(values | flags)
-    except ConfigError as error:
-        raise ConfigError(f"{path or 'convert dsc3d'}: {error.message}", error.hint) from error

@@ -177,10 +177,9 @@ def export_to_nuplan(
         {"type": kind, "mapping": list(mapping), "scenarios": count}
         for (kind, mapping), count in sorted(report.mappings.items())
     ]
-    names = ("logs", "maps", "token_file", "tokens", "cities")
-    shown = {name: getattr(report, name) for name in names} | {"mappings": mappings}
-    rest = {"cut_off": report.cut_off, "longer": report.longer, "missing_maps": report.missing_maps}
-    print_result(shown | rest, _export_lines(report, mappings), as_json=as_json)
+    names = "logs maps token_file tokens cities mappings cut_off longer missing_maps".split()
+    values = {name: getattr(report, name) for name in names} | {"mappings": mappings}
+    print_result(values, _export_lines(report, mappings), as_json=as_json)
 
 
 def _export_lines(report: "ExportReport", mappings: list[dict[str, Any]]) -> "Iterator[str]":

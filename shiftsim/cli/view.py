@@ -127,7 +127,7 @@ def report(
 def print_worst(runs: "Sequence[Run]", count: int) -> None:
     """Name the worst scenarios of each run, and of how many they are."""
     from shiftsim.report.scores import worst_rollouts
-    from shiftsim.report.words import task_words
+    from shiftsim.report.words import task_of
 
     for run in runs:
         rows = [row for row in worst_rollouts(run, count) if row["cls"] < 1.0]
@@ -136,7 +136,7 @@ def print_worst(runs: "Sequence[Run]", count: int) -> None:
             of = f"{len(rows)} of {len(set(run.scores['token'].to_pylist()))}"
             echo(f"\n worst scenarios of {run.path.name}, {of}, {each}")
         for row in rows:
-            where = f"{row['token']}  {task_words(row)}"
+            where = f"{row['token']}  {task_of(row).words}"
             others = f"  ({row['others']} more like it)" if row["others"] else ""
             score = f"{100.0 * row['cls']:6.2f}"
             score = score if row["cls"] else cli.paint(score, "red")

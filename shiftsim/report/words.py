@@ -64,12 +64,6 @@ def rows_by_task(table: pa.Table) -> dict[Task, list[dict[str, Any]]]:
     return out
 
 
-def task_words(row: Mapping[str, Any]) -> str:
-    """Planner and noise of a rollout, as "idm ou-high seed 1"; clean ones have no seed."""
-    seed = "" if row["noise"] == "none" else f" seed {row['seed']}"
-    return f"{row['planner']} {row['noise']}{seed}"
-
-
 def violation_words(row: Mapping[str, Any], tracks: Tracks) -> str:
     """A row of `metrics.parquet` with a violation, as "at-fault collision, pedestrian 17, …"."""
     words, partner = [REASONS.get(row["metric"], row["metric"])], row["partner_token"]

@@ -295,17 +295,12 @@ def score_elsewhere(
             first = min(failed, key=lambda result: result.task)
             more = f"; {len(tasks) - 1} other rollouts fail as well" if len(tasks) > 1 else ""
             raise DataError(f"{first.error}{more}", first.hint)
-        counted = _counted(remarks, len(tasks) - len(failed))
+        total, known = len(tasks) - len(failed), sorted(remarks.items())
+        counted = (f"{one} ({n} of {total} rollouts)" if n < total else one for one, n in known)
         about = {"undefined": undefined, "remarks": [source.name, *source.remarks, *counted]}
         manifest |= {"state": "finished", "ended": now(), "elsewhere": about}
         expected = {task._replace(token=token) for task in tasks for token in source.tokens}
         return writer.finish(manifest, expected, default=f"not in {source.name}")
-
-
-def _counted(remarks: Counter[str], total: int) -> list[str]:
-    """What is to be known of rollouts, with their number where it is not of all."""
-    found = sorted(remarks.items())
-    return [f"{one} ({n} of {total} rollouts)" if n < total else one for one, n in found]
 
 
 def _fingerprint(source: Source, store: str, config: RunConfig) -> dict[str, Any]:

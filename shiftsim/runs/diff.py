@@ -147,11 +147,10 @@ def diff_lines(found: Difference) -> list[str]:
         lines.append(f" settings that differ: {', '.join(found.settings)}")
     for change in found.changes:
         task = change.task
-        seed = "" if task.noise == "none" else f" seed {task.seed}"
-        both = "/".join(dict.fromkeys((task.planner, change.planner)))
+        both = task._replace(planner="/".join(dict.fromkeys((task.planner, change.planner))))
         metrics = ", ".join(f"{name} {_in_words(*pair)}" for name, pair in change.metrics.items())
         total = _in_words(change.first, change.second)
-        lines.append(f" {task.token}  {both} {task.noise}{seed}  {total}  {metrics}")
+        lines.append(f" {task.token}  {both.words}  {total}  {metrics}")
         parts = [f"first difference {change.departure}" if change.departure else change.note]
         if change.largest and change.largest[0]:
             gap, seconds = change.largest

@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 
 from shiftsim.errors import ConfigError, DataError, listed, one_of
 from shiftsim.files import write_text
-from shiftsim.runs.rollouts import Task, damaged, describe
+from shiftsim.runs.rollouts import Task, damaged
 from shiftsim.runs.rollouts.files import FOLDER, RolloutLocation, RolloutReader, complete_rollout
 from shiftsim.runs.tables import LOCATION, OK, read_table, stored_location
 from shiftsim.sim.log import SimulationLog
@@ -108,7 +108,7 @@ class Run:
         """One stored rollout as it lies on disk, a row per sample; or a DataError."""
         location = self.rollout_places.get(task)
         if location is None:
-            what = f"run {self.path.name!r} holds no rollout of {describe(task)}"
+            what = f"run {self.path.name!r} holds no rollout of {task.words} {task.token}"
             raise DataError(what, hint="run again with --save-rollouts all")
         return self._reader.read(location)
 

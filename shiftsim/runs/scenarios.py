@@ -184,10 +184,8 @@ def default_split(store: ScenarioStore, edits: "EditSet | None" = None) -> str:
     path = Path(store.path) / "splits" / f"{_DEMO_SPLIT}.toml"
     if store.generator.get("name") != DEFAULT_STORE or not path.is_file():
         return ""
-    if edits is not None:
-        if not set(edits.named(store).values()) <= set(read_split(path).tokens):
-            return ""
-    return _DEMO_SPLIT
+    fits = edits is None or set(edits.named(store).values()) <= set(read_split(path).tokens)
+    return _DEMO_SPLIT if fits else ""
 
 
 def open_split(store: ScenarioStore, name: str, *, whole: bool = False) -> "tuple[Split, str]":

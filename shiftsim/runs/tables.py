@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from shiftsim.metrics import SHORT_NAMES
-from shiftsim.runs.rollouts import Task, damaged, describe
+from shiftsim.runs.rollouts import Task, damaged
 from shiftsim.runs.rollouts.files import FOLDER, KEY, RolloutLocation, part_file
 from shiftsim.world.ranges import RUN, require
 
@@ -153,7 +153,7 @@ def stored_results(run: Path) -> Iterator[TaskResult]:
 def _next_rows(task: Task, rows: Iterator[Any], table: Path) -> list[dict[str, Any]]:
     found, values = next(rows, (None, []))
     if found != task:
-        what = f"the rows of {describe(task)} are missing"
+        what = f"the rows of {task.words} {task.token} are missing"
         raise damaged(table.with_suffix(".parquet"), what)
     return list(values)
 

@@ -90,11 +90,6 @@ def map_unordered(
         pool.close()
 
 
-def _seconds_since_compiling() -> float:
-    """How long ago the last kernel was put into the cache [s]."""
-    return time() - max((path.stat().st_mtime for path in machine_code()), default=-inf)
-
-
 @dataclass(eq=False)
 class _Worker:
     """A process of the pool, and the task that it is at."""
@@ -188,7 +183,9 @@ class Pool:
                 yield outcome
         now = monotonic()
         late = [worker for worker in self.workers if worker.deadline < now]
-        if late and _seconds_since_compiling() < _TIME_TO_COMPILE:
+        files = machine_code() if late else ()
+        compiled = max((path.stat().st_mtime for path in files), default=-inf)
+        if time() - compiled < _TIME_TO_COMPILE:
             for worker in late:
                 worker.deadline = now + _TIME_TO_COMPILE
             return

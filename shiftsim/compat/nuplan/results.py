@@ -31,7 +31,7 @@ from shiftsim.metrics import evaluate, measure
 from shiftsim.metrics.score import closed_loop_score, nuplan_columns
 from shiftsim.runs.derive import tasks_with_rollouts
 from shiftsim.runs.results import Run, open_run
-from shiftsim.runs.rollouts import Task, describe
+from shiftsim.runs.rollouts import Task
 from shiftsim.runs.scenarios import open_run_store
 from shiftsim.runs.tables import FAILED, TaskResult, task_of
 from shiftsim.runs.task import attempt
@@ -84,7 +84,8 @@ def export_results(
         for outcome in outcomes:
             result = outcome.result or TaskResult(outcome.task, FAILED, error=outcome.death)
             if isinstance(result, TaskResult):
-                raise DataError(f"{describe(outcome.task)}: {result.error}", result.hint)
+                what = f"{outcome.task.words} {outcome.task.token}"
+                raise DataError(f"{what}: {result.error}", result.hint)
             found[outcome.task] = result
             progress(len(found), len(tasks))
     names = {task.token: result["key"]["log_name"] for task, result in found.items()}

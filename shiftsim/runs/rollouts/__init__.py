@@ -17,11 +17,11 @@ class Task(NamedTuple):
     seed: int  # seed of the noise; 0 without noise
     token: str  # scenario
 
-
-def describe(task: Task) -> str:
-    """A task in words."""
-    seed = "" if task.noise == "none" else f" seed {task.seed}"
-    return f"{task.planner} {task.noise}{seed} {task.token}"
+    @property
+    def words(self) -> str:
+        """All but the scenario, as "idm ou-high seed 1"; clean ones have no seed."""
+        seed = "" if self.noise == "none" else f" seed {self.seed}"
+        return f"{self.planner} {self.noise}{seed}"
 
 
 def damaged(path: Path, what: str) -> DataError:
