@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from shiftsim.errors import DataError
+from shiftsim.kernels import FloatArray
 from shiftsim.metrics import MetricResult, evaluate, measure
 from shiftsim.metrics.score import closed_loop_score, nuplan_columns
 from shiftsim.planners.registry import load_planner
@@ -46,13 +47,9 @@ _LABELS = {  # columns that name things, or say what only their own run can know
     *("metric_computator", "metric_statistics_name", "time_series_selected_frames", "log_name"),
     *("scenario_type", "aggregator_type", "error_message"),
 }
-_NO_METRICS = {
-    "scenario",
-    "planner_name",
-    "log_name",
-    "scenario_type",
-    "num_scenarios",
-    "aggregator_type",
+_NO_METRICS = {  # of the table of scores
+    *("scenario", "log_name", "scenario_type"),
+    *("num_scenarios", "planner_name", "aggregator_type"),
 }
 POSE = [1e-6, 1e-6, 1e-7]  # m, m, rad
 _RUNTIMES = (("mean", np.mean), ("median", np.median), ("std", np.std))
@@ -174,43 +171,38 @@ def _read(folder: Path, pattern: str, token: str, report: Report) -> dict[str, G
             if name not in table:
                 raise DataError(f"{file}: column {name!r} is missing", OTHER_VERSION)
         if has_means:
-            _require_numbers(table, file)
-            table = _compare_means(table)
+            table = _compare_means(table, file)
         found[file.stem] = Groups(table, (token, "planner_name"))
     return found
 
 
-def _require_numbers(table: Source, file: Path) -> None:
+def _compare_means(table: Source, file: Path) -> Source:
+    """Compare the last rows of the scores, which are of several scenarios; returns the others."""
+    table, numbers = replace(table, name="scores"), dict[str, FloatArray]()
     for column in ("num_scenarios", *(name for name in table if name not in _NO_METRICS)):
         try:
-            table[column].astype(np.float64)
+            numbers[column] = table[column].astype(np.float64)
         except (TypeError, ValueError) as error:
             raise DataError(f"{file}: column {column!r}: {error}", OTHER_VERSION) from None
-    means = table.at(~np.isnan(table["num_scenarios"].astype(np.float64)))
+    is_one = np.isnan(numbers.pop("num_scenarios"))
+    means = table.at(~is_one)
     if len(means.groups("scenario", "planner_name")) < means.num_rows:  # each reads all rows
         raise DataError(f"{file}: column 'num_scenarios': a mean is there twice", DAMAGED)
-
-
-def _compare_means(table: Source) -> Source:
-    """Compare the last rows of the scores, which are of several scenarios; returns the others."""
-    table = replace(table, name="scores")
-    count = table["num_scenarios"].astype(np.float64)
-    for row in np.flatnonzero(~np.isnan(count)).tolist():
+    for row in np.flatnonzero(~is_one).tolist():
         name, planner = table["scenario"][row], table["planner_name"][row]
         is_final = name == "final_score"
-        members = np.isnan(count) & (table["planner_name"] == planner)
+        members = is_one & (table["planner_name"] == planner)
         members &= is_final | (table["scenario_type"] == name)
-        means = {"num_scenarios": float(members.sum())}
-        for metric in (column for column in table if column not in _NO_METRICS):
-            values = table[metric][members].astype(np.float64)
-            total = float(np.nansum(values)) if not np.isnan(values).all() else np.nan
+        ours = {"num_scenarios": float(members.sum())}
+        for metric, values in numbers.items():
+            known = values[members & ~np.isnan(values)]
             # nuPlan rule 606: metrics of a scenario type are added up, only the score is a mean
-            is_mean = is_final or metric == "score"
-            means[metric] = total / max(len(values), 1) if is_mean else total
-        for column, mean in means.items():
+            count = max(members.sum(), 1) if is_final or metric == "score" else 1
+            ours[metric] = float(np.sum(known)) / count if known.size else np.nan
+        for column, mean in ours.items():
             where, theirs = f"{name} {planner} {column}", table[column][row]
             table.report.compare("scores of several", where, mean, theirs, atol=TOLERANCE)
-    return table.at(np.isnan(count))
+    return table.at(is_one)
 
 
 class _Replay:
@@ -310,28 +302,23 @@ def _compare_result(
         ours = {name: [np.nan if score is None else score] for name, score in row.items()}
         table[run.key].match(str(run), ours, rollouts.SCORES)
     for metric in (name for name in result.scores if name in metrics):
-        row, atol = _metric_row(metric, result)
-        theirs = metrics[metric][run.key]
+        theirs, series = metrics[metric][run.key], result.series.get(metric)
         if not theirs.num_rows:
             report.fail(f"metric {metric}", str(run), "there is no row of it")
             continue
+        row = nuplan_columns(result, metric)
+        if row["metric_score"] is None:
+            row["metric_score"] = np.nan
+        atol = {"metric_score": rollouts.SCORES.get(metric, EXACT)}
+        atol["time_series_values"] = EXACT if series and series.unit == "boolean" else TOLERANCE
+        for one in (one for one in result.statistics if one.metric == metric):
+            is_whole = one.unit in ("boolean", "count")
+            atol[f"{one.name}_stat_value"] = EXACT if is_whole else TOLERANCE
         for name in (name for name in theirs if name.endswith("_stat_type")):
             row.setdefault(name, None)  # other scenarios have more of them
         for name, value in row.items():
             other, bound = theirs[name][0] if name in theirs else None, atol.get(name, EXACT)
             report.compare(f"metric {metric}", f"{run} {name}", value, other, atol=bound)
-
-
-def _metric_row(metric: str, result: MetricResult) -> tuple[dict[str, Any], dict[str, float]]:
-    """The row of a metric in nuPlan's table, by column, and tolerances."""
-    series, row = result.series.get(metric), nuplan_columns(result, metric)
-    if row["metric_score"] is None:
-        row["metric_score"] = np.nan
-    atol = {"metric_score": rollouts.SCORES.get(metric, EXACT)}
-    atol["time_series_values"] = EXACT if series and series.unit == "boolean" else TOLERANCE
-    for one in (one for one in result.statistics if one.metric == metric):
-        atol[f"{one.name}_stat_value"] = EXACT if one.unit in ("boolean", "count") else TOLERANCE
-    return row, atol
 
 
 def _compare_runner(run: Run, row: Source, recorded: Recorded | None) -> bool:

@@ -152,7 +152,7 @@ def test_a_changed_mean_is_named(folder, row):
     for column in ("score", "ego_is_comfortable", "num_scenarios"):
         change(path, column, row, 1e-6)
     report = Report()
-    _compare_means(read_table(path, report))
+    _compare_means(read_table(path, report), path)
     name = pq.read_table(path)["scenario"][row].as_py()
     assert sorted(line.split(": ")[1] for line in report.mismatches) == [
         f"{name} SimplePlanner {column}"
