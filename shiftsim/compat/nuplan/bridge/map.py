@@ -26,6 +26,7 @@ from nuplan.common.maps.abstract_map_objects import (
     StopLine,
 )
 from nuplan.common.maps.maps_datatypes import IntersectionType, LaneConnectorType, StopLineType
+from shiftsim.compat.nuplan.shims.geometry import derived, part
 from shiftsim.errors import MapError
 from shiftsim.kernels import FloatArray
 from shiftsim.world.layers import Layer, Lists, nearest_of
@@ -57,10 +58,7 @@ class NuPlanPolylineMapObject(PolylineMapObject):
     def linestring(self) -> shapely.LineString:
         return shapely.LineString(self._xy)
 
-    @property
-    def length(self) -> float:
-        """Length [m]."""
-        return float(self.linestring.length)
+    length = derived(lambda self: float(self.linestring.length), "Length [m].")
 
     @cached_property
     def discrete_path(self) -> list[Any]:
@@ -118,6 +116,11 @@ class _Mapped:
     @cached_property
     def polygon(self) -> shapely.Polygon:
         return self._layer.shape(self._index)
+
+
+def _number(table: str, kind: Any, doc: str) -> Any:
+    """A property: the number of this object in a table of the map, as a kind of numbers."""
+    return derived(lambda mapped: kind(int(getattr(mapped._source, table)[mapped._index])), doc)
 
 
 def _linked(table: str, layer: str) -> Any:
@@ -181,10 +184,7 @@ class _Edge(_Mapped):
 class NuPlanLane(_Edge, Lane):
     """A lane."""
 
-    @property
-    def index(self) -> int:
-        """Position in the roadblock, 0 leftmost."""
-        return int(self._source.lane_index[self._index])
+    index = _number("lane_index", int, "Position in the roadblock, 0 leftmost.")
 
     def is_left_of(self, other: Any) -> bool:
         """Whether it is further left in the same roadblock."""
@@ -209,10 +209,7 @@ class NuPlanLaneConnector(_Edge, LaneConnector):
     """A lane across an intersection."""
 
     adjacent_edges = (None, None)
-
-    @property
-    def turn_type(self) -> Any:
-        return LaneConnectorType(int(self._source.turn_type[self._index]))
+    turn_type = _number("turn_type", LaneConnectorType, "Where it leads.")
 
     def is_left_of(self, other: Any) -> bool:
         """False: connectors have no neighbours."""
@@ -252,12 +249,7 @@ class NuPlanStopLine(_Mapped, StopLine):
 
     intersection_from = _not_in_nuplan("intersection_from")
     parent = _not_in_nuplan("parent")
-
-    @property
-    def layer_type(self) -> Any:
-        return StopLineType(int(self._source.stop_kinds[self._index]))
-
-    stop_line_type = layer_type
+    layer_type = stop_line_type = _number("stop_kinds", StopLineType, "What one stops for.")
 
 
 class NuPlanIntersection(_Mapped, Intersection):
@@ -306,9 +298,7 @@ class BridgeMap(AbstractMap):
         self.source = source
         self._by_index: dict[tuple[str, int], Any] = {}
 
-    @property
-    def map_name(self) -> str:
-        return self.source.name
+    map_name = part("source.name", "Its name.")
 
     @cached_property
     def _spans(self) -> dict[Any, _Span]:
