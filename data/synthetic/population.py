@@ -15,7 +15,6 @@ from shiftsim.data.synthetic.town import Town
 from shiftsim.data.synthetic.traffic import Box, Traffic
 from shiftsim.geometry.boxes import boxes_to_corners
 from shiftsim.kernels import FloatArray
-from shiftsim.world.state import LightStatus
 
 _HALTS = {"bus": 0.4, "bicycle": 0.2}  # chance to stop for a while
 _HALTS_ELSE, _SLOW = 0.08, 0.07  # chance of all others, and of those who dawdle
@@ -137,11 +136,7 @@ def _queue(
 def _is_red(town: Town, entry: str) -> bool:
     """Whether a street has a light that is red at time 0."""
     numbers = {road.id for turn, road in town.connectors.items() if turn.street == entry}
-    return any(
-        numbers & group and lights.status(phase, 0.0) == LightStatus.RED
-        for lights in town.lights
-        for phase, group in enumerate(lights.phases)
-    )
+    return any(x.wait(phase, 0.0) > 0.0 for n, (x, phase) in town.lit().items() if n in numbers)
 
 
 def _moving_off(routes: RandomRoutes, entry: str, rng: np.random.Generator) -> list[Driver]:

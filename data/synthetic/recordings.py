@@ -6,7 +6,6 @@ DSC3D has no traffic lights, so they join the recordings after the conversion.
 import json
 import shutil
 import tempfile
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from hashlib import blake2b
@@ -25,12 +24,11 @@ from shiftsim.data.store.writing import StoreWriter
 from shiftsim.data.synthetic.agents import SIZES
 from shiftsim.data.synthetic.layouts import random_town
 from shiftsim.data.synthetic.population import random_traffic
-from shiftsim.data.synthetic.town import Lights, Town
+from shiftsim.data.synthetic.town import Town
 from shiftsim.data.synthetic.traffic import DT, Box, Traffic
 from shiftsim.errors import ConversionError
 from shiftsim.geometry.boxes import wrap_angles
 from shiftsim.kernels import FloatArray
-from shiftsim.world.map import VectorMap
 from shiftsim.world.state import TrafficLights
 
 DURATION = 42.08  # s, of a recording
@@ -199,30 +197,19 @@ def _write_recording(folder: Path, start: datetime, table: pa.Table) -> None:
 def _add_lights(store: Path, recording: str, town: Town, offset: FloatArray) -> None:
     """Write what the traffic lights showed into a recording."""
     opened = ScenarioStore(store)
-    road = opened.map(town.name)
-    stored = opened.recording(recording)
+    road, stored = opened.map(town.name), opened.recording(recording)
     found = stored.read(0, stored.num_rows)
     seconds = (np.arange(stored.num_rows) * ROW_S).tolist()
-    lit = list(_lit_connectors(road, town, offset))
-    names = tuple(road.edges.ids[edge] for edge, *_ in lit)
-    columns = [[int(lights.status(phase, time)) for time in seconds] for _, lights, phase in lit]
-    with StoreWriter(store) as writer:
-        lights = TrafficLights(names, np.array(columns, np.int8).T)
-        writer.add_recording(replace(found, lights=lights))
-
-
-def _lit_connectors(
-    road: VectorMap, town: Town, offset: FloatArray
-) -> Iterator[tuple[int, Lights, int]]:
-    """Connectors of the map that have a light, whose lights, and their phase."""
-    specs = list(town.connectors.values())
+    specs, lit = list(town.connectors.values()), town.lit()
     ends = [spec.center_of(-1, np.array([0.0, spec.length]))[:, :2] + offset for spec in specs]
+    shown: dict[str, list[int]] = {}  # by connector
     for edge in range(road.num_lanes, len(road.edges)):
-        line = road.baselines.at(edge)
-        gaps = np.hypot(*(np.array(ends) - line[[0, -1]]).T).sum(0)
-        number = specs[int(gaps.argmin())].id
-        assert gaps.min() < _SAME_PLACE, f"{road.name}: connector {road.edges.ids[edge]}"
-        for lights in town.lights:
-            for phase, group in enumerate(lights.phases):
-                if number in group:
-                    yield edge, lights, phase
+        gaps = np.hypot(*(np.array(ends) - road.baselines.at(edge)[[0, -1]]).T).sum(0)
+        name, number = road.edges.ids[edge], specs[int(gaps.argmin())].id
+        assert gaps.min() < _SAME_PLACE, f"{road.name}: connector {name}"
+        if number in lit:
+            lights, phase = lit[number]
+            shown[name] = [int(lights.status(phase, time)) for time in seconds]
+    with StoreWriter(store) as writer:
+        status = np.array(list(shown.values()), np.int8).T
+        writer.add_recording(replace(found, lights=TrafficLights(tuple(shown), status)))

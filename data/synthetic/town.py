@@ -114,19 +114,6 @@ class Lights:
         since = (self.begun + time - sum(spans[:phase])) % sum(spans)
         return -since if since < self.green[phase] + self.yellow else sum(spans) - since
 
-    def closed(self, time: float) -> set[int]:
-        """Connecting roads that nobody may enter at a time [s]."""
-        return {
-            number
-            for phase, numbers in enumerate(self.phases)
-            if self.status(phase, time) != LightStatus.GREEN
-            for number in numbers
-        }
-
-    def waits(self, time: float) -> dict[str, float]:
-        """How long the vehicles before each crosswalk will see red [s]."""
-        return {name: self.wait(phase, time) for name, phase in self.crossings.items()}
-
 
 @dataclass(frozen=True)
 class Leg:
@@ -192,6 +179,15 @@ class Town:
         """The OpenDRIVE file of its roads."""
         streets = [street.road for street in self.streets.values()]
         return roads.town_xml(self.name, [*streets, *self.connectors.values()])
+
+    def lit(self) -> dict[int, tuple[Lights, int]]:
+        """Which lights, and their phase, by connecting road that has some."""
+        return {
+            number: (lights, phase)
+            for lights in self.lights
+            for phase, numbers in enumerate(lights.phases)
+            for number in numbers
+        }
 
     def parked(self) -> FloatArray:
         """(n, 3) poses of parked cars."""

@@ -15,6 +15,7 @@ from shiftsim.data.synthetic.agents import WALKING, Driver, Pedestrian, Zone, ar
 from shiftsim.data.synthetic.roads import STEP
 from shiftsim.data.synthetic.town import Town
 from shiftsim.kernels import FloatArray
+from shiftsim.world.state import LightStatus
 
 DT = 0.08  # s, 12.5 Hz
 _MAX_ACCEL, _BRAKING, _HARDEST = 1.3, 1.6, 3.2  # m/s^2
@@ -48,7 +49,7 @@ class Traffic:
     _passed: dict[tuple[int, int], float] = field(default_factory=dict)
     # connecting roads with a light that is not green
     _closed: set[int] = field(default_factory=set)
-    # how long the light for vehicles will stay red, by crosswalk [s]
+    # how long the vehicles before a crosswalk will see red [s]
     _waits: dict[str, float] = field(default_factory=dict)
 
     def record(self, duration: float) -> list[Box]:
@@ -80,9 +81,10 @@ class Traffic:
         return self.boxes
 
     def _step(self, time: float) -> None:
-        lights = self.town.lights
-        self._closed = {number for x in lights for number in x.closed(time)}
-        self._waits = {name: wait for x in lights for name, wait in x.waits(time).items()}
+        lit, green = self.town.lit().items(), LightStatus.GREEN
+        self._closed = {number for number, (x, k) in lit if x.status(k, time) != green}
+        crossings = ((x, pair) for x in self.town.lights for pair in x.crossings.items())
+        self._waits = {name: x.wait(phase, time) for x, (name, phase) in crossings}
         self._admit()
         bodies = _bodies(self._driving)
         wanted = [self._acceleration(driver, bodies, time) for driver in self._driving]

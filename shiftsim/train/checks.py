@@ -28,7 +28,6 @@ ASIDE, TURNED = 0.5, 0.1  # m to the left, rad: what the ego is moved by
 # m that the path goes on straight
 BACK, AT, FARTHEST = 0.2, 49, 100.0
 
-
 CHECKS = ("slower behind an obstacle", "goes on without the lead", "starts at green", "comes back")
 
 

@@ -18,7 +18,7 @@ from shiftsim.data.synthetic.agents import SIZES, arc_at
 from shiftsim.data.synthetic.layouts import KINDS, random_town
 from shiftsim.data.synthetic.population import random_traffic
 from shiftsim.data.synthetic.store import FOREIGN, town_specs, write_towns
-from shiftsim.data.synthetic.town import Lights
+from shiftsim.data.synthetic.town import Lights, Town
 from shiftsim.data.synthetic.traffic import DT
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.geometry.boxes import boxes_to_corners
@@ -252,6 +252,7 @@ def test_traffic_lights_are_in_the_store_for_the_connectors_that_have_one(store)
 
 def test_streets_take_turns_and_yellow_lies_between_green_and_red():
     lights = Lights((frozenset({1}), frozenset({2})), (10.0, 8.0), 4.0, {"crosswalk": 1})
+    lit = Town("test", lights=(lights,)).lit()
     times = np.arange(0.0, 60.0, 0.5).tolist()
     shown = [[lights.status(phase, time) for time in times] for phase in (0, 1)]
     assert all(LightStatus.RED in both for both in zip(*shown, strict=True))
@@ -260,8 +261,9 @@ def test_streets_take_turns_and_yellow_lies_between_green_and_red():
     assert changes == {(green, yellow), (yellow, red), (red, green)}
     assert shown[0].index(yellow) == 12  # 6 s: 4 s of the 10 are over
     for time, (one, two) in zip(times, zip(*shown, strict=True), strict=True):
-        assert lights.closed(time) == {n for n, x in ((1, one), (2, two)) if x != green}
-        assert (lights.waits(time)["crosswalk"] > 0.0) == (two == red)
+        closed = {n for n, (x, phase) in lit.items() if x.status(phase, time) != green}
+        assert closed == {n for n, x in ((1, one), (2, two)) if x != green}
+        assert (lights.wait(lights.crossings["crosswalk"], time) > 0.0) == (two == red)
 
 
 @pytest.mark.parametrize("number", [0, pytest.param(4, marks=pytest.mark.thorough)])
