@@ -209,7 +209,7 @@ def _check_bicycle(arrays: Named, report: Report) -> None:
 
 def _check_tracker(arrays: Named, report: Report) -> None:
     commands = np.column_stack([arrays["accel_cmd"], arrays["steer_rate_cmd"]])
-    for case, (begin, end) in enumerate(zip(*_bounds(arrays["traj_ptr"]), strict=True)):
+    for case, (begin, end) in enumerate(pairwise(arrays["traj_ptr"].tolist())):
         columns = {name: arrays[f"traj_{name}"][begin:end] for name in ("x", "y", "heading")}
         plan = arrays["traj_time_us"][begin:end], ego_states(columns)
         now, ego = int(arrays["now_us"][case]), arrays["ego_state"][case]
@@ -218,17 +218,13 @@ def _check_tracker(arrays: Named, report: Report) -> None:
 
 
 def _check_comfort(arrays: Named, report: Report) -> None:
-    for case, (begin, end) in enumerate(zip(*_bounds(arrays["sig_ptr"]), strict=True)):
+    for case, (begin, end) in enumerate(pairwise(arrays["sig_ptr"].tolist())):
         states = ego_states({name: arrays[f"sig_in_{name}"][begin:end] for name in _SIGNALS})
         signals = comfort_signals(arrays["sig_in_time_us"][begin:end], states)
         for name, profile in PROFILES.items():
             flags = within_bounds(signals, profile)
             theirs = arrays["within_default" if name == "nuplan" else f"within_{name}"][case]
             report.compare(f"comfort, {name}", f"case {case}", [*flags, all(flags)], theirs)
-
-
-def _bounds(ends: np.ndarray) -> tuple[list[int], list[int]]:
-    return ends[:-1].tolist(), ends[1:].tolist()
 
 
 def _check_metrics(arrays: Named, report: Report) -> None:

@@ -124,20 +124,16 @@ class TrajectorySampling:
             raise ValueError(f"num_poses is {count!r}, not an integer")
         if [bool(count), bool(horizon), bool(interval)].count(True) < 2:
             raise ValueError(f"two of the three values are needed: {self}")
-        if count and horizon and interval:
-            if not math.isclose(count, horizon / interval, abs_tol=_SAMPLING_TOLERANCE):
-                raise ValueError(f"the three values do not fit together: {self}")
-        elif count and horizon:
-            interval = horizon / count
-        elif count and interval:
-            horizon = count * interval
-        elif horizon and interval:
+        if not count:
             count = int(horizon / interval)  # nuPlan rule 574: cut, not rounded
             rest = math.fmod(horizon, interval)
             if min(rest, abs(interval - rest)) > _SAMPLING_TOLERANCE:
                 raise ValueError(f"the horizon is not a multiple of the interval: {self}")
-        self.num_poses, self.time_horizon = count, float(horizon)
-        self.interval_length = float(interval)
+        elif horizon and interval:
+            if not math.isclose(count, horizon / interval, abs_tol=_SAMPLING_TOLERANCE):
+                raise ValueError(f"the three values do not fit together: {self}")
+        self.num_poses, self.time_horizon = count, float(horizon or count * interval)
+        self.interval_length = float(interval or horizon / count)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, TrajectorySampling):
