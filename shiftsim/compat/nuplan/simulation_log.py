@@ -29,7 +29,7 @@ from shiftsim.sim.dynamics.perfect import KEPT_US
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world import state
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import PACIFICA, AgentKind, LightStatus
+from shiftsim.world.state import PACIFICA, AgentKind
 
 MAP_VERSION = "nuplan-maps-v1.0"
 T = TypeVar("T")
@@ -289,18 +289,14 @@ def _lights(scenario: Scenario, log: SimulationLog) -> Iterator[list[Any]]:
     """Lights of every sample that are listed."""
     lights = log.traffic_lights
     types = [_DEVKIT.TrafficLightStatusType(code) for code in range(4)]
-    numbers = [connector_number(scenario, name) for name in lights.connector_ids]
-    is_listed = lights.status != LightStatus.ABSENT
-    rows, connectors = np.nonzero(is_listed)
-    listed = [
-        _DEVKIT.TrafficLightStatusData(
-            status=types[lights.status[row, connector]],
-            lane_connector_id=numbers[connector],
-            timestamp=int(log.time_us[row]),
-        )
-        for row, connector in zip(rows, connectors, strict=True)
-    ]
-    return _grouped(listed, is_listed.sum(axis=1))
+    numbers = {name: connector_number(scenario, name) for name in lights.connector_ids}
+    for row, time_us in enumerate(log.time_us.tolist()):
+        yield [
+            _DEVKIT.TrafficLightStatusData(
+                status=types[status], lane_connector_id=numbers[name], timestamp=time_us
+            )
+            for name, status in lights.listed(row)
+        ]
 
 
 def _grouped(pieces: Iterable[T], lengths: IntArray) -> Iterator[list[T]]:
