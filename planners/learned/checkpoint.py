@@ -164,11 +164,9 @@ def open_checkpoint(path: Path) -> Checkpoint:
     holder = contents.entries[entry] if entry else contents.entries
     tensors = {str(name): value for name, value in holder.items() if hasattr(value, "as_strided")}
     if not tensors:
-        raise CheckpointError(
-            f"checkpoint {str(path)!r} holds no tensors "
-            f"(entries: {', '.join(list(contents.entries)[:8]) or 'none'})",
-            hint="give the checkpoint that the training wrote",
-        )
+        entries = ", ".join([*contents.entries][:8]) or "none"
+        what = f"checkpoint {str(path)!r} holds no tensors (entries: {entries})"
+        raise CheckpointError(what, reader.WRITTEN_HINT)
     state = _without_prefixes(tensors)
     others = [name for name in contents.entries if name != entry] if entry else []
     others += [name for name in holder if name not in tensors]
@@ -232,9 +230,8 @@ def checked_state(
     try:
         wanted = empty_state(planner, args)
     except CheckpointError as error:
-        raise CheckpointError(
-            f"checkpoint {str(found.path)!r}: {error.message}", error.hint
-        ) from error
+        what = f"checkpoint {str(found.path)!r}: {error.message}"
+        raise CheckpointError(what, error.hint) from error
     problems = _differences(shapes_of(found.state), shapes_of(wanted))
     if problems:
         _require_likeness(found, planner)
@@ -244,15 +241,11 @@ def checked_state(
         )
     state = {name: found.state[name].detach().to(wanted[name].dtype) for name in wanted}
     allowed = CHECKPOINT["weight"]
-    bad = [
-        n for n, value in state.items() if not bool((value.double().abs() <= allowed.high).all())
-    ]
-    if bad:
-        what = f"{bad[0]} has values that are not finite or beyond {allowed}"
-        raise CheckpointError(
-            f"checkpoint {str(found.path)!r}: {what}",
-            hint="the training has diverged, or the file is damaged",
-        )
+    for name, value in state.items():
+        if not bool((value.double().abs() <= allowed.high).all()):
+            what = f"{name} has values that are not finite or beyond {allowed}"
+            hint = "the training has diverged, or the file is damaged"
+            raise CheckpointError(f"checkpoint {str(found.path)!r}: {what}", hint)
     return state
 
 
@@ -369,9 +362,8 @@ def require_torch(who: str) -> None:
     try:
         import torch  # noqa: F401  # to see whether it can be imported
     except ImportError as error:
-        raise MissingExtraError(
-            f"{who} needs PyTorch", hint="pip install 'shiftsim[learned]'"
-        ) from error
+        hint = "pip install 'shiftsim[learned]'"
+        raise MissingExtraError(f"{who} needs PyTorch", hint) from error
 
 
 def resolve_device(name: str) -> str:

@@ -21,7 +21,7 @@ from shiftsim.errors import CheckpointError
 _LEGACY_MAGIC = b"l\xfc\x9cF\xf9 j\xa8P\x19"  # the number with which torch < 1.6 began its files
 _HEADER_BYTES = 64
 ARGS_HINT = "use the args.json that was published with the checkpoint"
-_WRITTEN_HINT = "give the checkpoint that the training wrote"
+WRITTEN_HINT = "give the checkpoint that the training wrote"
 _DAMAGED_HINT = (
     "download it again, and compare its size with the one that its authors publish; or, where you "
     "trust it, load it with torch.load(…, weights_only=False) and save its state_dict alone"
@@ -55,7 +55,7 @@ def read_contents(path: Path) -> Contents:
         raise unreadable(path, error) from error
     is_zip = head.startswith(b"PK\x03\x04")
     if not is_zip and _LEGACY_MAGIC not in head and head[8:9] != b"{":
-        raise CheckpointError(f"checkpoint {str(path)!r} {_what_else(head)}", _WRITTEN_HINT)
+        raise CheckpointError(f"checkpoint {str(path)!r} {_what_else(head)}", WRITTEN_HINT)
     try:
         contents = _read_safetensors(path) if head[8:9] == b"{" else _read_torch(path, is_zip)
     except Exception as error:  # damaged files make torch raise whatever there is
@@ -65,7 +65,7 @@ def read_contents(path: Path) -> Contents:
     loaded: object = contents.entries  # of torch.load, which may return anything
     if not isinstance(loaded, dict):
         what = f"holds one {type(loaded).__name__}, not tensors by name"
-        raise CheckpointError(f"checkpoint {str(path)!r} {what}", _WRITTEN_HINT)
+        raise CheckpointError(f"checkpoint {str(path)!r} {what}", WRITTEN_HINT)
     return contents
 
 
