@@ -5,7 +5,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from itertools import count, cycle, islice
+from itertools import chain, count, cycle, islice, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -147,8 +147,5 @@ def _sample(store: ScenarioStore) -> list[str]:
         steps = np.diff(scene.ego[rows[0] : rows[-1] + 1, :2], axis=0)
         if np.hypot(*steps.T).sum() >= _SPLIT_PATH:
             by_city[scene.city].append(scene.token)
-    turns = max(map(len, by_city.values()))
-    mixed = [
-        tokens[turn] for turn in range(turns) for tokens in by_city.values() if turn < len(tokens)
-    ]
-    return sorted(mixed[:_SPLIT_SIZE])
+    mixed = filter(None, chain.from_iterable(zip_longest(*by_city.values())))
+    return sorted(islice(mixed, _SPLIT_SIZE))

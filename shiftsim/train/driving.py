@@ -9,7 +9,7 @@ within 0.1 s: a larger `tau` steers harder than the tracker.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, islice, zip_longest
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -233,9 +233,8 @@ def divide(store: ScenarioStore, tokens: Iterable[str], seed: int) -> Towns:
 
 def tested_tokens(towns: Towns, count: int) -> list[str]:
     """Scenarios of the towns that are left out, `count` at most, as many of each as can be."""
-    lists = [sorted(tokens) for tokens in towns.tested.values()]
-    longest = max(len(tokens) for tokens in lists)
-    return sorted([found[i] for i in range(longest) for found in lists if i < len(found)][:count])
+    turns = zip_longest(*(sorted(tokens) for tokens in towns.tested.values()))
+    return sorted(islice(filter(None, chain.from_iterable(turns)), count))
 
 
 def collecting_jobs(

@@ -6,7 +6,7 @@ makes them.
 """
 
 import pickle
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BytesIO
@@ -73,16 +73,14 @@ class BlockMaker:
         self._stream, self._store = stream, open_store(stream.store)
         self._kind = KINDS[stream.planner]
         self._planner = self._kind.planner.asking(lambda scenes: ())
-        self._driven: dict[str, list[tuple[Run, Task]]] = {}
+        self._driven = defaultdict[str, list[tuple[Run, Task]]](list)
         for run in map(open_run, stream.driven):
-            for task, place in run.rollout_places.items():
-                if place is not None:
-                    self._driven.setdefault(task.token, []).append((run, task))
+            for task in (task for task, place in run.rollout_places.items() if place is not None):
+                self._driven[task.token].append((run, task))
 
     def __call__(self, block: int) -> Block:
         """The samples of a block, in batches, the last of which may be short."""
-        failed: Counter[str] = Counter()
-        made: list[Sample] = []
+        failed, made = Counter[str](), list[Sample]()
         tokens = self._stream.tokens_of(block)
         for place, token in enumerate(tokens):
             made += self._of_scenario(token, [self._stream.seed, 2, block, place], failed)
@@ -104,7 +102,7 @@ class BlockMaker:
             failed[type(error).__name__] += 1
             return made
         as_recorded = None, _draw(scenario, key)
-        driven = [_draw_driven(*one, scenario, key) for one in self._driven.get(token, ())]
+        driven = [_draw_driven(*one, scenario, key) for one in self._driven[token]]
         for states, iterations in (as_recorded, *driven):
             how: dict[str, Any] = {"as_published": self._stream.as_published, "driven": states}
             for iteration in iterations.tolist():
