@@ -84,8 +84,8 @@ class Batch(NamedTuple):
 
     def tensors(self) -> dict[str, Tensor]:
         """All by name; `counts` (parts, B) are how many rows of a part are not padding."""
-        parts = {**self._parts, **self._asdict()}
-        del parts["inputs"]
+        parts = self._parts | {"target": self.target, "target_valid": self.valid}
+        parts["projection"] = self.projection
         if "counts" in parts:
             parts["counts"] = torch.tensor(parts["counts"])
         return {name: value for name, value in parts.items() if value is not None}

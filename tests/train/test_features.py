@@ -54,7 +54,8 @@ def test_files_hold_the_batches_of_the_stream(asked, road, planner):
     samples = Stream(str(road), tokens, 7, 10_000, planner, as_published=True)
     (batch,) = next(load_blocks(samples, 0, 0)).batches
     known, found = batch.tensors(), load_file(asked.out / "samples-000000.safetensors")
-    assert found.keys() == known.keys() > {"current_state", "counts", "target", "valid"}
+    assert found.keys() == known.keys() > {"current_state", "counts", "target", "target_valid"}
+    assert found["valid"].equal(batch.inputs.valid)  # of the past, not of the target
     assert ("projection" in found) == (planner == "pluto")
     assert all(found[name].equal(value) for name, value in known.items())
     assert index["samples"] == len(found["target"])
