@@ -295,7 +295,8 @@ def score_elsewhere(
             first = min(failed, key=lambda result: result.task)
             more = f"; {len(tasks) - 1} other rollouts fail as well" if len(tasks) > 1 else ""
             raise DataError(f"{first.error}{more}", first.hint)
-        total, known = len(tasks) - len(failed), sorted(remarks.items())
+        known = sorted(remarks.items())
+        total = len(tasks) - len(failed)
         counted = (f"{one} ({n} of {total} rollouts)" if n < total else one for one, n in known)
         about = {"undefined": undefined, "remarks": [source.name, *source.remarks, *counted]}
         manifest |= {"state": "finished", "ended": now(), "elsewhere": about}

@@ -154,10 +154,12 @@ def judge_scenario(scenario: Scenario, config: FilterConfig) -> dict[str, Any]:
     centers = center_poses(log.expert_ego[:, :3])
     path = float(np.hypot(*np.diff(centers[:, :2], axis=0).T).sum())
     progress = next(s.value for s in result.statistics if s.name == _PROGRESS)
-    rows, start_us = {row.metric: row for row in result.rows}, int(log.time_us[0])
+    rows = {row.metric: row for row in result.rows}
     rules = {_COLLISIONS: COLLISION, _DRIVABLE: AREA}
     failed = [name for name in rules if rows[name].score != 1.0]
-    broken, violated = [rules[n] for n in failed], [v for n in failed if (v := rows[n].violation)]
+    broken = [rules[name] for name in failed]
+    violated = [first for name in failed if (first := rows[name].violation) is not None]
+    start_us = int(log.time_us[0])
     # nuPlan rule 551: too little progress is a short path, or a path beside the route
     if path < config.min_path_m:
         broken.append(STANDING)

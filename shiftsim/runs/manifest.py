@@ -104,11 +104,14 @@ def _git_state() -> str:
 
 def state_of(folder: Path) -> State:
     """How far the run in a folder is; `failed` has ended with failed tasks, `new` loses nothing."""
-    has_results, names = has_entries(folder / JOURNAL), {folder.name}
-    if folder.is_dir():  # one that was killed before it had begun leaves hidden files and a journal
-        names = {path.name for path in folder.iterdir() if path.name[0] != "."} - {JOURNAL}
-    if not folder.exists() or not (names or has_results):
+    if not folder.exists():
         return "new"
+    has_results = has_entries(folder / JOURNAL)
+    if folder.is_dir() and not has_results:
+        # a process that was killed before it had begun leaves hidden files and an empty journal
+        names = {path.name for path in folder.iterdir() if not path.name.startswith(".")}
+        if names <= {JOURNAL}:
+            return "new"
     manifest = read_manifest(folder)
     if manifest["state"] == "running" and not has_results:
         return "new"

@@ -14,7 +14,7 @@ from shiftsim.errors import ConfigError, DataError, listed, one_of
 from shiftsim.files import write_text
 from shiftsim.runs.rollouts import Task, damaged
 from shiftsim.runs.rollouts.files import FOLDER, RolloutLocation, RolloutReader, complete_rollout
-from shiftsim.runs.tables import LOCATION, OK, read_table, stored_location
+from shiftsim.runs.tables import LOCATION, OK, read_table, stored_location, task_of
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.scenario import Scenario
 
@@ -90,14 +90,9 @@ class Run:
     @cached_property
     def rollout_places(self) -> dict[Task, RolloutLocation | None]:
         """Where every rollout is stored; None where there is none."""
-        keys, places = (
-            zip(*(self.tasks[name].to_pylist() for name in names), strict=True)
-            for names in (Task._fields, LOCATION)
-        )
-        return {
-            Task(*key): stored_location(self.path / FOLDER, *place)
-            for key, place in zip(keys, places, strict=True)
-        }
+        rows = self.tasks.select([*Task._fields, *LOCATION]).to_pylist()
+        places = (stored_location(self.path / FOLDER, *(row[n] for n in LOCATION)) for row in rows)
+        return dict(zip(map(task_of, rows), places, strict=True))
 
     def rollout(self, task: Task, scenario: Scenario) -> SimulationLog:
         """One stored rollout; the scenario is that of the run's store, else it is a DataError."""
