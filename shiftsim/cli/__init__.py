@@ -197,26 +197,26 @@ _KIND = inspect.Parameter.KEYWORD_ONLY  # those with a default may come first
 
 def with_settings(
     *names: str, of: Any = RunConfig, **helps: str
-) -> Callable[[Callable[..., None]], Callable[..., None]]:
+) -> Callable[[Callable[..., int | None]], Callable[..., int | None]]:
     """Give a command options of settings at its parameter `settings`; `helps` replaces texts."""
     known = {item.name: item for item in fields(of)}
     items = [known[name] for name in names or known]
     in_file = of is RunConfig  # where settings may be that are not given
     options = [_option(item, helps.get(item.name), in_file=in_file) for item in items]
 
-    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+    def decorate(command: Callable[..., int | None]) -> Callable[..., int | None]:
         parameters: list[inspect.Parameter] = []
         for name, parameter in inspect.signature(command).parameters.items():
             parameters += options if name == "settings" else [parameter.replace(kind=_KIND)]
 
         @wraps(command)
-        def call(**values: Any) -> None:
+        def call(**values: Any) -> int | None:
             settings = {}
             for item in items:
                 value, parse = values.pop(item.name), item.metadata["option"].parse
                 if value not in (None, []):
                     settings[item.name] = parse(value) if parse else value
-            command(settings=settings, **values)
+            return command(settings=settings, **values)
 
         call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         call.__annotations__ = {p.name: p.annotation for p in parameters}
@@ -255,7 +255,7 @@ def planner_arguments(
     return arguments
 
 
-# exit codes
+# exit codes, which commands return; without one all is well
 USAGE, DATA, UNFINISHED, INTERRUPTED = 1, 2, 3, 130
 # of whichever click typer was built on
 _ClickError: Any = typer.BadParameter.__mro__[2]

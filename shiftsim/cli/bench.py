@@ -3,14 +3,13 @@
 import sys
 from typing import TYPE_CHECKING, Any
 
-import typer
 from typer import Argument, Option
 
 from shiftsim import cli
 from shiftsim.cli import Json, Quiet, echo, plural, print_json, print_result, stdout_to_stderr
 from shiftsim.cli.run import DryRun, Live, announce, progress_of
 from shiftsim.errors import MissingExtraError
-from shiftsim.runs.config import named_checkpoint, split_label
+from shiftsim.runs.config import split_label
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -55,7 +54,7 @@ def bench(
     live: Live = False,
     quiet: Quiet = False,
     as_json: Json = False,
-) -> None:
+) -> int:
     """Run a benchmark track with all its traffic modes, noises and seeds, and report it.
 
     The same command again goes on where the first one ended.
@@ -78,28 +77,32 @@ def bench(
     if costs is not None:
         lines = costs_of.lines(plan, costs, shards=shards)
         print_result(costs_of.as_json(plan, costs, shards=shards), lines, as_json=as_json)
-        return
+        return 0
     plans = list(plan.runs.values())
     words = () if quiet and not dry_run else _plan_lines(plan)
     announce(plans, words, dry_run=dry_run, as_json=as_json)
     if dry_run:
-        return
+        return 0
     with progress_of(plans, plan.folder, sys.argv[1:], live, quiet or as_json) as on_progress:
         runs = run_bench(plan, on_progress=on_progress, argv=sys.argv)
     allow_partial = settings.get("allow_partial", False)
     _report(plan, published=published, allow_partial=allow_partial, as_json=as_json)
-    if not all(run.is_complete for run in runs):
-        raise typer.Exit(cli.UNFINISHED)
+    return 0 if all(run.is_complete for run in runs) else cli.UNFINISHED
 
 
 def _official(settings: cli.Settings) -> list[str]:
     """The official checkpoint, for planners that would take weights of our own unasked."""
     from shiftsim.planners.table import OFFICIAL, shipped_file
 
-    sources = dict(map(split_label, settings.get("planners", ())))
-    shipped = [name for name, source in sources.items() if shipped_file(source) is not None]
-    unnamed = (n for n in shipped if not named_checkpoint({**settings, "planners": sources}, n))
-    return [f"{name}={OFFICIAL}" for name in unnamed]
+    given = settings.get("checkpoints", ())
+    if any("=" not in text for text in given):  # of the only planner with one
+        return []
+    named = {text.partition("=")[0] for text in given}
+    arguments = settings.get("planner_args", {})
+    named |= {name for name, values in arguments.items() if "checkpoint" in values}
+    labels = map(split_label, settings.get("planners", ()))
+    names = [label for label, source in labels if shipped_file(source) is not None]
+    return [f"{name}={OFFICIAL}" for name in names if name not in named]
 
 
 def _plan_lines(plan: "Plan") -> "Iterator[str]":

@@ -77,7 +77,7 @@ def nuplan(
     ),
     quiet: Quiet = False,
     as_json: Json = False,
-) -> None:
+) -> int:
     """Convert scenarios of nuPlan logs (.db) and maps (map.gpkg)."""
     from shiftsim.data.nuplan.scenarios import parse_mapping
 
@@ -90,18 +90,16 @@ def nuplan(
     }
     with progress_bar(quiet=quiet or as_json) as advance:
         report = shiftsim.convert_nuplan(logs, maps, folder, **filters, progress=advance)
-    failed = list(report.failed.items())
     lines = [
         *(f" tolerated: {flaw} ({count})" for flaw, count in report.flaws.items()),
         *_failures(report.failed),
         *(f" left by {key}: {count}" for key, count in report.left.items()),
         *(f" there are {what}: {_counted(found)}" for what, found in report.offers.items()),
         f" {plural(len(report.converted), 'scenario')} converted, "
-        f"{len(report.unchanged)} unchanged, {len(failed)} failed → {folder}",
+        f"{len(report.unchanged)} unchanged, {len(report.failed)} failed → {folder}",
     ]
     print_result(vars(report), lines, as_json=as_json)
-    if failed or report.left:
-        raise typer.Exit(cli.UNFINISHED)
+    return cli.UNFINISHED if report.failed or report.left else 0
 
 
 def _counted(counts: Counter[str]) -> str:
@@ -140,7 +138,7 @@ def dsc3d(
     settings: cli.Settings,
     quiet: Quiet = False,
     as_json: Json = False,
-) -> None:
+) -> int:
     """Convert recordings in the layout of DSC3D.
 
     A broken recording is skipped and named; the others are converted, and the exit code is 3. A
@@ -167,7 +165,7 @@ def dsc3d(
     rest: dict[str, Any] = {"site": site, "map_path": map_path, **settings, **vars(options)}
     make = partial(shiftsim.convert_dsc3d, source, **rest)
     lines = partial(_site_lines, is_short=options.is_short)
-    _convert(make, store, "site", lines, quiet=quiet, as_json=as_json)
+    return _convert(make, store, "site", lines, quiet=quiet, as_json=as_json)
 
 
 @app.command()
@@ -273,9 +271,9 @@ def _add_dataset(kind: str, text: str) -> None:
         at: At = None,
         quiet: Quiet = False,
         as_json: Json = False,
-    ) -> None:
+    ) -> int:
         make = partial(shiftsim.convert_dataset, kind, folder, egos=egos, at=at, **settings)
-        _convert(make, store, "dataset", _scene_lines, quiet=quiet, as_json=as_json)
+        return _convert(make, store, "dataset", _scene_lines, quiet=quiet, as_json=as_json)
 
 
 for _kind, _text in _DATASETS.items():
@@ -290,16 +288,15 @@ def _convert(
     *,
     quiet: bool,
     as_json: bool,
-) -> None:
-    """Convert a source over processes, print the report, and leave with the code for it."""
+) -> int:
+    """Convert a source over processes, print the report, and return the code for it."""
     folder = store_path(store)
     with progress_bar(quiet=quiet or as_json) as advance:
         report = make(store=folder, on_progress=advance)
     following = f" next: shiftsim filter {store}, then shiftsim run --planner idm --store {store}"
     printed = [*lines(report, folder), following]
     print_result({kind: report.name, **_contents(report)}, printed, as_json=as_json)
-    if report.skipped:
-        raise typer.Exit(cli.UNFINISHED)
+    return cli.UNFINISHED if report.skipped else 0
 
 
 def _failures(failed: "Mapping[str, str]") -> "Iterator[str]":

@@ -8,7 +8,6 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-import typer
 from typer import Argument, Option
 
 import shiftsim
@@ -29,7 +28,7 @@ def verify(
     require_all: bool = Option(
         False, "--require-all", help="Exit with 3 if anything is not covered."
     ),
-) -> None:
+) -> int:
     """Compare your nuPlan results with what shiftsim computes.
 
     Exit codes: 0 all covered cases equal, 1 a mismatch, 2 nothing covered or not recognised,
@@ -58,14 +57,14 @@ def verify(
         folder, lambda token: opened.read_recorded(token) if token in opened else None, mode
     )
     echo("\n".join(result.lines()))
-    raise typer.Exit(result.exit_code(require_all=require_all))
+    return result.exit_code(require_all=require_all)
 
 
 def doctor(
     fills: bool = Option(False, "--compile", help="First compile all kernels that runs need."),
     quiet: Quiet = False,
     as_json: Json = False,
-) -> None:
+) -> int:
     """Versions, cores and memory, and whether the kernels compute what they should."""
     kernels = None
     if fills:
@@ -74,8 +73,7 @@ def doctor(
     with progress_bar(quiet=quiet or as_json) as advance:
         found = examine(advance, kernels)
     print_result(found, diagnosis_lines(found), as_json=as_json)
-    if found["mismatches"] or not found["cases"]:
-        raise typer.Exit(cli.DATA)
+    return cli.DATA if found["mismatches"] or not found["cases"] else 0
 
 
 _MAX_NAMED = 20  # mismatches that are printed

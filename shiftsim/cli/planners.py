@@ -70,7 +70,7 @@ def check_one_planner(
     store: str = Option("demo", help="Store with scenarios to try it on."),
     token: str | None = Option(None, help="Scenario. [the first]"),
     as_json: Json = False,
-) -> None:
+) -> int:
     """Does a planner obey the contract? Says what is wrong, and what to do."""
     from shiftsim.planners.contract import HANGS, check_planner
     from shiftsim.planners.registry import load_planner
@@ -100,8 +100,7 @@ def check_one_planner(
     print_result([asdict(finding) for finding in findings], lines, as_json=as_json)
     if any(finding.check == HANGS for finding in errors):
         raise KeyboardInterrupt
-    if errors:
-        raise typer.Exit(cli.USAGE)
+    return cli.USAGE if errors else 0
 
 
 @checkpoint.command()

@@ -52,7 +52,7 @@ def run(
     live: Live = False,
     quiet: Quiet = False,
     as_json: Json = False,
-) -> None:
+) -> int:
     """Simulate and score planners on scenarios."""
     values = read_toml(config) if config else {}
     if texts := settings.pop("planner_args", ()):
@@ -60,7 +60,8 @@ def run(
         of_file = values.get("planner_args", {})
         settings["planner_args"] = cli.planner_arguments(texts, of_file, planners)
     where = str(config) if config else "run"
-    run_settings(values | settings, where, dry_run=dry_run, live=live, quiet=quiet, as_json=as_json)
+    how = {"dry_run": dry_run, "live": live, "quiet": quiet, "as_json": as_json}
+    return run_settings(values | settings, where, **how)
 
 
 def run_settings(
@@ -71,8 +72,8 @@ def run_settings(
     live: bool = False,
     quiet: bool,
     as_json: bool = False,
-) -> None:
-    """Run what the settings say, print what it gave, and leave with the right code."""
+) -> int:
+    """Run what the settings say, print what it gave, and return the right code."""
     learned = (name for name, entry in PLANNERS.items() if entry.kind == "learned")
     named = str(values.get("planners"))  # whatever a file holds there
     what = "torch" if any(name in named for name in learned) else "NumPy and numba"
@@ -85,12 +86,12 @@ def run_settings(
     lines = () if quiet and not dry_run else _plan_lines(plan)
     announce([plan], lines, dry_run=dry_run, as_json=as_json)
     if dry_run:
-        return
+        return 0
     words = [word for word in sys.argv[1:] if word not in ("--resume", "--retry-failed")]
     words.append("--resume")
     with progress_of([plan], plan.folder, words, live, quiet or as_json) as on_progress:
         finished = execute(plan, on_progress=on_progress, argv=sys.argv)
-    leave_with(finished, allow_partial=plan.config.allow_partial, as_json=as_json)
+    return code_of(finished, allow_partial=plan.config.allow_partial, as_json=as_json)
 
 
 @contextmanager
@@ -263,16 +264,15 @@ def _weights(fingerprint: Mapping[str, Any]) -> str:
     return "; ".join(filter(None, (text, str(fingerprint.get("weights", "")), digest)))
 
 
-def leave_with(finished: "Run", *, allow_partial: bool, as_json: bool) -> None:
-    """Print what a run gave, and leave with the code for it."""
+def code_of(finished: "Run", *, allow_partial: bool, as_json: bool) -> int:
+    """Print what a run gave, and return the code for it."""
     if as_json:
         from shiftsim.report.scores import summary
 
         cli.print_json(summary(finished))
     else:
         _print_results(finished, allow_partial=allow_partial)
-    if not finished.is_complete:
-        raise typer.Exit(cli.UNFINISHED)
+    return 0 if finished.is_complete else cli.UNFINISHED
 
 
 def _print_results(finished: "Run", *, allow_partial: bool) -> None:
@@ -320,7 +320,7 @@ def score(
     partial: bool = Option(False, "--partial", help="Also rollouts that end early; labelled so."),
     quiet: Quiet = False,
     as_json: Json = False,
-) -> None:
+) -> int:
     """Score stored rollouts again, under other thresholds, or what was driven elsewhere.
 
     Tables of poses and nuPlan's simulation logs become a run folder: docs/score_elsewhere.md.
@@ -342,7 +342,7 @@ def score(
         else:
             settings = {"thresholds": run.manifest["config"]["thresholds"], **settings}
             finished = rescore(run, **settings)
-    leave_with(finished, allow_partial=allow_partial, as_json=as_json)
+    return code_of(finished, allow_partial=allow_partial, as_json=as_json)
 
 
 def merge(
@@ -352,10 +352,10 @@ def merge(
         False, "--allow-partial", help="Accept missing shards; labelled so."
     ),
     as_json: Json = False,
-) -> None:
+) -> int:
     """Join runs made with --shard: the same tables as without."""
     merged = shiftsim.merge(runs, out=out, allow_partial=allow_partial)
-    leave_with(merged, allow_partial=allow_partial, as_json=as_json)
+    return code_of(merged, allow_partial=allow_partial, as_json=as_json)
 
 
 def bundle(
@@ -387,14 +387,14 @@ def demo(
     seed: int | None = Option(None, min=0, help="Of the random towns; same seed, same bytes. [0]"),
     domain: str | None = Option(None, help="Of the random towns: home or foreign. [all]"),
     quiet: Quiet = False,
-) -> None:
+) -> int:
     """Generate small recordings, convert them, run three planners with and without noise.
 
     With --towns, generate, convert and filter random towns to train in, and run nothing.
     """
     if towns is not None:
         _make_towns(out, towns, seed or 0, domain or "all", settings, quiet=quiet)
-        return
+        return 0
     for name, value in (("--seed", seed), ("--domain", domain)):
         if value is not None:
             raise ConfigError(f"{name} is of random towns only", hint="say how many with --towns")
@@ -409,7 +409,7 @@ def demo(
                 shiftsim.demo_store(folder)
     values = {**DEMO, "store": str(folder) if out else DEFAULT_STORE, **settings}
     try:
-        run_settings(values, "demo", quiet=quiet)
+        return run_settings(values, "demo", quiet=quiet)
     finally:
         named = f" --store {out}" if out else ""
         lines = (

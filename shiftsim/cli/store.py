@@ -30,7 +30,7 @@ export = new_app("Write scenarios in the formats of others.", no_args_is_help=Tr
 Store = Annotated[str, Argument(metavar="STORE", help="Store, by name or folder.")]
 
 
-def check(store: Store, as_json: Json = False) -> None:
+def check(store: Store, as_json: Json = False) -> int:
     """Validate a store: files, units, motion, maps and routes; lists every problem.
 
     At the end comes what was found in each recording.
@@ -41,8 +41,7 @@ def check(store: Store, as_json: Json = False) -> None:
     found = survey_store(path)
     problems = [asdict(problem) for problem in found.problems]
     print_result(problems, _survey_lines(path, found), as_json=as_json)
-    if any(problem.is_error for problem in found.problems):
-        raise typer.Exit(cli.DATA)
+    return cli.DATA if any(problem.is_error for problem in found.problems) else 0
 
 
 def _survey_lines(path: Path, found: "CheckReport") -> "Iterator[str]":
@@ -77,7 +76,7 @@ def filter_scenarios(
     min_progress: float | None = Option(None, help="Least share of it along the route. [0.5]"),
     quiet: Quiet = False,
     as_json: Json = False,
-) -> None:
+) -> int:
     """Drive every scenario as recorded; drop those with a collision, off the road or standing.
 
     Dropped scenarios stay in the store and are listed; runs over the whole store leave them out.
@@ -90,8 +89,7 @@ def filter_scenarios(
         found = opened.filter(workers=workers, on_progress=advance, **settings, **limits)
     values = {"config": found.config, "counts": found.counts(), "verdicts": found.rows}
     print_result(values, _verdict_lines(found, found.config["thresholds"]), as_json=as_json)
-    if found.counts()["failed"]:
-        raise typer.Exit(cli.UNFINISHED)
+    return cli.UNFINISHED if found.counts()["failed"] else 0
 
 
 def _verdict_lines(found: "FilterResults", thresholds: str) -> "Iterator[str]":
