@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from shiftsim.data.readers.convert import ConversionReport
     from shiftsim.data.readers.scenarios import RecordingSummary
     from shiftsim.data.readers.tracks.reader import TracksReader
+    from shiftsim.data.readers.windows import ConversionConfig
 
 app = new_app("Make a scenario store from recordings.", no_args_is_help=True)
 MAX_NAMED = 20  # failures that are printed
@@ -147,8 +148,6 @@ def dsc3d(
     Planners need 2 s of history. A recording too short for that is converted with a made-up one,
     of constant velocity: --window-s 4.9 --overlap-s 0 --history-s 0 --padding-s 2.2
     """
-    from shiftsim.data.readers.windows import make_config
-
     for word in category or ():
         name, _, known = word.partition("=")
         if not (name and known):
@@ -158,10 +157,7 @@ def dsc3d(
         **cli.given(country=country, padding_s=padding_s, max_per_window=max_per_window),
         **cli.given(category_map=dict(word.split("=", 1) for word in category or ()) or None),
     }
-    try:
-        options = make_config((read_toml(config) if config else {}) | flags)
-    except ConfigError as error:
-        raise ConfigError(f"{config or 'convert dsc3d'}: {error.message}", error.hint) from error
+    options = _options(config, flags)
     rest: dict[str, Any] = {"site": site, "map_path": map_path, **settings, **vars(options)}
     make = partial(shiftsim.convert_dsc3d, source, **rest)
     lines = partial(_site_lines, is_short=options.is_short)
@@ -297,6 +293,15 @@ def _convert(
     printed = [*lines(report, folder), following]
     print_result({kind: report.name, **_contents(report)}, printed, as_json=as_json)
     return cli.UNFINISHED if report.skipped else 0
+
+
+def _options(path: Path | None, flags: dict[str, Any]) -> "ConversionConfig":
+    from shiftsim.data.readers.windows import make_config
+
+    try:
+        return make_config((read_toml(path) if path else {}) | flags)
+    except ConfigError as error:
+        raise ConfigError(f"{path or 'convert dsc3d'}: {error.message}", error.hint) from error
 
 
 def _failures(failed: "Mapping[str, str]") -> "Iterator[str]":
