@@ -224,6 +224,8 @@ def _value(kind: Any, value: Any, name: str, where: str, check: Check) -> Any:
     wanted = (int, float) if kind is float else kind
     if not isinstance(value, wanted) or (isinstance(value, bool) and kind is not bool):
         raise ConfigError(f"{what} {_KINDS[kind]}")
+    if kind is float and isinstance(value, int) and abs(value) > sys.float_info.max:
+        raise ConfigError(f"{what} a number that is not so large")
     check(name, value, where)
     return float(value) if kind is float else value
 

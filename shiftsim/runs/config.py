@@ -6,6 +6,7 @@ The options of the command line are made from the fields, too.
 """
 
 import os
+import re
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
@@ -249,9 +250,9 @@ def parse_argument(text: str, planners: tuple[str, ...]) -> tuple[str, str, Valu
 
 def parse_shard(text: str) -> tuple[int, int]:
     """Number and count of a shard `i/n`, i from 1 to n; else a ConfigError."""
-    number, _, count = text.partition("/")
-    if number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count):
-        return int(number), int(count)
+    found = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text)
+    if found and 1 <= int(found[1]) <= int(found[2]):
+        return int(found[1]), int(found[2])
     raise ConfigError(f"shard {text!r} is not i/n with i from 1 to n", hint="for example 2/16")
 
 

@@ -89,7 +89,7 @@ def test_shards_of_other_runs_are_refused(shards, whole, toy, tmp_path):
         merge_runs([shards[0], whole], out=str(tmp_path / "merged"))
 
 
-@pytest.mark.parametrize("text", ["3", "0/2", "3/2", "1/0", "a/b", "1/2/3"])
+@pytest.mark.parametrize("text", ["3", "0/2", "3/2", "1/0", "a/b", "1/2/3", "1/" + "9" * 5000])
 def test_a_shard_that_is_none_is_refused(toy, text):
     with pytest.raises(ConfigError, match="is not i/n"):
         settings(toy, "", shard=text)

@@ -278,6 +278,7 @@ def test_what_cannot_be_applied_names_scenario_edit_and_reason(scene, tables, re
         ({"spawn": [{"pose": [1.0, 2.0]}]}, "pose has 2 values, not 3"),
         ({"spawn": [{"at": {}, "speed_mps": -1.0}]}, "speed_mps -1.0"),
         ({"spawn": [{"at": {}, "speed_mps": "fast"}]}, "speed_mps is 'fast'; it must be a number"),
+        ({"spawn": [{"at": {}, "speed_mps": 10**400}]}, "it must be a number that is not so large"),
         ({"slow": [{"factor": 2.0, "kinds": ["vehicle"]}]}, "factor is above 1"),
         ({"walk": [{"from": {"ahead_m": 1.0}}]}, "end is missing"),
         ({"code": "dl", "remove": [{}]}, "code and remove exclude each other"),
