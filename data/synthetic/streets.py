@@ -175,16 +175,16 @@ def reaches(streets: Sequence[Street], angles: Sequence[float], rounding: float)
 
 def are_apart(streets: Sequence[Street]) -> bool:
     """Whether no two streets come too close away from the junctions that they share."""
-    for one, two in combinations([x for x in streets if not x.is_one_way], 2):
-        gaps = np.hypot(*np.moveaxis(_away(one, two)[:, None] - _away(two, one), -1, 0))
+    lines = [(x, x.road.at(np.append(np.arange(0.0, x.length, _STEP), x.length))) for x in streets]
+    for (one, a), (two, b) in combinations([x for x in lines if not x[0].is_one_way], 2):
+        gaps = np.hypot(*np.moveaxis(_away(a, one, two)[:, None] - _away(b, two, one), -1, 0))
         wide = one.half + two.half + max(one.sidewalk, two.sidewalk) + _APART
         if gaps.min(initial=np.inf) < wide:
             return False
     return True
 
 
-def _away(street: Street, other: Street) -> FloatArray:
-    """Points of a street that are not near a junction that it shares with another one."""
+def _away(line: FloatArray, street: Street, other: Street) -> FloatArray:
+    """Points of a street's line that are not near a junction that it shares with another one."""
     first, last = (x in other.junctions and x > 0 for x in street.junctions)
-    places = np.append(np.arange(0.0, street.length, _STEP), street.length)
-    return street.road.at(places)[_SKIPPED * first : len(places) - _SKIPPED * last, :2]
+    return line[_SKIPPED * first : len(line) - _SKIPPED * last, :2]
