@@ -157,26 +157,22 @@ def _progress_along(
     for i in range(1, len(poses)):
         x, y = poses[i, 0], poses[i, 1]
         out[i] = 0.0
-        if contains(blocks, chain_blocks[at], x, y):
-            along = project_on_line(lines, chain_edges[at], x, y)
-            out[i] = along - previous
-            previous = along
-            continue
         # nuPlan rule 72: the search goes forward only, and where nothing is found the memory stays
-        ahead = at + 1
+        ahead = at
         while ahead <= last and not contains(blocks, chain_blocks[ahead], x, y):
             ahead += 1
         if ahead > last:
             continue
-        extra = 0.0
-        for passed in range(at + 1, ahead):
-            edge, after = chain_edges[passed], lines.ptr[chain_edges[passed + 1]]
-            start = project_on_line(lines, edge, lines.xy[after, 0], lines.xy[after, 1])
-            extra += start - _project_end(lines, edge, chain_edges[passed - 1])
-        current, edge = chain_edges[at], chain_edges[ahead]
-        length = lines.arc[lines.ptr[current + 1] - 1]
+        current, edge, extra = chain_edges[at], chain_edges[ahead], 0.0
         along = project_on_line(lines, edge, x, y)
-        out[i] = (length - previous) + (along - _project_end(lines, edge, current)) + extra
+        out[i] = along - previous
+        for passed in range(at + 1, ahead):
+            over, after = chain_edges[passed], lines.ptr[chain_edges[passed + 1]]
+            start = project_on_line(lines, over, lines.xy[after, 0], lines.xy[after, 1])
+            extra += start - _project_end(lines, over, chain_edges[passed - 1])
+        if ahead > at:
+            length = lines.arc[lines.ptr[current + 1] - 1]
+            out[i] = (length - previous) + (along - _project_end(lines, edge, current)) + extra
         at, previous = ahead, along
 
 

@@ -10,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from shiftsim.errors import MapError
+from shiftsim.geometry.rings import INTERIOR, locate_in_polygon
 from shiftsim.kernels import FloatArray, IntArray, kernel
-from shiftsim.world.layers import Lists, Polygons, containing, contains, distance_to, in_any
+from shiftsim.world.layers import Lists, Polygons, containing, distance_to, in_any, in_bounds
 from shiftsim.world.map import VectorMap
 
 _KEEP_DISTANCE = 5.0  # m, how far a connector is kept for inside an intersection
@@ -113,22 +114,25 @@ def _search(lanes: Lanes, x: float, y: float, out: IntArray) -> int:
 
 
 @kernel
-def _narrow(lanes: Lanes, x: float, y: float, known: IntArray, count: int, out: IntArray) -> int:
-    """Write which of the first `count` known edges, or the successors of one, hold a point."""
-    polygons, outgoing = lanes.polygons, lanes.outgoing
-    found = 0
-    for index in range(count):
-        if contains(polygons, known[index], x, y):
-            out[found] = known[index]
-            found += 1
-    if found == 0 and count == 1:
-        edge = known[0]
-        for item in range(outgoing.ptr[edge], outgoing.ptr[edge + 1]):
-            after = outgoing.items[item]
-            if not has(out, found, after) and contains(polygons, after, x, y):
-                out[found] = after
-                found += 1
-    return found
+def _narrow(
+    lanes: Lanes, points: FloatArray, known: IntArray, count: int, out: IntArray, counts: IntArray
+) -> None:
+    """Write which of the first `count` known edges, or the successors of one, hold each point."""
+    areas, after, ptr = lanes.polygons, lanes.outgoing.items, lanes.outgoing.ptr
+    xy, ring_ptr, poly_ptr, bounds = areas.xy, areas.ring_ptr, areas.poly_ptr, areas.bounds
+    more = ptr[known[0] + 1] - ptr[known[0]] if count == 1 else 0
+    for point in range(len(points)):
+        x, y, found = points[point, 0], points[point, 1], 0
+        for index in range(count + more):
+            if index == count and found > 0:
+                break
+            edge = known[index] if index < count else after[ptr[known[0]] + index - count]
+            if in_bounds(bounds, edge, x, y) and not has(out[point], found, edge):
+                first, last = poly_ptr[edge], poly_ptr[edge + 1]
+                if locate_in_polygon(xy, ring_ptr, first, last, x, y) == INTERIOR:
+                    out[point, found] = edge
+                    found += 1
+        counts[point] = found
 
 
 @kernel
@@ -139,7 +143,9 @@ def _driven_route(lanes: Lanes, intersections: Polygons, poses: FloatArray, out:
         x, y = poses[i, 0], poses[i, 1]
         count = 0
         if i > 0 and counts[i - 1] > 0:
-            count = _narrow(lanes, x, y, lists[i - 1], counts[i - 1], lists[i])
+            here = slice(i, i + 1)
+            _narrow(lanes, poses[here], lists[i - 1], counts[i - 1], lists[here], counts[here])
+            count = counts[i]
         if count == 0:
             count = _search(lanes, x, y, lists[i])
             if count == _OVERLAP:
@@ -195,17 +201,16 @@ def _corner_routes(lanes: Lanes, corners: FloatArray, out: EdgeLists) -> int:
         if i > 0:
             for corner in range(4):
                 size = _add(known, size, lists[i - 1, corner], counts[i - 1, corner])
+        _narrow(lanes, corners[i], known, size, lists[i], counts[i])
         for corner in range(4):
-            x, y = corners[i, corner, 0], corners[i, corner, 1]
-            found = lists[i, corner]
-            count = _narrow(lanes, x, y, known, size, found)
-            if count == 0:
-                count = _search(lanes, x, y, found)
+            if counts[i, corner] == 0:
+                x, y, found = corners[i, corner, 0], corners[i, corner, 1], lists[i, corner]
+                count = counts[i, corner] = _search(lanes, x, y, found)
                 if count == _OVERLAP:
                     return i
                 if i == 1:  # nuPlan rule 70: only here
-                    size = _add(known, size, found, count)
-            counts[i, corner] = count
+                    size, rest = _add(known, size, found, count), slice(corner + 1, 4)
+                    _narrow(lanes, corners[i, rest], known, size, lists[i, rest], counts[i, rest])
     return -1
 
 

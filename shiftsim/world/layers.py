@@ -178,25 +178,30 @@ def containing(polygons: Polygons, x: float, y: float, out: IntArray) -> int:
     if not (0.0 <= fx < polygons.shape[0] and 0.0 <= fy < polygons.shape[1]):
         return 0  # also where a coordinate is NaN
     cell = int(fx) * polygons.shape[1] + int(fy)
+    xy, ring_ptr, poly_ptr = polygons.xy, polygons.ring_ptr, polygons.poly_ptr
     found = 0
     for entry in range(polygons.cell_ptr[cell], polygons.cell_ptr[cell + 1]):
         poly = polygons.cell_items[entry]
-        if contains(polygons, poly, x, y):
-            if found < len(out):
-                out[found] = poly
-            found += 1
+        # not `contains`: each call that passes all arrays of a map counts references to them
+        if in_bounds(polygons.bounds, poly, x, y):
+            first, last = poly_ptr[poly], poly_ptr[poly + 1]
+            if locate_in_polygon(xy, ring_ptr, first, last, x, y) == INTERIOR:
+                if found < len(out):
+                    out[found] = poly
+                found += 1
     return found
+
+
+@kernel
+def in_bounds(bounds: FloatArray, poly: int, x: float, y: float) -> bool:
+    """Whether the bounds (M, 4) of polygon `poly` hold a point; touching counts."""
+    return bounds[poly, 0] <= x <= bounds[poly, 2] and bounds[poly, 1] <= y <= bounds[poly, 3]
 
 
 @kernel
 def contains(polygons: Polygons, poly: int, x: float, y: float) -> bool:
     """Whether polygon `poly` holds a point in its interior; the boundary does not count."""
-    if (
-        x < polygons.bounds[poly, 0]
-        or y < polygons.bounds[poly, 1]
-        or x > polygons.bounds[poly, 2]
-        or y > polygons.bounds[poly, 3]
-    ):
+    if not in_bounds(polygons.bounds, poly, x, y):
         return False
     first, last = polygons.poly_ptr[poly], polygons.poly_ptr[poly + 1]
     return locate_in_polygon(polygons.xy, polygons.ring_ptr, first, last, x, y) == INTERIOR
@@ -342,12 +347,8 @@ class Layer:
 
     def containing(self, x: float, y: float) -> IntArray:
         """Indices of the polygons that hold a point in their interior, ascending."""
-        out = np.empty(16, np.int64)
-        count = containing(self.polygons, x, y, out)
-        if count > len(out):
-            out = np.empty(count, np.int64)
-            containing(self.polygons, x, y, out)
-        return out[:count]
+        out = np.empty(self.most_at_a_point, np.int64)
+        return out[: containing(self.polygons, x, y, out)]
 
     @cached_property
     def most_at_a_point(self) -> int:
