@@ -113,13 +113,10 @@ def choose_successor(graph: LaneGraph, edge: int) -> int:
     for entry in range(graph.outgoing.ptr[edge], graph.outgoing.ptr[edge + 1]):
         following = graph.outgoing.items[entry]
         # nuPlan rule 126: with lights only green is open, without any listed state but red
-        if graph.has_lights[following]:
-            if not graph.lights[following] & GREEN:
-                continue
-        elif graph.lights[following] & RED:
-            continue
+        lights, has_lights = graph.lights[following], graph.has_lights[following]
+        is_open = lights & GREEN != 0 if has_lights else lights & RED == 0
         curvature = initial_curvature(graph.baselines, following)
-        if curvature < best:
+        if is_open and curvature < best:
             best, chosen = curvature, following
     return chosen
 
@@ -174,8 +171,7 @@ def _drop_driven(path: FloatArray, size: int, progress: float) -> int:
         return 2
     x, y, heading = pose_on_path(path, size, progress)
     front = path[after - 1, HEADING]
-    path[0, 0], path[0, 1] = x, y
-    path[0, HEADING] = front + wrap_angle(heading - front)
+    path[0, 0], path[0, 1], path[0, HEADING] = x, y, front + wrap_angle(heading - front)
     num_left = 1
     for vertex in range(after, size):
         for column in range(3):
@@ -202,16 +198,13 @@ def set_box(
 
 
 @kernel
-def add_curve(footprints: Footprints, index: int, line: FloatArray, distance: float) -> None:
-    """Add the buffer of a line (K, 2) to the box of an agent or of the ego ahead."""
-    bounds, curve = footprints.bounds, footprints.curve[index]
+def add_curve(line: FloatArray, distance: float, curve: FloatArray, bounds: FloatArray) -> int:
+    """Write the buffer of a line (K, 2) and add it to bounds (4,); returns its size."""
     size = buffer_curve(line, distance, curve)
-    footprints.curve_size[index] = size
     low_x, low_y, high_x, high_y = ring_bounds(curve[:size])
-    bounds[index, 0] = min(bounds[index, 0], low_x)
-    bounds[index, 1] = min(bounds[index, 1], low_y)
-    bounds[index, 2] = max(bounds[index, 2], high_x)
-    bounds[index, 3] = max(bounds[index, 3], high_y)
+    bounds[0], bounds[1] = min(bounds[0], low_x), min(bounds[1], low_y)
+    bounds[2], bounds[3] = max(bounds[2], high_x), max(bounds[3], high_y)
+    return size
 
 
 @kernel
@@ -235,19 +228,3 @@ def cut_path(path: FloatArray, size: int, start: float, stop: float, line: Float
     after = min(max(first_after(path, size, last), 1), size - 1)
     line[count, 0], line[count, 1] = _point_before(path, after, last)
     return count + 1
-
-
-@kernel
-def move_agent(
-    fleet: Fleet, footprints: Footprints, line: FloatArray, headway: float, agent: int
-) -> None:
-    """Pose and footprint of an agent from its progress; `line` (K, 2) is scratch."""
-    path, size = fleet.path[agent], fleet.path_size[agent]
-    progress = fleet.progress[agent]
-    x, y, heading = pose_on_path(path, size, clamp_progress(path, size, progress))
-    fleet.pose[agent, 0], fleet.pose[agent, 1], fleet.pose[agent, 2] = x, y, heading
-    length, width = fleet.size[agent, 0], fleet.size[agent, 1]
-    set_box(footprints, agent, x, y, heading, length, width)
-    front = progress + 0.5 * length + fleet.speed[agent] * headway
-    points = cut_path(path, size, progress - 0.5 * length, front, line)
-    add_curve(footprints, agent, line[:points], 0.5 * width)

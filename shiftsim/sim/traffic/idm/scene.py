@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from shiftsim.geometry.corridor import Corridor
 from shiftsim.geometry.polylines import RUN
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.sim.traffic.idm.buffer import curve_capacity
@@ -77,8 +78,23 @@ class Footprints(NamedTuple):
     bounds: FloatArray  # (M, 4) min x, min y, max x, max y [m]
     box: FloatArray  # (M, 4, 2) corners [m]
     curve: FloatArray  # (A + 2, V, 2) buffers of the path pieces just ahead of agents and ego [m]
-    curve_size: IntArray  # (A + 2,) how many vertices of them count; 0 before the first step
+    curve_size: IntArray  # (M,) how many vertices of them count; 0 before the first step
     apart: FloatArray  # (M,) scratch: least distances to one of them [m]
+
+
+class Footprint(NamedTuple):
+    """One of the footprints."""
+
+    box: FloatArray  # (4, 2) corners [m]
+    curve: FloatArray  # (V, 2) buffer of its path piece, maybe empty [m]
+
+
+class Ahead(NamedTuple):
+    """The corridor ahead of one agent."""
+
+    corridor: Corridor
+    outline: FloatArray  # (V, 2) its outline [m]
+    outline_size: IntArray  # (1,) how many of its vertices count; -1 before it is made
 
 
 class Scratch(NamedTuple):
@@ -86,8 +102,8 @@ class Scratch(NamedTuple):
 
     line: FloatArray  # (K, 2) a piece of a path [m]
     runs: FloatArray  # (R, 4) bounds of its runs of segments, as in `Path` [m]
-    outline: FloatArray  # (V, 2) outline of its buffer [m]
-    outline_size: IntArray  # (1,) how many of its vertices count; -1 before it is made
+    outline: FloatArray  # this and the next one as in `Ahead`
+    outline_size: IntArray
 
 
 class Yielding(NamedTuple):
@@ -144,7 +160,7 @@ def make_scene(
         bounds=np.zeros((count, 4)),
         box=np.zeros((count, 4, 2)),
         curve=_make_curves(fleet),
-        curve_size=np.zeros(len(agents) + 2, np.int64),
+        curve_size=np.zeros(count, np.int64),
         apart=np.empty(count),
     )
     scratch = _make_scratch(fleet)

@@ -3,22 +3,27 @@
 import numpy as np
 
 from shiftsim.geometry.boxes import wrap_angle
+from shiftsim.geometry.corridor import Corridor
+from shiftsim.geometry.polylines import RUN, bound_runs
 from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.sim.dynamics.idm import idm_step
 from shiftsim.sim.traffic.idm.lead import (
     FREE,
-    corridor_ahead,
     find_lead,
+    footprint_at,
     in_corridor,
     stop_line_ahead,
 )
 from shiftsim.sim.traffic.idm.paths import (
+    add_curve,
+    clamp_progress,
+    cut_path,
     extend_route,
-    move_agent,
     needs_longer_path,
+    pose_on_path,
     set_box,
 )
-from shiftsim.sim.traffic.idm.scene import PROGRESS, Fleet, Scene
+from shiftsim.sim.traffic.idm.scene import PROGRESS, Ahead, Fleet, Scene
 from shiftsim.sim.traffic.idm.yielding import ignores_ego_ahead, place_ego_ahead
 from shiftsim.sim.traffic.lanes import RED
 from shiftsim.world.state import HEADING as EGO_HEADING
@@ -92,29 +97,36 @@ def advance(scene: Scene, row: TrackArrays, ego: FloatArray, span: float) -> tup
             continue
         # nuPlan rule 123: agents move one after the other, and see where those before them went
         path, size, progress = fleet.path[agent], fleet.path_size[agent], fleet.progress[agent]
-        path_end, half_width = path[size - 1, PROGRESS], 0.5 * fleet.size[agent, 1]
-        corridor = corridor_ahead(path, size, progress, half_width, scratch)
-        if not progress < path_end and not in_corridor(footprints, agent, corridor, scratch):
+        length, width = fleet.size[agent, 0], fleet.size[agent, 1]
+        path_end = path[size - 1, PROGRESS]
+        points = cut_path(path, size, progress, path_end, scratch.line)
+        line, runs = scratch.line[:points], scratch.runs[: (points - 2) // RUN + 1]
+        bound_runs(line, runs)
+        corridor = Corridor(line, runs, 0, points, 0.5 * width)
+        ahead = Ahead(corridor, scratch.outline, scratch.outline_size)
+        ahead.outline_size[0], bounds = -1, footprints.bounds
+        own = footprint_at(footprints, agent)
+        if not progress < path_end and not in_corridor(own, bounds[agent], ahead):
             return LEFT_PATH, agent  # nuPlan rule 128
-        ignored, ahead = FREE, num_agents + 1
+        ignored, later = FREE, num_agents + 1  # where the ego will be
         if (
-            footprints.present[ahead]
-            and in_corridor(footprints, ahead, corridor, scratch)
+            footprints.present[later]
+            and in_corridor(footprint_at(footprints, later), bounds[later], ahead)
             and ignores_ego_ahead(scene, agent)
         ):
-            ignored = ahead
-        lead, gap, lead_y = find_lead(footprints, agent, ignored, corridor, scratch)
+            ignored = later
+        lead, gap, lead_y = find_lead(footprints, agent, ignored, ahead)
         for segment in range(fleet.route_size[agent]):
             edge = fleet.route[agent, segment]
             if graph.lights[edge] & RED:
-                is_first, gap, lead_y = stop_line_ahead(scene, agent, edge, corridor, gap, lead_y)
+                is_first, gap, lead_y = stop_line_ahead(graph, edge, own, ahead, gap, lead_y)
                 if is_first:
                     lead = len(footprints.present)
         heading = fleet.pose[agent, 2]
         lead_speed, lead_heading = 0.0, heading
         if lead == FREE:
             # nuPlan rule 124: on a free road the agent brakes for the end of its path
-            gap = path_end - progress - 0.5 * fleet.size[agent, 0]
+            gap = path_end - progress - 0.5 * length
         elif lead < num_agents:
             lead_speed, lead_heading = fleet.speed[lead], fleet.pose[lead, 2]
         elif lead <= num_agents + 1 and not scene.yielding.cautious[agent]:
@@ -134,9 +146,16 @@ def advance(scene: Scene, row: TrackArrays, ego: FloatArray, span: float) -> tup
             parameters.decel_max,
             span,
         )
-        fleet.progress[agent] += distance
-        fleet.speed[agent] = max(speed, 0.0)
-        move_agent(fleet, footprints, scratch.line, parameters.headway, agent)
+        progress += distance
+        speed = max(speed, 0.0)
+        x, y, heading = pose_on_path(path, size, clamp_progress(path, size, progress))
+        set_box(footprints, agent, x, y, heading, length, width)
+        front = progress + 0.5 * length + speed * parameters.headway
+        points = cut_path(path, size, progress - 0.5 * length, front, scratch.line)
+        line, curve = scratch.line[:points], footprints.curve[agent]
+        footprints.curve_size[agent] = add_curve(line, 0.5 * width, curve, bounds[agent])
+        fleet.pose[agent, 0], fleet.pose[agent, 1], fleet.pose[agent, 2] = x, y, heading
+        fleet.progress[agent], fleet.speed[agent] = progress, speed
     write_agents(fleet, scene.agents, row)
     return DONE, 0
 

@@ -70,7 +70,8 @@ def place_ego_ahead(scene: Scene, x: float, y: float, heading: float, vx: float,
     else:
         line[2, 0] += reach * cos
         line[2, 1] += reach * sin
-    add_curve(footprints, place, line[:count], reach)
+    curve, bounds = footprints.curve[place], footprints.bounds[place]
+    footprints.curve_size[place] = add_curve(line[:count], reach, curve, bounds)
 
 
 @kernel
