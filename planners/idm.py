@@ -39,9 +39,9 @@ from shiftsim.planners.routes.lead import (
     LightWatch,
     Objects,
     RedLights,
+    bounds_of,
     find_lead,
     keep_one_overlap,
-    make_objects,
 )
 from shiftsim.sim.dynamics.idm import idm_acceleration
 from shiftsim.sim.planner import Observation, SceneInfo
@@ -271,12 +271,10 @@ def objects_around(tracks: Tracks, center: FloatArray, red: RedLights) -> Object
     speeds = np.hypot(velocities[:, 0], velocities[:, 1])
     speeds[tracks.kinds[near] > LAST_AGENT_KIND] = 0.0
     count, nothing = len(near), np.zeros(len(red.lanes))
-    return make_objects(
-        np.concatenate([boxes_to_corners(poses, sizes).reshape(-1, 2), red.xy]),
-        np.concatenate([4 * np.arange(count), 4 * count + red.ptr]),
-        np.concatenate([poses[:, 2], nothing]),
-        np.concatenate([speeds, nothing]),
-    )
+    xy = np.concatenate([boxes_to_corners(poses, sizes).reshape(-1, 2), red.xy])
+    ptr = np.concatenate([4 * np.arange(count), 4 * count + red.ptr])
+    turns, speeds = np.concatenate([poses[:, 2], nothing]), np.concatenate([speeds, nothing])
+    return Objects(xy, ptr, bounds_of(xy, ptr), turns, speeds)
 
 
 @kernel

@@ -28,14 +28,15 @@ class LightWatch:
     def __init__(self, road: VectorMap, lanes: Collection[int]) -> None:
         """Take the map and the lanes and connectors."""
         self._road, self._lanes = road, frozenset(lanes)
-        self._lights, self._red = TrafficLights.empty(1), red_lights([], [])
+        self._seen, self._red = TrafficLights.empty(1), red_lights([], [])
 
     def at(self, lights: TrafficLights) -> RedLights:
-        """The red ones in a row of lights; what cannot be written is not looked at twice."""
-        if lights is not self._lights or lights.status.flags.writeable:
+        """The red ones in a row of lights; they are made again where lights have changed."""
+        names, status = self._seen.connector_ids, self._seen.status
+        if lights.connector_ids is not names or not np.array_equal(lights.status, status):
             red = [lane for lane in red_lanes(self._road, lights) if lane in self._lanes]
-            rings = [self._road.edges.rings(lane)[0] for lane in red]
-            self._lights, self._red = lights, red_lights(red, rings)
+            self._red = red_lights(red, [self._road.edges.rings(lane)[0] for lane in red])
+            self._seen = TrafficLights(lights.connector_ids, lights.status.copy())
         return self._red
 
 
@@ -49,8 +50,12 @@ def red_lights(lanes: list[int], rings: Sequence[FloatArray]) -> RedLights:
     """Red lights of some lanes and connectors with the shells (V, 2)."""
     xy = np.concatenate([np.zeros((0, 2)), *rings])
     ptr = np.cumsum([0, *map(len, rings)])
-    bounds = [[*ring.min(axis=0), *ring.max(axis=0)] for ring in rings]
-    return RedLights(lanes, xy, ptr, np.array(bounds).reshape(-1, 4))
+    return RedLights(lanes, xy, ptr, bounds_of(xy, ptr))
+
+
+def bounds_of(xy: FloatArray, ptr: IntArray) -> FloatArray:
+    """(M, 4) min x, min y, max x, max y of rings, of which each begins at a vertex `ptr` [m]."""
+    return np.hstack([extreme.reduceat(xy, ptr[:-1]) for extreme in (np.minimum, np.maximum)])
 
 
 # beside CLEAR, HIT and UNDECIDED: not asked yet, and touched by the ego's footprint itself
@@ -65,17 +70,6 @@ class Objects(NamedTuple):
     bounds: FloatArray  # (M, 4) min x, min y, max x, max y [m]
     headings: FloatArray  # (M,) heading, 0 for a red light [rad]
     speeds: FloatArray  # (M,) speed, 0 for static objects and red lights [m/s]
-
-
-def make_objects(
-    xy: FloatArray, ptr: IntArray, headings: FloatArray, speeds: FloatArray
-) -> Objects:
-    """Objects from the arrays of `Objects`, their bounds added."""
-    bounds = np.zeros((len(speeds), 4))
-    if len(speeds):
-        bounds[:, :2] = np.minimum.reduceat(xy, ptr[:-1])
-        bounds[:, 2:] = np.maximum.reduceat(xy, ptr[:-1])
-    return Objects(xy, ptr, bounds, headings, speeds)
 
 
 @kernel

@@ -10,15 +10,17 @@ from shiftsim.geometry.corridor import CLEAR, HIT
 from shiftsim.geometry.rings import SLACK
 from shiftsim.planners.routes.lead import (
     OVERLAPPING,
+    Objects,
+    bounds_of,
     find_lead,
     keep_one_overlap,
-    make_objects,
 )
 
 
 def objects_of(rings):
     nothing, ptr = np.zeros(len(rings)), np.cumsum([0, *map(len, rings)])
-    return make_objects(np.concatenate(rings), ptr, nothing, nothing)
+    xy = np.concatenate(rings)
+    return Objects(xy, ptr, bounds_of(xy, ptr), nothing, nothing)
 
 
 def test_the_gap_to_the_lead_is_the_distance_between_the_polygons(rng):

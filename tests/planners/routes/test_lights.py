@@ -33,7 +33,7 @@ def test_lights_are_looked_at_again_when_they_change():
     assert len(watch.at(red).lanes) == 1
 
 
-def test_lights_that_can_be_written_are_looked_at_every_time():
+def test_lights_that_are_written_in_place_are_noticed():
     watch, changing = LightWatch(straight_road(), range(100)), lights(("21",), 2)
     assert len(watch.at(changing).lanes) == 1
     changing.status[0, 0] = LightStatus.GREEN
