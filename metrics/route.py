@@ -209,8 +209,10 @@ def _corner_routes(lanes: Lanes, corners: FloatArray, out: EdgeLists) -> int:
                 if count == _OVERLAP:
                     return i
                 if i == 1:  # nuPlan rule 70: only here
-                    size, rest = _add(known, size, found, count), slice(corner + 1, 4)
-                    _narrow(lanes, corners[i, rest], known, size, lists[i, rest], counts[i, rest])
+                    size, rest = _add(known, size, found, count), corner + 1
+                    _narrow(
+                        lanes, corners[i, rest:], known, size, lists[i, rest:], counts[i, rest:]
+                    )
     return -1
 
 

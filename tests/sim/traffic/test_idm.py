@@ -72,6 +72,18 @@ def test_first_step_moves_by_the_old_speed() -> None:
     assert tracks.velocities[1, 0, 0] == pytest.approx(3.0 + 0.1 * accel, abs=1e-6)
 
 
+def test_many_steps_at_once_are_those_one_by_one() -> None:
+    scenario = scene([(40.0, 0.0, 0.0), (75.0, 0.0, 0.0)], [VEHICLE, CONE], speed=5.0)
+    alone, together = drive(scenario, 60), scenario.tracks.rows(scenario.iteration_rows)
+    model = IdmTraffic()
+    model.start(scenario, together, 0)
+    for first, last in ((0, 1), (1, 20), (20, 60)):
+        model.step_many(first, scenario.expert[first:last], together, first + 1)
+
+    np.testing.assert_array_equal(together.poses[:61], alone.poses[:61])
+    np.testing.assert_array_equal(together.velocities[:61], alone.velocities[:61])
+
+
 def test_follower_stops_behind_a_cone() -> None:
     tracks = drive(scene([(40.0, 0.0, 0.0), (75.0, 0.0, 0.0)], [VEHICLE, CONE], speed=5.0))
 
