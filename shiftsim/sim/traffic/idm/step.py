@@ -71,7 +71,7 @@ def advance(scene: Scene, row: TrackArrays, ego: FloatArray, span: float) -> tup
     """
     fleet, footprints, num_agents = scene.fleet, scene.footprints, len(scene.agents)
     parameters, graph, scratch = scene.parameters, scene.graph, scene.scratch
-    heading = ego[EGO_HEADING]
+    bounds, heading = footprints.bounds, ego[EGO_HEADING]
     x = ego[0] + _EGO_CENTER * np.cos(heading)
     y = ego[1] + _EGO_CENTER * np.sin(heading)
     set_box(footprints, num_agents, x, y, heading, _EGO_LENGTH, _EGO_WIDTH)
@@ -104,7 +104,7 @@ def advance(scene: Scene, row: TrackArrays, ego: FloatArray, span: float) -> tup
         bound_runs(line, runs)
         corridor = Corridor(line, runs, 0, points, 0.5 * width)
         ahead = Ahead(corridor, scratch.outline, scratch.outline_size)
-        ahead.outline_size[0], bounds = -1, footprints.bounds
+        ahead.outline_size[0] = -1
         own = footprint_at(footprints, agent)
         if not progress < path_end and not in_corridor(own, bounds[agent], ahead):
             return LEFT_PATH, agent  # nuPlan rule 128
