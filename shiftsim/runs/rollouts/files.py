@@ -3,7 +3,7 @@
 Rows have what the scenario does not hold already. Recorded tracks (unless the traffic reacts),
 lights, route and expert come back from the store when a rollout is read, and noise from its key.
 Everything is stored to the last bit but plans, on which no score depends: they are less the pose of
-the ego, in single precision.
+the ego, and rounded.
 
 A worker sends the rows of a rollout as bytes, which wait in the journal; when the run ends they go
 into files `part-*.parquet`. Most of the time of writing a small Parquet file goes into headers,
@@ -38,6 +38,7 @@ from shiftsim.world.state import Tracks
 COMMAND_COLUMNS = ("command_accel_mps2", "command_steering_rate_radps")
 NOISE_COLUMNS = ("noise_accel_mps2", "noise_steering_rate_radps")
 _PLAN_COLUMNS = ("plan_dx_m", "plan_dy_m", "plan_dheading_rad")
+_PER_UNIT = 2048  # plans are rounded to this part of a metre and radian
 
 
 def _schema(columns: dict[str, pa.DataType]) -> pa.Schema:
@@ -92,8 +93,8 @@ def rollout_rows(
     columns += [pa.array(log.planning_seconds.astype(np.float32)), pa.array(log.degraded)]
     # poses behind the first that is unknown are left out
     known = np.logical_and.accumulate(~np.isnan(log.plans[..., 0]), axis=1)
-    offsets = (log.plans - log.ego[:, None, :3])[known].astype(np.float32)
-    columns += [_lists(known.sum(axis=1), of) for of in offsets.T]
+    offsets = np.rint((log.plans - log.ego[:, None, :3])[known] * _PER_UNIT) / _PER_UNIT
+    columns += [_lists(known.sum(axis=1), of) for of in offsets.T.astype(np.float32)]
     schema = [*STATES, *(TRACKS if with_tracks else ()), *(SEEN if with_seen else ())]
     columns += _box_columns(log.tracks) if with_tracks else []
     if with_seen:
@@ -197,7 +198,7 @@ def _cells(column: pa.Array, lengths: np.ndarray, name: str) -> pa.Array:
 
 
 def stored_plans(rows: pa.RecordBatch) -> np.ndarray:
-    """(K, P, 3) poses of the plans of a rollout, to about 10 micrometres, or a ValueError."""
+    """(K, P, 3) poses of the plans of a rollout, to 1/4096 m and rad, or a ValueError."""
     lengths = np.diff(rows[_PLAN_COLUMNS[0]].offsets.to_numpy())
     if (lengths > NUM_KEPT).any():
         raise ValueError(f"a plan of {lengths.max()} poses")
