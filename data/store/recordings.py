@@ -220,8 +220,10 @@ def _fill(at: IntArray, boxes: tuple[FloatArray, ...], out: tuple[FloatArray, ..
 
 
 def _texts(column: pa.ChunkedArray, rows: IntArray) -> tuple[str, ...]:
-    """Some texts of a column."""
-    return tuple(column.take(pa.array(rows)).cast(pa.string()).to_pylist())  # lists quicker
+    """Some texts of a column that names what a row is about."""
+    coded = tables.whole(column)
+    texts = coded.dictionary.to_pylist()
+    return tuple(texts[code] for code in coded.indices.to_numpy()[rows].tolist())
 
 
 def _rows(table: tables.Table, first: int, last: int, validate: bool) -> pa.Table:

@@ -115,8 +115,6 @@ def write_blocks(
         pq.ParquetWriter(
             partial,
             first.schema,
-            compression="zstd",
-            compression_level=3,
             **_encodings(first.schema),
             write_statistics=["row"] if "row" in first.schema.names else False,
             store_schema=False,
@@ -131,20 +129,27 @@ def write_blocks(
 def _encodings(described: pa.Schema) -> dict[str, Any]:
     """How columns are written: floats as bytes in planes, integers as differences.
 
-    Both are encodings of Parquet that compress much better than numbers as they are.
+    Both are encodings of Parquet that compress much better than numbers as they are. Codes of few
+    values are small enough.
     """
-    dictionaries, encoded = list[str](), dict[str, str]()
+    dictionaries, encoded, compression = list[str](), dict[str, str](), dict[str, str]()
     for field in described:
         is_list = pa.types.is_list(field.type)
         kind = field.type.value_type if is_list else field.type
         name = f"{field.name}.list.element" if is_list else field.name
+        compression[name] = "none" if field.name in _REPEATING and not is_list else "zstd"
         if field.name in _REPEATING:
             dictionaries.append(name)
         elif pa.types.is_floating(kind):
             encoded[name] = "BYTE_STREAM_SPLIT"
         elif kind in (pa.int32(), pa.int64()):
             encoded[name] = "DELTA_BINARY_PACKED"
-    return {"use_dictionary": dictionaries, "column_encoding": encoded}
+    return {
+        "use_dictionary": dictionaries,
+        "column_encoding": encoded,
+        "compression": compression,
+        "compression_level": {name: 3 for name, codec in compression.items() if codec == "zstd"},
+    }
 
 
 def write_json(path: Path, content: object) -> None:
@@ -239,7 +244,8 @@ class Table:
             found = self._file.read_row_groups(groups, wanted, use_threads=False)
             if len(groups) != 1:
                 found = found.combine_chunks()
-            for name in self._texts:
+            is_new = not self._validated.issuperset(groups)
+            for name in self._texts if is_new else ():
                 if name in wanted:
                     found[name].validate(full=True)  # that it is UTF-8
         except (OSError, pa.ArrowException) as error:
@@ -248,7 +254,7 @@ class Table:
             if name in wanted and (missing := found[name].null_count):
                 what = f"{missing} of {len(found)} values are missing"
                 raise DataError(f"{self.path}: column {name!r}: {what}", hint=REPAIR)
-        if validate and not self._validated.issuperset(groups):
+        if validate and is_new:
             require_ranges(found, str(self.path))
             self._validated.update(groups if columns is None else ())
         return found
@@ -272,12 +278,16 @@ def require_ranges(table: pa.Table, where: str) -> None:
 
 def column(table: pa.Table, name: str) -> Any:
     """Numbers of a column, those of lists one after the other; read-only."""
-    parts = table[name]
-    values = parts.chunk(0) if parts.num_chunks == 1 else parts.combine_chunks()
+    values = whole(table[name])
     flat = values.flatten() if pa.types.is_list(values.type) else values
     array: np.ndarray = flat.to_numpy(zero_copy_only=False)
     array.flags.writeable = False
     return array
+
+
+def whole(column: pa.ChunkedArray) -> pa.Array:
+    """A column in one piece."""
+    return column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
 
 
 def digest(path: Path) -> str:
