@@ -18,7 +18,7 @@ from shiftsim.data.recording import EgoTrace, Window
 from shiftsim.data.recording import scenario as make_scenario
 from shiftsim.data.store import schema, tables
 from shiftsim.data.store.map import read_map_file
-from shiftsim.data.store.recordings import StoredRecording, ego_states, open_ego
+from shiftsim.data.store.recordings import StoredRecording, ego_states
 from shiftsim.errors import FAILED, ConfigError, DataError, beginning
 from shiftsim.files import safe_join
 from shiftsim.world.map import VectorMap
@@ -213,7 +213,8 @@ class ScenarioStore:
         key = (recording, name)
         if key not in self._egos:
             _limit(self._egos)
-            self._egos[key] = open_ego(self.recording_folder(recording), name)
+            file = tables.ego_file(self.recording_folder(recording), name)
+            self._egos[key] = tables.Table(file, schema.EGO)
         return self._egos[key]
 
 

@@ -23,11 +23,10 @@ def write_recording(folder: Path, recording: Recording) -> None:
     """Write frames, lights and tracks of a recording; a DataError where numbers do not fit."""
     count, tracks = len(recording.time_us), recording.tracks
     shape = (count, len(tracks.tokens))
-    _require(
-        tracks.valid.shape == shape and tracks.kinds.shape == shape[1:], folder / tables.TRACKS
-    )
+    path = folder / tables.TRACKS
+    _require(tracks.valid.shape == shape and tracks.kinds.shape == shape[1:], path)
     for values, width in zip(tracks.arrays[1:], (3, 2, 2), strict=True):
-        _require(values.shape == (*shape, width), folder / tables.TRACKS)
+        _require(values.shape == (*shape, width), path)
     lights = recording.lights
     _require(lights.status.shape == (count, len(lights.connector_ids)), folder / tables.LIGHTS)
     blocks_of = {
@@ -179,11 +178,10 @@ class StoredRecording:
 
 
 def _rows_of(found: pa.Table, name: str, first: int, last: int) -> tuple[IntArray, IntArray]:
-    """Rows of a table about each track, or light: a column has its number.
+    """Rows (T, N) of a table about each track, or light, whose number is in a column.
 
-    Returns:
-        (T, N) row of the table for each row `first` … `last` - 1 of the recording, -1 where there
-        is none, by number; and any row (N,) of the table about each.
+    They are those for the rows `first` … `last` - 1 of the recording, -1 where there is none; and
+    any row (N,) of the table about each.
     """
     numbers = tables.column(found, name)
     starts = np.concatenate([[0], np.flatnonzero(numbers[1:] != numbers[:-1]) + 1])
@@ -235,11 +233,6 @@ def _rows(table: tables.Table, first: int, last: int, validate: bool) -> pa.Tabl
     if not first < last or not np.array_equal(rows, np.arange(first, last)):
         raise DataError(f"{table.path}: no rows {first} … {last - 1}", hint=tables.REPAIR)
     return found.slice(start, last - first)
-
-
-def open_ego(folder: Path, name: str) -> tables.Table:
-    """Open the file of an ego's states."""
-    return tables.Table(tables.ego_file(folder, name), schema.EGO)
 
 
 def ego_span(table: tables.Table) -> tuple[int, int]:

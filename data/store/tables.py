@@ -127,29 +127,27 @@ def write_blocks(
 
 
 def _encodings(described: pa.Schema) -> dict[str, Any]:
-    """How columns are written: floats as bytes in planes, integers as differences.
+    """How columns are written: floats as bytes in planes, integers as differences, then compressed.
 
     Both are encodings of Parquet that compress much better than numbers as they are. Codes of few
-    values are small enough.
+    values are small as they are.
     """
-    dictionaries, encoded, compression = list[str](), dict[str, str](), dict[str, str]()
+    dictionaries, encoded, compressed = list[str](), dict[str, str](), list[str]()
     for field in described:
         is_list = pa.types.is_list(field.type)
         kind = field.type.value_type if is_list else field.type
         name = f"{field.name}.list.element" if is_list else field.name
-        compression[name] = "none" if field.name in _REPEATING and not is_list else "zstd"
         if field.name in _REPEATING:
             dictionaries.append(name)
         elif pa.types.is_floating(kind):
             encoded[name] = "BYTE_STREAM_SPLIT"
         elif kind in (pa.int32(), pa.int64()):
             encoded[name] = "DELTA_BINARY_PACKED"
-    return {
-        "use_dictionary": dictionaries,
-        "column_encoding": encoded,
-        "compression": compression,
-        "compression_level": {name: 3 for name, codec in compression.items() if codec == "zstd"},
-    }
+        if is_list or field.name not in _REPEATING:
+            compressed.append(name)
+    codec = {"compression": dict.fromkeys(compressed, "zstd")}
+    level = {"compression_level": dict.fromkeys(compressed, 3)}
+    return {"use_dictionary": dictionaries, "column_encoding": encoded, **codec, **level}
 
 
 def write_json(path: Path, content: object) -> None:
@@ -172,11 +170,8 @@ class Table:
                 content = pa.BufferReader(file.read_buffer())  # mapped; the file need not stay open
             self._file = pq.ParquetFile(content, pre_buffer=False, read_dictionary=self._named)
         except (OSError, ValueError, KeyError, pa.ArrowException) as error:  # KeyError: a name
-            what = (
-                "is missing"
-                if not os.path.exists(path)
-                else f"is not a readable Parquet file: {error}"
-            )
+            is_there = os.path.exists(path)
+            what = f"is not a readable Parquet file: {error}" if is_there else "is missing"
             raise DataError(f"{path}: the file {what}", hint=REPAIR) from error
         found = self._file.schema_arrow
         for field in expected:

@@ -2,8 +2,7 @@
 
 Rows have what the scenario does not hold already. Recorded tracks (unless the traffic reacts),
 lights, route and expert come back from the store when a rollout is read, and noise from its key.
-Everything is stored to the last bit but plans, on which no score depends: they are less the pose of
-the ego, and rounded.
+All is stored to the last bit but plans, on which no score depends: they are rounded.
 
 A worker sends the rows of a rollout as bytes, which wait in the journal; when the run ends they go
 into files `part-*.parquet`. Most of the time of writing a small Parquet file goes into headers,

@@ -12,10 +12,11 @@ import pytest
 from recordings import TOKEN, make_recording, make_window, write_store
 
 from shiftsim.data.recording import EgoTrace, Recording
+from shiftsim.data.store import schema, tables
 from shiftsim.data.store.check import survey_store
 from shiftsim.data.store.map import read_map_file, write_map
 from shiftsim.data.store.reading import open_store
-from shiftsim.data.store.recordings import ego_states, open_ego, write_ego
+from shiftsim.data.store.recordings import ego_states, write_ego
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import DataError
 from shiftsim.world.map import VectorMap
@@ -28,7 +29,7 @@ def test_an_ego_that_lacks_a_row_is_named(tmp_path: Path) -> None:
     table = pq.read_table(path)
     pq.write_table(pa.concat_tables([table.slice(0, 2), table.slice(3)]), path)
     with pytest.raises(DataError, match=r"ego-ego\.parquet: no rows 0 … 4"):
-        ego_states(open_ego(tmp_path, "ego"), 0, 5)
+        ego_states(tables.Table(tables.ego_file(tmp_path, "ego"), schema.EGO), 0, 5)
 
 
 @pytest.mark.parametrize("name", ["tracks", "lights", "frames"])

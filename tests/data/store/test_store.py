@@ -13,9 +13,9 @@ from recordings import GOLDEN, LOG, TOKEN, make_recording, make_window, write_st
 
 from shiftsim.data.nuplan.convert import convert_nuplan
 from shiftsim.data.recording import EgoTrace, Recording
-from shiftsim.data.store import schema
+from shiftsim.data.store import schema, tables
 from shiftsim.data.store.reading import open_store
-from shiftsim.data.store.recordings import ego_span, ego_states, open_ego, write_ego
+from shiftsim.data.store.recordings import ego_span, ego_states, write_ego
 from shiftsim.errors import DataError
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import Tracks, TrafficLights
@@ -186,7 +186,7 @@ def test_an_ego_of_several_row_groups_comes_back_to_the_last_bit(
 ) -> None:
     states = rng.normal(size=(2 * schema.FRAME_BLOCK + 7, 11))
     write_ego(tmp_path, EgoTrace("drive", "ego", 40, states))
-    table = open_ego(tmp_path, "ego")
+    table = tables.Table(tables.ego_file(tmp_path, "ego"), schema.EGO)
     assert ego_span(table) == (40, 40 + len(states))
     for first, last in ((0, len(states)), (2040, 2060), (2048, 2049), (4096, 4103)):
         part = ego_states(table, 40 + first, 40 + last)
