@@ -94,6 +94,7 @@ class Rollout:
 
             self._traffic = Scripted(self._traffic)
         self._traffic.start(scenario, self._tracks, start)
+        self._is_batch = isinstance(self._traffic, BatchTraffic)  # asked once: it takes long
         self._drift, seed, token = setting.drift, setting.seed, scenario.token
         self._sensing: Sensing | None = None
         self._waiting = deque[Trajectory | Command]()  # plans under way, the next one first
@@ -392,7 +393,7 @@ def simulate_together(
             elif moved:
                 at, row = rollout.iteration, rollout._start + rollout.iteration
                 moves[index] = Move(at, rollout._ego[row], rollout._tracks, row + 1)
-        batch = [i for i in moves if isinstance(rollouts[i]._traffic, BatchTraffic)]
+        batch = [i for i in moves if rollouts[i]._is_batch]
         if batch:
             models = [cast(BatchTraffic, rollouts[i]._traffic) for i in batch]
             models[0].step_batch(models, [moves.pop(i) for i in batch])
