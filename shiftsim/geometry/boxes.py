@@ -12,7 +12,7 @@ from shiftsim.geometry.rings import (
     SLACK,
     convex_intersect,
     locate_in_ring,
-    segments_intersect,
+    segments_meet,
 )
 from shiftsim.kernels import FloatArray, kernel
 
@@ -92,8 +92,10 @@ def contact_type(
         return ACTIVE_REAR
     if locate_in_ring(other, box[0, 0], box[0, 1]) != EXTERIOR:
         return ACTIVE_FRONT
+    ax, ay, bx, by = box[0, 0], box[0, 1], box[3, 0], box[3, 1]
     for index in range(len(other)):
-        if segments_intersect(box[0], box[3], other[index - 1], other[index]):
+        cx, cy, dx, dy = other[index - 1, 0], other[index - 1, 1], other[index, 0], other[index, 1]
+        if segments_meet(ax, ay, bx, by, cx, cy, dx, dy):
             return ACTIVE_FRONT  # the front edge touches the other box
     return ACTIVE_LATERAL
 

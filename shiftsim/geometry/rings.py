@@ -107,12 +107,6 @@ def segments_meet(
 
 
 @kernel
-def segments_intersect(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> bool:
-    """As `segments_meet`, for points (2,)."""
-    return segments_meet(a[0], a[1], b[0], b[1], c[0], c[1], d[0], d[1])
-
-
-@kernel
 def locate_in_ring(ring: FloatArray, x: float, y: float) -> int:
     """Where a point lies relative to one ring (V, 2): INTERIOR, BOUNDARY or EXTERIOR."""
     parity, on_edge = ray_crossings(ring, len(ring) - 1, 0, len(ring), x, y)

@@ -22,7 +22,7 @@ from shiftsim.geometry.rings import (
     locate_in_polygon,
     orientation,
     polygon_distance,
-    segments_intersect,
+    segments_meet,
 )
 from shiftsim.kernels import FloatArray, IntArray, kernel, readonly
 
@@ -253,30 +253,28 @@ def meets_convex(polygons: Polygons, poly: int, ring: FloatArray) -> bool:
     first, last = polygons.poly_ptr[poly], polygons.poly_ptr[poly + 1]
     xy, ring_ptr = polygons.xy, polygons.ring_ptr
     for vertex in range(ring_ptr[first], ring_ptr[last]):
-        if _in_convex(ring, xy[vertex, 0], xy[vertex, 1]):
+        x, y, is_in = xy[vertex, 0], xy[vertex, 1], True
+        for corner in range(len(ring)):
+            ax, ay = ring[corner - 1, 0], ring[corner - 1, 1]
+            if orientation(ax, ay, ring[corner, 0], ring[corner, 1], x, y) < 0:
+                is_in = False
+                break
+        if is_in:
             return True
     for corner in range(len(ring)):
         x, y = ring[corner, 0], ring[corner, 1]
         if locate_in_polygon(xy, ring_ptr, first, last, x, y) != EXTERIOR:
             return True
     for chain in range(first, last):
-        before = ring_ptr[chain + 1] - 1
+        px, py = xy[ring_ptr[chain + 1] - 1, 0], xy[ring_ptr[chain + 1] - 1, 1]
         for vertex in range(ring_ptr[chain], ring_ptr[chain + 1]):
+            x, y = xy[vertex, 0], xy[vertex, 1]
             for corner in range(len(ring)):
-                if segments_intersect(xy[before], xy[vertex], ring[corner - 1], ring[corner]):
+                ax, ay = ring[corner - 1, 0], ring[corner - 1, 1]
+                if segments_meet(px, py, x, y, ax, ay, ring[corner, 0], ring[corner, 1]):
                     return True
-            before = vertex
+            px, py = x, y
     return False
-
-
-@kernel
-def _in_convex(ring: FloatArray, x: float, y: float) -> bool:
-    """Whether a point lies in a convex ring (V, 2), counter-clockwise, or on it."""
-    for corner in range(len(ring)):
-        ax, ay = ring[corner - 1, 0], ring[corner - 1, 1]
-        if orientation(ax, ay, ring[corner, 0], ring[corner, 1], x, y) < 0:
-            return False
-    return True
 
 
 @kernel

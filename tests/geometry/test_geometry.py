@@ -115,7 +115,8 @@ def test_distances_between_boxes_equal_those_of_shapely(rng, offset):
 def segments_meet(a, b, c, d):
     out = np.empty(len(a), np.bool_)
     for index in range(len(a)):
-        out[index] = rings.segments_intersect(a[index], b[index], c[index], d[index])
+        (ax, ay), (bx, by), (cx, cy), (dx, dy) = a[index], b[index], c[index], d[index]
+        out[index] = rings.segments_meet(ax, ay, bx, by, cx, cy, dx, dy)
     return out
 
 
@@ -129,19 +130,11 @@ def test_segments_meet_exactly_where_shapely_says_so(rng, offset):
     np.testing.assert_array_equal(segments_meet(a, b, c, d)[proper], theirs[proper])
 
 
-@kernel
-def point_meets(a, c, d):
-    out = np.empty(len(a), np.bool_)
-    for index in range(len(a)):
-        out[index] = rings.segments_intersect(a[index], a[index], c[index], d[index])
-    return out
-
-
 def test_a_segment_of_length_zero_is_a_point(rng):
     a, c, d = (grid_points(rng, 20_000, OFFSETS[0], step=1.0, reach=3.0) for _ in range(3))
     proper = (c != d).any(axis=1)
     theirs = shapely.intersects(shapely.points(a), shapely.linestrings(np.stack([c, d], 1)))
-    np.testing.assert_array_equal(point_meets(a, c, d)[proper], theirs[proper])
+    np.testing.assert_array_equal(segments_meet(a, a, c, d)[proper], theirs[proper])
 
 
 @kernel

@@ -128,11 +128,12 @@ def _draw_edge(
             drawn[line] = True
         if line == NONE or value == 0:
             continue
-        xy = roads.lines.xy[roads.lines.ptr[line] : roads.lines.ptr[line + 1]]
-        x0, y0 = _to_pixel(frame, xy[0, 0], xy[0, 1])
-        for vertex in range(1, len(xy)):
+        raster, xy = rasters[channel], roads.lines.xy
+        start, stop = roads.lines.ptr[line], roads.lines.ptr[line + 1]
+        x0, y0 = _to_pixel(frame, xy[start, 0], xy[start, 1])
+        for vertex in range(start + 1, stop):
             x1, y1 = _to_pixel(frame, xy[vertex, 0], xy[vertex, 1])
-            draw_line(rasters[channel], x0, y0, x1, y1, value)
+            draw_line(raster, x0, y0, x1, y1, value)
             x0, y0 = x1, y1
 
 
