@@ -26,14 +26,6 @@ from shiftsim.runs.rollouts import Task, files
 from shiftsim.runs.rollouts.files import RolloutLocation, decode_rows
 from shiftsim.runs.tables import MISSING, STATUSES, TABLES, TaskResult, stored_results
 
-_WRITE_OPTIONS: dict[str, Any] = {
-    "compression": "zstd",
-    "compression_level": 3,
-    "version": "2.6",
-    "data_page_version": "1.0",
-    "use_dictionary": True,
-    "write_statistics": True,
-}
 _ROW_GROUP = 1024  # tasks
 
 
@@ -42,8 +34,7 @@ class TaskRecord(NamedTuple):
 
     number: int  # its entry in the journal
     status: str  # what became of it
-    # where its rollout is, where a Parquet file has it already
-    location: RolloutLocation | None
+    location: RolloutLocation | None  # of its rollout, where a Parquet file has it already
     has_rollout: bool  # whether the journal has its rollout
 
 
@@ -81,8 +72,7 @@ class RunWriter:
         before = self.ended.get(result.task)
         if before is not None and before.location is not None:
             self._outdated.add(before.location.file)
-        record = TaskRecord(number, result.status, result.location, has_rollout)
-        self.ended[result.task] = record
+        self.ended[result.task] = TaskRecord(number, result.status, result.location, has_rollout)
 
     def result(self, task: Task) -> TaskResult:
         """What became of a task that has ended, without its rollout."""
@@ -124,7 +114,7 @@ class RunWriter:
             tables = {}
             for name, schema in TABLES.items():
                 path = stack.enter_context(atomic_write(self.path / f"{name}.parquet"))
-                table = pq.ParquetWriter(path, schema, **_WRITE_OPTIONS)
+                table = pq.ParquetWriter(path, schema, compression="zstd", compression_level=3)
                 tables[name] = stack.enter_context(table)
             while chunk := list(islice(tasks, _ROW_GROUP)):
                 rows: dict[str, list[dict[str, Any]]] = {name: [] for name in TABLES}

@@ -3,6 +3,7 @@
 import hashlib
 import os
 import platform
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -34,6 +35,7 @@ _SOURCES = (
 
 State: TypeAlias = Literal["new", "unfinished", "failed", "complete"]
 _NAMES = {"tokens": "scenarios", "review": "reviews"}  # in messages
+_OF_TASK, _OF_ROLLOUT = 17e3, 68e3  # bytes on disk when a run ends; in reactive traffic more
 
 
 def make_manifest(
@@ -135,6 +137,16 @@ def check_target(folder: Path, fingerprint: dict[str, Any], *, shard: str = "") 
         what = f"{str(folder)!r} holds another run: {differs}"
         raise ConfigError(what, hint="choose another --out, or remove that folder")
     return state
+
+
+def check_space(folder: Path, num_tasks: int, *, with_rollouts: bool) -> None:
+    """Refuse a run whose disk cannot hold it; its folder need not exist yet."""
+    place = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    needed = num_tasks * (_OF_TASK + _OF_ROLLOUT * with_rollouts)
+    if needed > (free := shutil.disk_usage(place).free):
+        what = f"{num_tasks} tasks need about {needed / 1e9:.1f} GB, {str(place)!r} has"
+        hint = "choose another --out" + ", or --save-rollouts failed" * with_rollouts
+        raise ConfigError(f"{what} {free / 1e9:.1f} GB free", hint)
 
 
 def difference(manifest: dict[str, Any], fingerprint: dict[str, Any], shard: str = "") -> str:

@@ -19,7 +19,7 @@ from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.planners import registry
 from shiftsim.planners.registry import PLANNERS, RunPlanner, planner_name, takes_argument
 from shiftsim.runs.config import DRIFT, RunConfig, Value, default_workers, parse_shard, split_label
-from shiftsim.runs.manifest import State, check_resumable, check_target, code_digest
+from shiftsim.runs.manifest import State, check_resumable, check_space, check_target, code_digest
 from shiftsim.runs.rollouts import Task
 from shiftsim.runs.scenarios import Selection, select_scenarios
 from shiftsim.runs.task import Batch, TaskRunner
@@ -120,6 +120,8 @@ def prepare(
     tasks = [Task(*run, token) for token in selection.present for run in runs]
     missing: list[Batch] = [(Task(*run, token),) for token in selection.missing for run in runs]
     batches = _of_shard(config.shard, _batches(grouped, tasks))
+    if before == "new":
+        check_space(folder, sum(map(len, batches)), with_rollouts=config.save_rollouts == "all")
     # one batch per planner to the front: they compile all the kernels
     leading = {batch[0].planner: batch for batch in reversed(batches)}
     batches.sort(key=lambda batch: leading[batch[0].planner] is not batch)

@@ -121,11 +121,7 @@ def open_run(path: str | Path) -> Run:
     """A run folder; a ConfigError where there is none, a DataError if it cannot be read."""
     folder = Path(path)
     if not folder.is_dir():
-        near = (
-            file
-            for where in ("*", "runs/*")
-            for file in folder.parent.glob(f"{where}/manifest.json")
-        )
+        near = [*folder.parent.glob("*/manifest.json"), *folder.parent.glob("runs/*/manifest.json")]
         runs = sorted(str(file.parent) for file in near)
         hint = f"there are: {listed(runs)}" if runs else "make one with `shiftsim run`"
         raise ConfigError(f"no run folder {str(folder)!r}", hint)

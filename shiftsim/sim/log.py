@@ -76,7 +76,7 @@ class SimulationLog:
         noise: (K, 2) what was added to them.
         plans: (K, P, 3) poses of the plan: every 0.1 s over its first second, from the moment of
             planning on, then every second to 8 s (P = 18); NaN where it does not reach, and where a
-            command was returned. Of a rollout from disk they are rounded to 1 mm and 0.1 mrad.
+            command was returned. Of a rollout from disk they are rounded to 1/2048 m and rad.
         planning_seconds: (K,) time the planner took for each call [s].
         degraded: (K,) whether the plan was a fallback by the planner's own account.
         seen: What the planner saw in place of `ego` and `tracks`; None where it saw these.

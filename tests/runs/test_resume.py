@@ -298,3 +298,27 @@ def test_a_worker_that_died_is_told_from_one_that_was_late():
     (died,) = results_of(Outcome((task,), None, "worker process killed by SIGKILL"))
     (late,) = results_of(Outcome((task,), None, "took longer than 2 s", is_late=True))
     assert (died.status, late.status) == ("failed", "timeout")
+
+
+@pytest.mark.parametrize(
+    ("kept", "free", "message"),
+    [
+        ("all", 500e3, r"12 tasks need about 0\.0 GB, '.*' has 0\.0 GB free"),
+        ("none", 50e3, "12 tasks need about"),
+        ("none", 500e3, ""),
+        ("all", 2e6, ""),
+    ],
+)
+def test_a_run_that_the_disk_cannot_hold_is_refused(
+    toy, tmp_path, monkeypatch, kept, free, message
+):
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=free))
+    config = settings(toy, tmp_path / "not" / "yet" / "run", save_rollouts=kept, **NOISY)
+    if not message:
+        prepare(config)
+        return
+    with pytest.raises(ConfigError, match=message) as caught:
+        prepare(config)
+    assert ("--save-rollouts failed" in caught.value.hint) == (kept == "all")
+    assert not (tmp_path / "not").exists()
