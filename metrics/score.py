@@ -96,14 +96,16 @@ class MetricResult:
     """Everything nuPlan says about one rollout under one threshold profile."""
 
     score: float  # closed-loop score in [0, 1]; NaN where a metric is undefined
-    # score by devkit metric name, None for metrics without one; always the same order
-    scores: dict[str, float | None]
+    scores: dict[str, float | None]  # by devkit name, None for metrics without; in one order
     rows: tuple[MetricRow, ...]  # one row per metric, in the same order
     statistics: tuple[Statistic, ...]  # named statistics, grouped by metric
     series: dict[str, Series]  # one value per sample, by metric
     thresholds: str  # name of the threshold profile
     measurements: Measurements  # routes, collisions, signals and distances behind the scores
     extra: tuple[MetricRow, ...] = ()  # rows of the user's own metrics; they never enter the score
+
+    def __repr__(self) -> str:
+        return f"<MetricResult: score {100.0 * self.score:.2f}, thresholds {self.thresholds}>"
 
 
 setattr(MetricResult, "__getattr__", missing_attribute)  # noqa: B010

@@ -18,15 +18,7 @@ from shiftsim.sim.dynamics.lqr import (
     command,
     fit_curvature,
 )
-from shiftsim.world.state import (
-    HEADING,
-    NUM_STATE,
-    PACIFICA,
-    STEERING,
-    VehicleParameters,
-    X,
-    Y,
-)
+from shiftsim.world.state import HEADING, NUM_STATE, PACIFICA, STEERING, VehicleParameters, X, Y
 
 DT = 0.1  # s, between poses
 STEP_US = 100_000

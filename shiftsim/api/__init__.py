@@ -121,7 +121,7 @@ def bench(
     """Run a benchmark track with all its traffic modes, noises and seeds, as `shiftsim bench` does.
 
     Args:
-        track: `semantic-shift`, `state-drift`, `sensor-drift` or `edits`.
+        track: `semantic-shift`, `state-drift`, `sensor-drift`, `edits` or `finding`.
         planner: A name, `package.module:Class` or `LABEL=` one of those, or a list of them.
         out: Folder; that of an earlier call goes on.
         val14: Store, or STORE:SPLIT, with Val14.

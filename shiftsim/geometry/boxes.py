@@ -7,13 +7,7 @@ rear-right, front-right.
 
 import numpy as np
 
-from shiftsim.geometry.rings import (
-    EXTERIOR,
-    SLACK,
-    convex_intersect,
-    locate_in_ring,
-    segments_meet,
-)
+from shiftsim.geometry.rings import EXTERIOR, SLACK, convex_intersect, locate_in_ring, segments_meet
 from shiftsim.kernels import FloatArray, kernel
 
 # rad, bearings from the rear axle that at-fault tests compare with

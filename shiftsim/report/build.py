@@ -199,7 +199,7 @@ def write_report(
             out += files
             texts[CITED] = cite
             shown = [
-                latex_picture(path.name, one.title, is_wide=one.is_wide)
+                latex_picture(path.name, one.caption, is_wide=one.is_wide)
                 for path, one in files.items()
             ]
             parts = [f"% {title}\n% {subtitle}\n% cite from {CITED}", *parts, *shown]

@@ -62,6 +62,12 @@ class Figure:
     name: str  # of its file, without ending
     title: str  # what it shows
     drawn: Any  # the matplotlib figure
+    notes: str = ""  # lines that it leaves to its caption
+
+    @property
+    def caption(self) -> str:
+        """What stands below it in a paper."""
+        return f"{self.title}: {'; '.join(self.notes.splitlines())}" if self.notes else self.title
 
     @property
     def is_wide(self) -> bool:
@@ -104,7 +110,7 @@ def figures(groups: Sequence[Group], *, form: FigureFormat = DEFAULT_FORM) -> li
 
         def add(kind: str, title: str, drawn: Any, note: str, name: str = name, **how: Any) -> None:
             _finish(drawn, title, note, form, **how)
-            out.append(Figure(f"{kind}_{name}", title, drawn))
+            out.append(Figure(f"{kind}_{name}", title, drawn, note if form.plain else ""))
 
         shown = [group for group in mine if group.estimate().value is not None]
         clean = [group for group in shown if group.noise == "none"]
@@ -172,8 +178,9 @@ def open_against_closed(groups: Sequence[Group], *, form: FigureFormat = DEFAULT
     labels = ", ".join(dict.fromkeys(group.data.label for group in shown))
     rules = dict.fromkeys(group.data.rules for group in shown)
     title = f"Open loop against closed loop on {labels}"
-    _add_words(figure, title, "\n".join((*rules, _RHO)), form)
-    return Figure("open-against-closed", title, figure)
+    notes = "\n".join((*rules, _RHO))
+    _add_words(figure, title, notes, form)
+    return Figure("open-against-closed", title, figure, notes if form.plain else "")
 
 
 def _scatter(

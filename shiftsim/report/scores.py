@@ -47,7 +47,10 @@ def scores(groups: Sequence[Group], *, by: str | None = None) -> Table:
     sets = dict.fromkeys(f"{group.data.label}, traffic {group.traffic}" for group in groups)
     title = f"Scores × 100 of all planners and noises: {'; '.join(sets)}"
     best = dict.fromkeys(COLUMNS.values(), max)
-    in_paper = Table("scores", title, header, paper, len(heading), notes, best=best)
+    counts = sorted({len(group.seeds) for group in groups} - {0, 1})
+    seeds = f"± sample standard deviation (n − 1) over {' or '.join(map(str, counts))} seeds"
+    words = (*notes, seeds) if counts else notes
+    in_paper = Table("scores", title, header, paper, len(heading), words, best=best)
     more: dict[str, Any] = {"full": machine, "paper": in_paper, "best": best}
     return Table("scores", title, header, rows, len(heading), notes, **more)
 

@@ -107,7 +107,7 @@ class RunConfig:
         (0,), "Noise seeds: 0,1,2 or 0-2 are three, 3 is number 3 alone. [0]", parse=parse_seeds
     )
     store: str = setting(DEFAULT_STORE, "Name or folder. [demo]", "--store", "-s")
-    split: str = setting("", "Name or file (.toml, .txt). [whole store; of demo demo-mini]")
+    split: str = setting("", "Name or file (.toml, .txt). [whole store; runs on demo: demo-mini]")
     limit: int = setting(0, "Only the first N scenarios.")
     all_scenarios: bool = setting(False, "Also the scenarios that the filter dropped.", "--all")
     edits: str = setting("", "File (.toml) of edits; only what they make is run.")
@@ -118,7 +118,7 @@ class RunConfig:
     controller: str = setting(
         "lqr", "lqr, perfect or log-playback. [lqr]", choices=("lqr", "perfect", "log-playback")
     )
-    thresholds: str = setting("nuplan", "nuplan or deepplan. [nuplan]")
+    thresholds: str = setting("nuplan", "nuplan or deepplan. [nuplan; score RUN: as before]")
     planner_args: dict[str, dict[str, Value]] = field(
         default_factory=dict,
         metadata={

@@ -191,10 +191,7 @@ def _attempting(make: Callable[[], Score]) -> Score:
 
 
 def _scored(
-    make: Callable[[], Score],
-    entries: Sequence[Entry],
-    workers: int,
-    on_progress: OnProgress,
+    make: Callable[[], Score], entries: Sequence[Entry], workers: int, on_progress: OnProgress
 ) -> Iterator[TaskResult]:
     """The results of rollouts, which so many processes share, to be put on disk as they come."""
     progress = Progress(0, len(entries), 0)

@@ -178,8 +178,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         if not isinstance(value, kind):
             raise damaged(path, f"{key!r} is missing or no {kind.__name__}")
     named, found = manifest["config"]["planners"], manifest["determining"]["planners"]
-    if not all(isinstance(name, str) for name in named) or not all(
-        isinstance(about, (dict, str)) for about in found.values()
-    ):
+    sound = [isinstance(about, (dict, str)) for about in found.values()]
+    if not all(sound) or not all(isinstance(name, str) for name in named):
         raise damaged(path, "its planners are no names with what they are")
     return manifest

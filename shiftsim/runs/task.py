@@ -161,7 +161,7 @@ class TaskRunner:
                 rows = self._open_loop(task, scenario)
                 metrics += [_metric_row(row, int(log.time_us[0]), profile) for row in rows]
             except ShiftsimError as error:  # closed loop has its score
-                warning = f"no open-loop score: {error.message}"
+                warning = f"no open-loop score: {error.message}; {error.hint}"
         keep, encoded = self.config.save_rollouts, b""
         if keep == "all" or (keep == "failed" and scores["cls"] == 0.0):
             # pedestrians of an edit wait for the ego

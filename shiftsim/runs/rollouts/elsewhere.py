@@ -95,6 +95,10 @@ class ScoredRollout(NamedTuple):
     log: SimulationLog  # the rollout
     result: MetricResult  # everything that nuPlan says of it
 
+    def __repr__(self) -> str:
+        total = "score undefined" if self.score is None else f"score {100.0 * self.score:.2f}"
+        return f"<ScoredRollout of {'; '.join([self.log.token, total, *self.remarks])}>"
+
 
 def score_rollout(
     poses: Any,

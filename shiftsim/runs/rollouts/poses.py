@@ -239,7 +239,7 @@ def _check_end(driven: Driven, times: IntArray, reached: int, *, partial: bool) 
         driven.refuse_one(
             -1 % len(driven.rows),
             f"the last sample is {ends:.1f} s after iteration 0, the scenario lasts {lasts:.1f} s",
-            "drive it to the end, or --partial to score what there is, labelled so; "
+            "drive it to the end, or have what there is scored as partial (--partial); "
             f"{MIN_SAMPLES} samples at least",
         )
 

@@ -7,12 +7,7 @@ and exact predicates decide whether two edges meet.
 
 import numpy as np
 
-from shiftsim.geometry.rings import (
-    orientation,
-    point_segment_distance,
-    ring_bounds,
-    segments_meet,
-)
+from shiftsim.geometry.rings import orientation, point_segment_distance, ring_bounds, segments_meet
 from shiftsim.kernels import FloatArray, kernel
 
 _ROUNDING = 1.0 + 1e-9  # factor on a square below which bounds of distances are equal
