@@ -61,6 +61,8 @@ def test_the_representations_are_one_short_line_with_what_matters(store, scenari
         (scenario.traffic_lights, "connectors"),
         (scene_info(scenario), scenario.map.name),
         (log, scenario.token),
+        (shiftsim.score(log, scenario), "score "),
+        (shiftsim.score_rollout(log.ego[:, :3], scenario, tracks="recorded"), scenario.token),
         (page, "kB"),
         (run, "4 of 4 tasks"),
     )

@@ -67,7 +67,9 @@ class Figure:
     @property
     def caption(self) -> str:
         """What stands below it in a paper."""
-        return f"{self.title}: {'; '.join(self.notes.splitlines())}" if self.notes else self.title
+        label, _, rest = self.notes.partition(": ")
+        words = rest if self.title.endswith(label) else self.notes
+        return f"{self.title}: {'; '.join(words.splitlines())}" if self.notes else self.title
 
     @property
     def is_wide(self) -> bool:

@@ -163,6 +163,7 @@ def test_what_has_no_open_loop_score_keeps_that_of_closed_loop(tmp_path, caplog)
     assert run.is_complete
     assert not any(row["metric"] in NAMES for row in run.metrics.to_pylist())
     assert "no open-loop score: open loop compares trajectories" in caplog.text
+    assert "; return a shiftsim.Trajectory" in caplog.text  # what to do about it
 
 
 def test_others_drive_as_recorded_whatever_the_traffic(tmp_path):

@@ -202,6 +202,10 @@ def test_a_plain_figure_leaves_title_and_notes_to_the_caption(groups):
         words = [text for text, _ in written(figure.drawn)]
         assert not any("made-up" in text or "bars:" in text for text in words)
         assert any("closed-loop score" in text or "score ×" in text for text in words)
+        assert figure.caption.startswith(f"{figure.title}: ")
+        assert "bars: " in figure.caption
+        assert figure.caption.count("made-up") == 1
+    assert all(figure.caption == figure.title for figure in drawn(groups).values())
 
 
 def test_no_line_leads_over_a_level_that_was_not_run(groups):
