@@ -269,6 +269,8 @@ def test_plans_are_rounded_offsets_from_the_ego(lengths, place, size):
     rows = rollout_rows(log, with_tracks=False)
     back = stored_plans(rows)
     np.testing.assert_allclose(back, plans, rtol=0.0, atol=(1.0 + 1e-6) / 4096)
+    parts = rows["plan_dx_m"].flatten().to_numpy() * 2048.0
+    np.testing.assert_array_equal(parts, np.rint(parts))  # few bits, which compress well
     again = rollout_rows(log_of(ego, back, log.tracks), with_tracks=False)
     assert again.equals(rows)  # whoever reads and writes it changes nothing
 
