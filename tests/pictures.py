@@ -59,7 +59,8 @@ def sizes_in_pdf(path):
     content = path.read_bytes()
     width = float(re.search(rb"/MediaBox \[ ?0 0 ([\d.]+)", content)[1]) / 72.0
     sizes = []
-    for stream in re.findall(rb"stream\r?\n(.*?)\r?\nendstream", content, re.S):
+    # what is compressed may itself end with a carriage return
+    for stream in re.findall(rb"stream\r?\n(.*?)\nendstream", content, re.S):
         with suppress(zlib.error):
             drawn = zlib.decompress(stream)
             sizes += [float(size) for size in re.findall(rb"/F\S+ ([\d.]+) Tf", drawn)]

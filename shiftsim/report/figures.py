@@ -292,8 +292,7 @@ def _scores(
         axes.set_xlim(-margin, len(headings) - 1 + margin)
         axes.set_xlabel(_LABELS.get(title, labels[0]), fontsize=SMALL)
         words = (title, _TRAFFIC.get(traffic, traffic))
-        is_alone = form.plain and len(panels) == 1
-        _finish_axes(axes, "" if is_alone else ", ".join(filter(None, words)), labels[1])
+        _finish_axes(axes, ", ".join(filter(None, words)), labels[1])
     if noise:
         _name_lines(ends)
     return figure

@@ -202,6 +202,7 @@ def test_a_plain_figure_leaves_title_and_notes_to_the_caption(groups):
         words = [text for text, _ in written(figure.drawn)]
         assert not any("made-up" in text or "bars:" in text for text in words)
         assert any("closed-loop score" in text or "score ×" in text for text in words)
+        assert any("non-reactive" in text.lower() for text in words)  # no caption says of which
         assert figure.caption.startswith(f"{figure.title}: ")
         assert "bars: " in figure.caption
         assert figure.caption.count("made-up") == 1
