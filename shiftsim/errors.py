@@ -95,6 +95,11 @@ def readable(value: object) -> str:
     return str(value)[:_MAX_TEXT].encode("utf-8", "backslashreplace").decode()
 
 
+def plural(count: int, noun: str) -> str:
+    """`1 task`, `2 tasks`."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def listed(names: Sequence[str], most: int = 8) -> str:
     """Names in one line; those beyond `most` are counted: "a, b and 3 more"."""
     more = f" and {len(names) - most} more" if len(names) > most else ""

@@ -254,6 +254,8 @@ def test_open_loop_is_drawn_against_closed_loop(pair, run):
         ]
         assert labels[0].endswith("n = 4")
         assert labels[2].endswith("ρ undefined, n = 2")
+        below, marks = axes.get_legend().get_window_extent(), axes.get_window_extent()
+        assert below.y1 < marks.y0  # it covers none of them
     with pytest.raises(shiftsim.ShiftsimError, match="no open-loop scores"):
         run.plot_open_against_closed()
 

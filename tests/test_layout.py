@@ -31,13 +31,13 @@ BUDGETS = {
     "data/nuplan": 2_685,  # goal 2_400
     "data/store": 2_190,
     "data/synthetic": 2_520,  # goal 2_100
-    "shiftsim/report": 3_200,  # goal 2_200
+    "shiftsim/report": 3_206,  # goal 2_200
     "shiftsim/view": 2_365,  # goal 1_800
     "shiftsim/env": 1_410,
     "shiftsim/train": 3_255,  # goal 1_600; rasters and rounds on a GPU, faster samples bring 30
     "shiftsim/compat": 3_580,  # goal 2_300
     "shiftsim/verify": 1_194,  # goal 1_200
-    "shiftsim/cli": 2_665,  # goal 2_300
+    "shiftsim/cli": 2_659,  # goal 2_300
     "benchmarks": 755,  # goal 700; the tracks finding and sensor-drift bring 40
 }
 MOST_LINES, MOST_MODULES, MOST_KERNELS = 63_600, 300, 220  # the goal is 52_000 lines

@@ -31,7 +31,7 @@ from urllib.parse import unquote
 import typer
 from typer import Option
 
-from shiftsim.errors import FAILED, DataError, ShiftsimError, nearest
+from shiftsim.errors import FAILED, DataError, ShiftsimError, nearest, plural
 from shiftsim.runs.config import RunConfig, parse_argument
 
 if TYPE_CHECKING:
@@ -109,11 +109,6 @@ def open_store(path: str | Path) -> "ScenarioStore":
     return store
 
 
-def plural(count: int, noun: str) -> str:
-    """`1 task`, `2 tasks`."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
 def terminal_width(stream: TextIO | None = None) -> int:
     """Columns of the terminal; 0 where a stream, the output if none is named, goes elsewhere."""
     is_terminal = (stream or sys.stdout).isatty()
@@ -154,14 +149,8 @@ def _bar() -> Iterator[Advance]:
     from rich import progress
     from rich.console import Console
 
-    columns = (
-        progress.BarColumn(),
-        progress.MofNCompleteColumn(),
-        progress.TimeElapsedColumn(),
-        progress.TextColumn("ETA"),
-        progress.TimeRemainingColumn(),
-        progress.TextColumn("{task.description}"),
-    )
+    times = (progress.TimeElapsedColumn(), "ETA", progress.TimeRemainingColumn())
+    columns = (progress.BarColumn(), progress.MofNCompleteColumn(), *times, "{task.description}")
     with progress.Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task("", total=None)
         yield lambda done, total, note="": bar.update(

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 from typer import Argument, Option
 
 from shiftsim import cli
-from shiftsim.cli import Json, Quiet, echo, plural, print_json, print_result, stdout_to_stderr
+from shiftsim.cli import Json, Quiet, echo, print_json, print_result, stdout_to_stderr
 from shiftsim.cli.run import DryRun, Live, announce, progress_of
-from shiftsim.errors import MissingExtraError
+from shiftsim.errors import MissingExtraError, plural
 from shiftsim.runs.config import split_label
 
 if TYPE_CHECKING:

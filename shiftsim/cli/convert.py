@@ -11,8 +11,8 @@ from typer import Argument, Option
 
 import shiftsim
 from shiftsim import cli
-from shiftsim.cli import Json, Quiet, echo, new_app, plural, print_json, print_result, progress_bar
-from shiftsim.errors import ConfigError, ConversionError, MissingExtraError
+from shiftsim.cli import Json, Quiet, echo, new_app, print_json, print_result, progress_bar
+from shiftsim.errors import ConfigError, ConversionError, MissingExtraError, plural
 from shiftsim.files import read_toml, store_path
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from typing import Annotated
 from typer import Argument, Option
 
 from shiftsim import cli
-from shiftsim.cli import Json, echo, new_app, plural, print_result
-from shiftsim.errors import ConfigError, ShiftsimError, beginning, one_of
+from shiftsim.cli import Json, echo, new_app, print_result
+from shiftsim.errors import ConfigError, ShiftsimError, beginning, one_of, plural
 from shiftsim.files import write_text
 
 app = new_app(

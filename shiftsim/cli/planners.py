@@ -10,7 +10,8 @@ import typer
 from typer import Argument, Option
 
 from shiftsim import cli
-from shiftsim.cli import Json, Quiet, echo, new_app, plural, print_result, stdout_to_stderr
+from shiftsim.cli import Json, Quiet, echo, new_app, print_result, stdout_to_stderr
+from shiftsim.errors import plural
 from shiftsim.train.folder import (
     BEST,
     FeatureSettings,

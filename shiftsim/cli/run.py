@@ -14,9 +14,9 @@ from typer import Argument, Option
 
 import shiftsim
 from shiftsim import cli
-from shiftsim.cli import Json, Quiet, echo, plural, print_result, progress_bar, stdout_to_stderr
+from shiftsim.cli import Json, Quiet, echo, print_result, progress_bar, stdout_to_stderr
 from shiftsim.cli.view import print_worst
-from shiftsim.errors import ConfigError
+from shiftsim.errors import ConfigError, plural
 from shiftsim.files import DEFAULT_STORE, read_toml, store_path
 from shiftsim.planners.table import PLANNERS
 from shiftsim.runs.config import make_config

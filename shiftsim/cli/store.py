@@ -9,9 +9,9 @@ import typer
 from typer import Argument, Option
 
 from shiftsim import cli
-from shiftsim.cli import Json, Quiet, echo, new_app, plural, print_json, print_result, progress_bar
+from shiftsim.cli import Json, Quiet, echo, new_app, print_json, print_result, progress_bar
 from shiftsim.cli.view import Plain, Serif, Width
-from shiftsim.errors import one_of
+from shiftsim.errors import one_of, plural
 from shiftsim.files import store_path
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ import typer
 from typer import Argument, Exit, Option
 
 from shiftsim import cli
-from shiftsim.cli import Json, Quiet, echo, plural, print_json, progress_bar, show_in_browser
-from shiftsim.errors import ConfigError
+from shiftsim.cli import Json, Quiet, echo, print_json, progress_bar, show_in_browser
+from shiftsim.errors import ConfigError, plural
 from shiftsim.files import safe_join
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from shiftsim.errors import ConfigError, import_extra, one_of
+from shiftsim.errors import ConfigError, import_extra, one_of, plural
 from shiftsim.files import write_text
 from shiftsim.report import dataset, details, paper
 from shiftsim.report.figures import Figure
@@ -141,7 +141,7 @@ class Comparison:
 
     def __repr__(self) -> str:
         count = sum(len(table.rows) for table in self.tables)
-        return f"<Comparison of {count} pair{'' if count == 1 else 's'} of planners>"
+        return f"<Comparison of {plural(count, 'pair')} of planners>"
 
     def _repr_html_(self) -> str:
         return str(self.table("html"))

@@ -7,6 +7,7 @@ import numpy as np
 import pyarrow.compute as pc
 
 from shiftsim.edits.sampling import GRADES, graded
+from shiftsim.errors import plural
 from shiftsim.kernels import FloatArray
 from shiftsim.metrics import MULTIPLIERS, navsim_rollouts, open_loop
 from shiftsim.report import statistics
@@ -79,7 +80,7 @@ def _findings(clean: Sequence[Group], noisy: Sequence[Group], heads: Sequence[st
         first, traffic = clean[0], clean[0].run.manifest["determining"]["traffic"]
         interval, second = score_interval(first), clean[1] if len(clean) > 1 else None
         sure = f" (95 % interval {interval.low:.2f} to {interval.high:.2f})" if interval else ""
-        scenarios = f"{len(first.data.tokens)} scenarios in {traffic} traffic"
+        scenarios = f"{plural(len(first.data.tokens), 'scenario')} in {traffic} traffic"
         verb = "is first with" if second else "scores"
         lead = f"{first.planner} {verb} {_score(first):.2f}{sure} {heads[0]}, on {scenarios}"
         if second:

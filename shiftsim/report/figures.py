@@ -49,6 +49,7 @@ _MEAN = {"markeredgecolor": "black", "markeredgewidth": 0.9}
 _ADE = "average displacement error (ADE) [m]"
 _RHO = "ρ: Spearman's rank correlation, of scenarios by planner, and of the planners' means"
 _HEIGHT, _AROUND, _HIGHEST = 1.9, 0.6, 8.0  # inches, of a panel, words around it, all panels
+_LINE = 1.25 * SMALL / 72.0  # inches, of text
 _BESIDE = 0.5  # inches, beside a panel: the labels of its axis
 _LONGEST = 18  # palette.characters of a name at the end of a line
 _WIDE = 5.0  # inches; what is wider needs both columns of a paper, and has panels side by side
@@ -176,7 +177,10 @@ def open_against_closed(groups: Sequence[Group], *, form: FigureFormat = DEFAULT
         _scatter(axes, points, styles)
         _finish_axes(axes, _TRAFFIC.get(traffic, traffic))
         axes.set_xlabel(label, fontsize=SMALL)
-        axes.legend(fontsize=SMALL, framealpha=0.8)
+        below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.24), "borderaxespad": 0.0}
+        legend = axes.legend(frameon=False, fontsize=SMALL, **below)
+        across = axes.get_subplotspec().get_gridspec().ncols
+        figure.set_figheight(figure.get_figheight() + _LINE * len(legend.get_texts()) / across)
     labels = ", ".join(dict.fromkeys(group.data.label for group in shown))
     rules = dict.fromkeys(group.data.rules for group in shown)
     title = f"Open loop against closed loop on {labels}"
@@ -317,7 +321,7 @@ def _name_lines(ends: Mapping[Any, Sequence[_End]]) -> None:
 
     figure = next(iter(ends)).figure
     height = figure.get_figheight() / figure.axes[0].get_gridspec().nrows - _AROUND
-    step = 106.0 * 1.25 * SMALL / 72.0 / height  # of lines of text, in scores
+    step = 106.0 * _LINE / height  # of lines of text, in scores
     found = [end for each in ends.values() for end in each]
     most = max(map(len, ends.values()))
     if max(len(end.label) for end in found) > _LONGEST or most * step > 104.0:
@@ -424,7 +428,7 @@ def _add_words(figure: Any, title: str, notes: str, form: FigureFormat, legend: 
         for note in notes.splitlines():
             below += wrap(note, palette.characters(width))
     figure.supxlabel("\n".join(below), fontsize=SMALL, color=_GREY)
-    height = figure.get_figheight() + 1.25 * SMALL / 72.0 * len([*words, *below])
+    height = figure.get_figheight() + _LINE * len([*words, *below])
     if legend:
         legend.set_title("\n".join(words), {"size": TEXT})
         height += legend.get_window_extent(figure.canvas.get_renderer()).height / figure.dpi

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pyarrow.compute as pc
 
+from shiftsim.errors import plural
 from shiftsim.report import words
 from shiftsim.report.groups import COLUMNS, Group, planner_identities, read_groups, seed_deviation
 from shiftsim.report.tables import Cell, Number, Row, Table, text
@@ -76,7 +77,7 @@ def _describe(group: Group) -> str:
     data = group.data
     return " · ".join(
         [
-            f"split {data.label} ({len(data.tokens)} scenarios)",
+            f"split {data.label} ({plural(len(data.tokens), 'scenario')})",
             f"traffic {group.run.manifest['determining']['traffic']}",
             f"controller {data.controller}",
             f"thresholds {data.thresholds}",

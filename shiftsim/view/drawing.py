@@ -15,6 +15,7 @@ import numpy as np
 
 from shiftsim.data.readers.codes import KINDS
 from shiftsim.data.store.reading import open_store
+from shiftsim.errors import plural
 from shiftsim.geometry.boxes import boxes_to_corners, to_frame, turned
 from shiftsim.kernels import FloatArray
 from shiftsim.report.palette import (
@@ -310,7 +311,8 @@ def _words(inspection: "TracksReader", egos: Egos) -> list[str]:
     if (step := _step(table)) > 1:
         words[0] += f", of their {len(table.xy)} rows one in {step} drawn"
     if egos:
-        words.append(f"{sum(map(len, egos.values()))} scenarios, {len(egos)} egos")
+        count = sum(map(len, egos.values()))
+        words.append(f"{plural(count, 'scenario')}, {plural(len(egos), 'ego')}")
     return words + [found.what for found in (*diagnostics.errors, *diagnostics.warnings)]
 
 

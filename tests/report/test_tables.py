@@ -639,6 +639,8 @@ def test_scenarios_of_different_durations_never_share_a_mean(tmp_path):
 def test_short_scenarios_alone_are_labelled(tmp_path):
     run = write_run(tmp_path / "a", durations=["8 s"] * 4)
     assert "split made-up, 8 s (4 scenarios)" in score_table([run])
+    run = write_run(tmp_path / "b", durations=["8 s"], tokens=("a",))
+    assert "(1 scenario)" in score_table([run])
 
 
 def test_a_rollout_of_unknown_duration_withholds_every_class(tmp_path):
