@@ -171,9 +171,15 @@ class RunPlanner:
             return load_planner(self.source, self.arguments)
         if inspect.isclass(self.source):
             return cast(Planner, self.source(**self.arguments))
-        # a planner that is isolated has its copies elsewhere
-        is_isolated = hasattr(self.source, "identify")
-        return cast(Planner, self.source if is_isolated else copy.deepcopy(self.source))
+        if isinstance(self.source, BatchPlanner):
+            return self.source.fork()
+        if hasattr(self.source, "identify"):  # it is isolated, and has its copies elsewhere
+            return cast(Planner, self.source)
+        try:
+            return cast(Planner, copy.deepcopy(self.source))
+        except _NO_PICKLE as error:
+            what = f"planner {self.name!r} cannot be copied, as every scenario needs it: {error}"
+            raise ConfigError(what, hint="give its class, or package.module:Class") from error
 
     @property
     def on_gpu(self) -> bool:
@@ -260,16 +266,23 @@ def _object_fingerprint(source: object, arguments: Mapping[str, Any]) -> dict[st
         digest.update(inspect.getsource(kind).encode())
     except (OSError, TypeError):
         digest.update(repr(sorted(vars(kind))).encode())
-    if source is not kind:
-        try:
-            digest.update(pickle.dumps(getattr(source, "__dict__", None)))
-        except _NO_PICKLE as error:  # then its state merely has no digest
-            digest.update(type(error).__name__.encode())
+    state = "" if source is kind else state_digest(getattr(source, "__dict__", None))
+    digest.update(state.encode())
+    is_seen = source is kind or (state and getattr(source, "is_seen", True))
     return {
         "planner": f"{kind.__module__}:{kind.__qualname__}",
         "arguments": dict(sorted(arguments.items())),
         "source": digest.hexdigest(),
+        **({} if is_seen else {"unseen": True}),
     }
+
+
+def state_digest(value: object) -> str:
+    """SHA-256 of a value; empty where it cannot be pickled, so that nobody can compare it."""
+    try:
+        return hashlib.sha256(pickle.dumps(value)).hexdigest()
+    except _NO_PICKLE:
+        return ""
 
 
 def _hash_file(path: Path, spec: str, argument: str) -> str:

@@ -26,6 +26,7 @@ from shiftsim.env.terms import Terms, compute_reward_terms, make_state
 from shiftsim.errors import ConfigError, MissingExtraError, ShiftsimError, one_of, readable
 from shiftsim.files import expand, make_table, read_toml
 from shiftsim.planners.learned.checkpoint import prepare_inference, require_torch
+from shiftsim.planners.registry import state_digest
 from shiftsim.sim.loop import Rollout
 from shiftsim.sim.planner import Observation, SceneInfo
 from shiftsim.world.state import Command, Trajectory
@@ -78,9 +79,12 @@ class PolicyPlanner:
         space = getattr(policy, "observation_space", None)
         self._parts = tuple(space) if isinstance(space, spaces.Dict) else ()
         self.sees_recording = CRITIC in self._parts
-        self.source = ""  # in the fingerprint: of a function only the name is pickled
+        self.source, self.uses = "", ""  # in the fingerprint: of a function the name is pickled
         with suppress(OSError, TypeError):  # of what is no function, or of a console
             self.source = hashlib.sha256(inspect.getsource(policy).encode()).hexdigest()
+            names = inspect.getclosurevars(policy).globals
+            self.uses = state_digest({n: v for n, v in names.items() if not inspect.ismodule(v)})
+        self.is_seen = bool(self.uses) or not inspect.isroutine(policy)
 
     def reset(self, scene: SceneInfo) -> None:
         """Forget the scenario before."""
@@ -144,13 +148,14 @@ def policy_planner(
         policy = inner  # the network of a model, without what trained it
     seen, acts = (getattr(policy, f"{what}_space", None) for what in ("observation", "action"))
     if isinstance(observation, str):
-        known = {name: make().space for name, make in OBSERVATIONS.items()}
-        observation = observation or (_fitting(seen, known) if seen is not None else "vector")
-        observation = OBSERVATIONS[one_of("observation", observation, OBSERVATIONS)]()
-    if not action and acts is not None:
-        known = {name: spaces.Box(-high_of(name), high_of(name)) for name in ACTIONS}
-        action = _fitting(acts, known)
-    return PolicyPlanner(policy, observation, action or "command", name)
+        names = [one_of("observation", observation, OBSERVATIONS)] if observation else OBSERVATIONS
+        known = {name: OBSERVATIONS[name]().space for name in names}
+        observation = (_fitting(seen, known) if seen is not None else observation) or "vector"
+        observation = OBSERVATIONS[observation]()
+    kinds = [one_of("action", action, ACTIONS)] if action else ACTIONS
+    known = {name: spaces.Box(-high_of(name), high_of(name)) for name in kinds}
+    action = (_fitting(acts, known) if acts is not None else action) or "command"
+    return PolicyPlanner(policy, observation, action, name)
 
 
 def _fitting(space: Any, known: Mapping[str, Any]) -> str:
@@ -160,7 +165,8 @@ def _fitting(space: Any, known: Mapping[str, Any]) -> str:
         if space == other or (are_parts and space.spaces.items() <= other.spaces.items()):
             return name
     raise ConfigError(
-        f"the policy was made for {space}, which is neither {' nor '.join(known)}",
+        f"the policy was made for {space}, which is "
+        f"{'neither' if len(known) > 1 else 'not'} {' nor '.join(known)}",
         hint="where a wrapper made it so, give a function that does the same to policy_planner",
     )
 

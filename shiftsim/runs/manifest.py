@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 from shiftsim._version import __version__
-from shiftsim.errors import ConfigError, DataError
+from shiftsim.errors import ConfigError, DataError, plural
 from shiftsim.files import PACKAGE
 from shiftsim.runs.config import RunConfig
 from shiftsim.runs.journal import has_entries
@@ -144,17 +144,26 @@ def check_space(folder: Path, num_tasks: int, *, with_rollouts: bool) -> None:
     place = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     needed = num_tasks * (_OF_TASK + _OF_ROLLOUT * with_rollouts)
     if needed > (free := shutil.disk_usage(place).free):
-        what = f"{num_tasks} tasks need about {needed / 1e9:.1f} GB, {str(place)!r} has"
+        what = f"{plural(num_tasks, 'task')} need about {needed / 1e6:,.1f} MB, {str(place)!r} has"
         hint = "choose another --out" + ", or --save-rollouts failed" * with_rollouts
-        raise ConfigError(f"{what} {free / 1e9:.1f} GB free", hint)
+        raise DataError(f"{what} {free / 1e6:,.1f} MB free", hint)
 
 
 def difference(manifest: dict[str, Any], fingerprint: dict[str, Any], shard: str = "") -> str:
     """The settings that differ from those of a manifest, in words; empty when none does."""
     before = {**manifest.get("determining", {}), "shard": manifest.get("shard", "")}
     after = {**fingerprint, "shard": shard}
-    names = [n for n in sorted({*before, *after}) if before.get(n) != after.get(n)]
-    return f"{', '.join(_NAMES.get(name, name) for name in names)} differ" if names else ""
+    words = {name: _NAMES.get(name, name) for name in _differing(before, after)}
+    planners = [one.get("planners", {}) for one in (before, after)]
+    for name in _differing(*planners) if {*planners[0]} == {*planners[1]} else ():
+        parts = _differing(*(one[name] for one in planners))
+        words["planners"] += f" ({name}: {', '.join(parts)})"
+    return f"{', '.join(words.values())} differ" if words else ""
+
+
+def _differing(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
+    """The keys under which two tables hold different values."""
+    return [key for key in sorted({*one, *other}) if one.get(key) != other.get(key)]
 
 
 def check_resumable(folder: Path, fingerprint: dict[str, Any], *, shard: str = "") -> None:

@@ -110,6 +110,11 @@ def prepare(
     elif before == "unfinished" and not config.resumes:
         what = f"{str(folder)!r} holds an unfinished run with these settings"
         raise ConfigError(what, hint="--resume finishes it; remove the folder to begin anew")
+    unseen = [entry.name for entry in entries if entry.fingerprint.get("unseen")]
+    if config.resumes and before != "new" and unseen:
+        what = f"planner {unseen[0]!r} holds what cannot be pickled, so nobody can tell whether"
+        hint = "begin anew in another --out; planners given as package.module:Class can resume"
+        raise ConfigError(f"{what} it is the one of {str(folder)!r}", hint)
     runs = [
         (entry.name, model.name, seed)
         for entry in entries

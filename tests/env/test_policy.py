@@ -129,6 +129,23 @@ def test_observations_of_ones_own_know_no_recording(toy, tmp_path):
         shiftsim.simulate(scenario, shiftsim.policy_planner(len, observation=Recorded()))
 
 
+GAIN = 0.1
+
+
+def steady(seen):
+    return [GAIN, 0.0]
+
+
+def test_what_a_function_refers_to_is_a_part_of_it(monkeypatch):
+    before = run_planner(shiftsim.policy_planner(steady), {}).fingerprint
+    monkeypatch.setitem(steady.__globals__, "GAIN", 0.2)
+    after = run_planner(shiftsim.policy_planner(steady), {}).fingerprint
+    monkeypatch.setitem(steady.__globals__, "GAIN", lambda: 0.2)
+    hidden = run_planner(shiftsim.policy_planner(steady), {}).fingerprint
+    assert before["source"] != after["source"]
+    assert [one.get("unseen", False) for one in (before, after, hidden)] == [False, False, True]
+
+
 @pytest.mark.parametrize(
     ("policy", "settings", "message"),
     [
@@ -139,6 +156,11 @@ def test_observations_of_ones_own_know_no_recording(toy, tmp_path):
             Weaving(space=gymnasium.spaces.Box(-1, 1, (7,))),
             {},
             r"Box\(.*7.*neither none nor raster",
+        ),
+        (
+            Weaving(space=gymnasium.spaces.Box(-1, 1, (7,))),
+            {"observation": "raster"},
+            r"Box\(.*7.*not raster",
         ),
     ],
 )

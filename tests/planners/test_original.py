@@ -5,9 +5,11 @@ import threading
 import numpy as np
 import pytest
 
+from shiftsim.errors import ConfigError
 from shiftsim.kernels import readonly
 from shiftsim.planners.basic import ConstantVelocity
 from shiftsim.planners.prototype import PlannerPrototype
+from shiftsim.planners.registry import run_planner
 
 
 class Holder(ConstantVelocity):
@@ -86,6 +88,14 @@ def test_a_batch_planner_is_forked():
     copied = original.copy()
     assert original.planner.forks == 1
     assert copied.forks == 0
+
+
+def test_an_instance_is_forked_or_copied_or_refused():
+    planner = Team()
+    assert run_planner(planner, {}).prototype.copy() is not planner
+    assert planner.forks == 1
+    with pytest.raises(ConfigError, match="cannot be copied"):
+        run_planner(Locked(), {})
 
 
 def test_a_copy_is_closed_when_it_has_driven():

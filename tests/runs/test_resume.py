@@ -16,6 +16,7 @@ from shiftsim.runs.config import make_config
 from shiftsim.runs.execute import execute
 from shiftsim.runs.folder import RunWriter
 from shiftsim.runs.journal import Journal
+from shiftsim.runs.manifest import difference
 from shiftsim.runs.prepare import prepare
 from shiftsim.runs.results import JOURNAL
 from shiftsim.runs.rollouts import Task
@@ -135,6 +136,13 @@ def test_resuming_with_other_settings_names_what_differs(stopped, toy, change, n
         prepare(settings(toy, stopped, resume=True, **(NOISY | change)))
 
 
+def test_what_differs_of_a_planner_is_named():
+    idm = {"planner": "idm", "arguments": {}}
+    before = {"determining": {"planners": {"a": idm, "b": idm}, "noise": 1}}
+    after = {"planners": {"a": idm, "b": idm | {"arguments": {"headway": 3.0}}}, "noise": 1}
+    assert difference(before, after) == "planners (b: arguments) differ"
+
+
 def test_another_version_of_the_code_is_not_mixed_in(stopped, toy, monkeypatch):
     monkeypatch.setattr("shiftsim.runs.prepare.code_digest", lambda: "another")
     with pytest.raises(ConfigError, match="code differ"):
@@ -149,6 +157,15 @@ def test_resuming_by_name_with_other_settings_names_what_differs(toy, tmp_path, 
         prepare(settings(toy, "", resume=True, thresholds="deepplan", **NOISY))
     assert prepare(settings(toy, "", resume=True, **NOISY)).before == "unfinished"
     assert prepare(settings(toy, "", thresholds="deepplan", **NOISY)).before == "new"
+
+
+def test_a_planner_that_nobody_can_compare_does_not_resume(toy, tmp_path):
+    how = {"store": str(toy), "out": str(tmp_path / "run"), "workers": 1, "noise": "ou-high"}
+    policies = [shiftsim.policy_planner(lambda seen, gain=gain: [gain, 0.0]) for gain in (0.1, 0.2)]
+    with pytest.raises(Stop):
+        shiftsim.run({"mine": policies[0]}, on_progress=stop_after(1), **how)
+    with pytest.raises(ConfigError, match="'mine' holds what cannot be pickled"):
+        shiftsim.run({"mine": policies[1]}, resume=True, **how)
 
 
 def test_resuming_where_nothing_is_yet_begins_anew(toy, tmp_path, undisturbed):
@@ -303,7 +320,7 @@ def test_a_worker_that_died_is_told_from_one_that_was_late():
 @pytest.mark.parametrize(
     ("kept", "free", "message"),
     [
-        ("all", 500e3, r"12 tasks need about 0\.0 GB, '.*' has 0\.0 GB free"),
+        ("all", 500e3, r"12 tasks need about 1\.0 MB, '.*' has 0\.5 MB free"),
         ("none", 50e3, "12 tasks need about"),
         ("none", 500e3, ""),
         ("all", 2e6, ""),
@@ -318,7 +335,7 @@ def test_a_run_that_the_disk_cannot_hold_is_refused(
     if not message:
         prepare(config)
         return
-    with pytest.raises(ConfigError, match=message) as caught:
+    with pytest.raises(DataError, match=message) as caught:
         prepare(config)
     assert ("--save-rollouts failed" in caught.value.hint) == (kept == "all")
     assert not (tmp_path / "not").exists()

@@ -58,6 +58,7 @@ def test_resuming_and_its_state_are_printed(call, tmp_path):
     code, out, _ = call(*words, "--resume")
     assert code == 0
     assert "is complete already" in out
+    assert f"what {tmp_path / 'run'} holds will be replaced" in call(*words)[1]
     code, _, err = call(*words, "--resume", "--thresholds", "deepplan")
     assert code == 1
     assert "thresholds differ" in err
