@@ -272,7 +272,8 @@ def _facts(run: Run) -> dict[str, str]:
     store = str(manifest["store"]).replace("\\", "/").rstrip("/").rpartition("/")[2]
     identities = planner_identities(run).items()
     weights = {
-        name: one.get("weights") or _short(one.get("checkpoint", "")) for name, one in identities
+        name: one.get("weights") or _short(one.get("checkpoint", "")) or _files(one)
+        for name, one in identities
     }
     return {
         "date": _date(run),
@@ -290,6 +291,13 @@ def _facts(run: Run) -> dict[str, str]:
         "shiftsim": _version(run),
         **{name: str(manifest.get("versions", {}).get(name, "")) for name in _PACKAGES},
     }
+
+
+def _files(identity: Mapping[str, Any]) -> str:
+    """The files that a planner is made of, with the beginnings of their hashes."""
+    given = identity["arguments"] | {"policy": str(identity["planner"]).partition(":")[2]}
+    files = identity.get("files", {}).items()
+    return ", ".join(f"{Path(given.get(name, name)).name} {_short(one)}" for name, one in files)
 
 
 def _date(run: Run) -> str:

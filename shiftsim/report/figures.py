@@ -104,7 +104,7 @@ class _End(NamedTuple):
 def figures(groups: Sequence[Group], *, form: FigureFormat = DEFAULT_FORM) -> list[Figure]:
     """All pictures that the groups allow; a MissingExtraError without matplotlib."""
     out: list[Figure] = []
-    styles = palette.planner_styles(dict.fromkeys(group.planner for group in groups))
+    styles = palette.planner_styles(group.planner for group in groups)
     names: list[str] = []
     for data, mine in by_set(groups):
         # sets of one name are numbered, as it becomes that of a file
@@ -162,7 +162,7 @@ def open_against_closed(groups: Sequence[Group], *, form: FigureFormat = DEFAULT
     if not asked:
         raise ConfigError("no open-loop scores", hint="shiftsim run --open-loop makes them")
     shown = [group for group in asked if group.noise == "none"] or asked
-    styles = palette.planner_styles(dict.fromkeys(group.planner for group in shown))
+    styles = palette.planner_styles(group.planner for group in shown)
     ade = next(name for name, (short, *_) in open_loop.METRICS.items() if short == "ADE")
     kinds = {"open-loop score × 100": (open_loop.TOTAL, 100.0), _ADE: (ade, 1.0)}
     rows = list(dict.fromkeys(group.traffic for group in shown))

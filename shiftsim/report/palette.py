@@ -23,10 +23,11 @@ from shiftsim.world.state import AgentKind
 COLUMN, PAGE = 3.5, 7.0  # inches, one column and both columns of a paper
 SMALL, TEXT = 7.0, 8.0  # points at that width; nothing is smaller
 _INCHES = {"in": 1.0, "": 1.0, "cm": 1 / 2.54, "mm": 1 / 25.4, "pt": 1 / 72.27}
-_SERIF = {"font.family": ["STIXGeneral", "DejaVu Serif"], "mathtext.fontset": "stix"}
+_SERIF = {"font.family": ["STIXGeneral", "DejaVu Serif"]}
 _DPI = 200
 _Call = ParamSpec("_Call")
 _Made = TypeVar("_Made")
+_LITERAL = {"text.parse_math": False}  # names may hold dollars
 _PLAIN = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 
 
@@ -60,7 +61,7 @@ def in_format(draw: Callable[_Call, _Made]) -> Callable[_Call, _Made]:
     def call(*values: _Call.args, **named: _Call.kwargs) -> _Made:
         matplotlib = _matplotlib()
         is_serif = getattr(named.get("form"), "serif", False)
-        with matplotlib.rc_context(_SERIF if is_serif else {}):
+        with matplotlib.rc_context(_LITERAL | (_SERIF if is_serif else {})):
             return draw(*values, **named)
 
     return call
@@ -158,10 +159,13 @@ def dashes(noise: str) -> Literal["-", "--"]:
 
 
 def planner_styles(planners: Iterable[str]) -> dict[str, Style]:
-    """A style per planner, its own (also with a remark, as in `idm (reactive)`) or the next one."""
+    """A style per planner, its own (also with a remark, as in `idm (reactive)`) or the next one.
+
+    Others have theirs in the order of their names, whatever the order in which they are drawn.
+    """
     out: dict[str, Style] = {}
-    others = cycle(_OTHERS)
-    for name in dict.fromkeys(planners):
+    planners, others = list(planners), cycle(_OTHERS)
+    for name in sorted(set(planners)):
         style = _KNOWN.get(name.partition(" (")[0])
         out[name] = next(others) if style is None or style in out.values() else style
-    return out
+    return {name: out[name] for name in dict.fromkeys(planners)}

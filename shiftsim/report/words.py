@@ -36,6 +36,8 @@ _HOW_FAR = {  # what the first value of a violation measures
 }
 UNITS = {  # nuPlan's names, shortened
     "meters": "m",
+    "meter": "m",
+    "radian": "rad",
     "seconds": "s",
     "meters_per_second": "m/s",
     "meters_per_second_squared": "m/s²",

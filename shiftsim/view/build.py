@@ -264,7 +264,7 @@ def list_page(
     looks = {
         "multipliers": [SHORT_NAMES[name] for name in MULTIPLIERS],
         "noises": drift_order(row["noise"] for row in rows),
-        "styles": planner_styles(sorted({row["planner"] for row in rows})),
+        "styles": planner_styles(row["planner"] for row in rows),
         "scenes": list(scenes),
     }
     numbered = [{**row, "scene": scenes[row.get("scene")]} for row in rows]

@@ -29,7 +29,7 @@ from shiftsim.report.palette import (
     new_figure,
     save_picture,
 )
-from shiftsim.report.words import violation_words, violations, worst_moment
+from shiftsim.report.words import violation_words, violations, worst_moment, worst_violation
 from shiftsim.sim.log import as_recorded
 from shiftsim.view.scene import ShownRollout, box_around, indices_near, map_lines
 from shiftsim.world.map import VectorMap
@@ -98,7 +98,7 @@ def draw_paths(
         look = {"linewidth": 1.8, "linestyle": dashes(item.noise), "markevery": every}
         look |= style.marks(item.noise, 5.5)
         path = view.place(ego[:upto, :2])
-        lines += axes.plot(*path.T, zorder=6, label=caption(item, shown), **look)
+        lines += axes.plot(*path.T, zorder=6, label=caption(item), **look)
     return lines
 
 
@@ -182,17 +182,18 @@ def draw_scale(axes: Any, view: View) -> None:
     axes.annotate(f"{length} m", **at, fontsize=SMALL, bbox=box, zorder=9, **place)
 
 
-def caption(item: ShownRollout, shown: Sequence[ShownRollout]) -> str:
-    """Planner, noise, seed of several, score, and its cause, as "… at-fault collision at 4.3 s"."""
-    name = item.planner if item.noise == "none" else f"{item.planner}, {item.noise}"
-    alike = [one for one in shown if (one.planner, one.noise) == (item.planner, item.noise)]
-    name += f", seed {item.seed}" if len({one.seed for one in alike}) > 1 else ""
+def caption(item: ShownRollout) -> str:
+    """Planner, noise, seed, score, and its cause, as "… at-fault collision at 4.3 s"."""
+    name = item.planner
+    name += "" if item.noise == "none" else f", {item.noise}, seed {item.seed}"
     score = "" if item.cls is None else f": score {100.0 * item.cls:.0f}"
-    worst = worst_moment(violations(item.metrics))
+    found = violations(item.metrics)
+    worst = worst_moment(found) or worst_violation(found)
     if worst is None:
         return f"{name}{score}"
     what, comma, more = violation_words(worst.row, item.log.tracks).partition(",")
-    return f"{name}{score}; {what} ({worst.short}){comma}{more} at {worst.time:.1f} s"
+    time = "" if worst.time is None else f" at {worst.time:.1f} s"
+    return f"{name}{score}; {what} ({worst.short}){comma}{more}{time}"
 
 
 class Mark(NamedTuple):

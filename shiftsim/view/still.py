@@ -116,7 +116,7 @@ def _grid(
     rows = [_sample_at(scenario, shown, time) for time in at]
     styles, width = _styles(shown), form.width or palette.PAGE
     around, length = View(np.zeros(3), np.array([*-_NEAR, *_NEAR])), characters(width)
-    captions = [_wrapped(drawing.caption(item, shown), length) for item in shown]
+    captions = [_wrapped(drawing.caption(item), length) for item in shown]
     below = "\n".join(_wrapped(words, length) for words in (_KEY, form.note) if words)
     above = _wrapped(_words(scenario), characters(width, TEXT))
     above, below = ("", "") if form.plain else (above, below)
@@ -279,8 +279,7 @@ def _wrapped(text: str, length: int, **settings: Any) -> str:
 
 
 def _words(scenario: Scenario) -> str:
-    words = (scenario.token, scenario.scenario_type, scenario.city)
-    return "  ".join(words).replace("$", r"\$")
+    return "  ".join((scenario.token, scenario.scenario_type, scenario.city))
 
 
 def _heading(axes: Any, scenario: Scenario, time: float, form: FigureFormat) -> None:

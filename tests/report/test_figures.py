@@ -244,3 +244,12 @@ def test_names_stand_at_the_ends_of_lines_where_they_find_room(tmp_path):
         named = {text.get_text() for axes in figure.axes for text in axes.texts}
         assert (named == {*names}) is is_direct
         assert ({*names} <= in_legend) is not is_direct
+
+
+def test_names_with_dollars_are_no_mathematics(tmp_path):
+    from matplotlib.text import Text
+
+    for figure in drawn(read_groups([write_run(tmp_path / "a", planners=("a$x$b",))])).values():
+        assert not any(
+            text.get_parse_math() for text in figure.drawn.findobj(Text) if text.get_text()
+        )

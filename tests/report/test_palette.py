@@ -60,6 +60,7 @@ def test_markers_are_all_different():
 def test_own_planners_have_styles_of_their_own():
     found = planner_styles(["carl", "mine:A", "mine:B", "pluto"])
     assert len(set(found.values())) == 4
+    assert found == planner_styles(["mine:B", "pluto", "mine:A", "carl"])  # in any figure
 
 
 def hue(colour):

@@ -518,6 +518,10 @@ def test_the_runs_table_says_when_from_what_and_with_which_versions(tmp_path):
     assert rows["weights"] == "carl: own weights; idm: own weights"
     assert (rows["shiftsim"], rows["numpy"], rows["numba"]) == ("9.8.7 (abc)", "1.2", "0.3")
     assert rows["rollouts finished"] == "8 of 8"
+    files = {"planner": "policy:nets/a.zip", "arguments": {}, "files": {"policy": "2e" * 32}}
+    run = write_run(tmp_path / "b", planners=("ours",), fingerprint=files)
+    rows = {row[0]: row[1] for row in runs_table([run]).rows}
+    assert rows["weights"] == "ours: a.zip 2e2e2e2e2e2e"
 
 
 def test_metrics_stand_in_one_order_with_their_words(tmp_path):

@@ -61,7 +61,7 @@ def test_a_still_says_planner_noise_score_and_metric_in_words(scenario, shown):
     words = " ".join(text for text, _ in written(picture(scenario, shown, at=[1.0])))
     plain = " ".join(words.split())
     assert "idm: score 87" in plain
-    assert said(scenario, f"idm, ou-high: score 0; {IN_FULL}") in plain
+    assert said(scenario, f"idm, ou-high, seed 0: score 0; {IN_FULL}") in plain
     assert plain.count(said(scenario, SAID)) == 3
 
 
