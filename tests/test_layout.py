@@ -40,7 +40,7 @@ BUDGETS = {
     "shiftsim/cli": 2_659,  # goal 2_300
     "benchmarks": 755,  # goal 700; the tracks finding and sensor-drift bring 40
 }
-MOST_LINES, MOST_MODULES, MOST_KERNELS = 63_600, 300, 220  # the goal is 52_000 lines
+MOST_LINES, MOST_MODULES, MOST_KERNELS = 63_663, 300, 220  # the goal is 52_000 lines
 LONGEST_MODULE, CROWDED = 450, 16
 # modules of under 80 lines that one other module imports, and why they stand alone
 SMALL_AND_ALONE = {

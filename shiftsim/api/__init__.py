@@ -6,6 +6,7 @@ what objects answer when they are asked for something by another name.
 """
 
 import html
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,7 @@ import shiftsim.edits  # noqa: F401  # attaches Scenario.edited
 from shiftsim.api.stores import demo_store as demo_store
 from shiftsim.data import open_store as open_store
 from shiftsim.data.store.reading import ScenarioStore
-from shiftsim.errors import ConfigError, MissingExtraError, missing_attribute
+from shiftsim.errors import ConfigError, MissingExtraError, missing_attribute, plural
 from shiftsim.files import DEFAULT_STORE, store_path
 from shiftsim.planners import registry
 from shiftsim.sim import loop
@@ -60,7 +61,7 @@ def run(
             `limit`, `traffic`, `thresholds`, `workers`, `out`, …
 
     Returns:
-        The finished run; print `.table()`.
+        The finished run; print `.table()`. A warning says what failed.
 
     Raises:
         ShiftsimError: A setting is wrong, or something it names is missing.
@@ -71,9 +72,11 @@ def run(
         run = shiftsim.run(planners, noise="ou-high", split="demo-mini", limit=2)
         ```
     """
+    from shiftsim.report.scores import failures
     from shiftsim.runs.config import make_config
     from shiftsim.runs.execute import execute
     from shiftsim.runs.prepare import prepare
+    from shiftsim.runs.tables import task_of
 
     several = planner if isinstance(planner, (list, tuple)) else [planner]
     named = planner if isinstance(planner, Mapping) else {}
@@ -89,7 +92,12 @@ def run(
         **settings,
     }
     plan = prepare(make_config(values), planners=planners, noises=models)
-    return _with_methods(execute(plan, **{"on_progress": on_progress} if on_progress else {}))
+    done = execute(plan, **{"on_progress": on_progress} if on_progress else {})
+    if lost := [row for row in failures(done) if row["error"]]:
+        failed = f"{len(lost)} of {plural(len(done.tasks), 'task')} failed"
+        words = task_of(lost[0]).words
+        warnings.warn(f"{failed}, the first: {words}: {lost[0]['error']}", stacklevel=2)
+    return _with_methods(done)
 
 
 def demo(store: str | Path = DEFAULT_STORE, **settings: Any) -> "Run":

@@ -31,7 +31,7 @@ def verify(
 ) -> int:
     """Compare your nuPlan results with what shiftsim computes.
 
-    Exit codes: 0 all covered cases equal, 1 a mismatch, 2 nothing covered or not recognised,
+    Exit codes: 0 all covered cases equal, 1 a mismatch or a wrong setting, 2 nothing covered,
     3 not all covered (with --require-all).
     """
     from shiftsim.verify.experiment import verify_experiment

@@ -157,6 +157,7 @@ def explain(
     from shiftsim.benchmarks.bench import open_runs
     from shiftsim.report.explain import explain_lines, explain_tasks
     from shiftsim.report.scores import worst_rollouts
+    from shiftsim.report.words import task_of
 
     runs = open_runs([source]).runs
     if token is None and as_json:
@@ -175,7 +176,8 @@ def explain(
             echo(f"{name}\n")
         for task in tasks:
             echo("\n".join([*explain_lines(task), ""]))
-    if any(run.rollout_places.values() for run in runs):
+    stored = {key for run in runs for key, place in run.rollout_places.items() if place is not None}
+    if any(task_of(task) in stored for tasks in chosen.values() for task in tasks):
         echo(f"see it: shiftsim view {source} {token}")
 
 

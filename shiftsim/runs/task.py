@@ -117,7 +117,10 @@ class TaskRunner:
         share = (perf_counter() - began) / max(1, len(rollouts))
         for (task, rollout), log in zip(rollouts.items(), logs, strict=True):
             seconds[task]["simulate_seconds"] += share
-            found[task] = attempt(task, partial(self._score, task, rollout, log, seconds[task]))
+            result = attempt(task, partial(self._score, task, rollout, log, seconds[task]))
+            if isinstance(log, BaseException) and not isinstance(log, ShiftsimError):
+                result = replace(result, error=f"{result.error}, at iteration {rollout.iteration}")
+            found[task] = result
         return [
             replace(result, seconds=seconds[task])
             for task, result in found.items()

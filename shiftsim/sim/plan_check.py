@@ -137,7 +137,8 @@ def _explain(code: int, plan: Trajectory, now_us: int, next_us: int) -> Fault:
             "times must increase strictly",
         )
     if code == _TOO_LARGE:
-        row, column = np.argwhere(~(np.abs(plan.states) <= LARGEST))[0]
+        # poses first: from_poses makes velocities of them
+        column, row = np.argwhere(~(np.abs(plan.states.T) <= LARGEST))[0]
         return Fault(
             "finite",
             f"{STATE_COLUMNS[column]} of state {row} is {plan.states[row, column]}",

@@ -136,6 +136,7 @@ def test_failed_tasks_withhold_the_score_and_are_explained(place):
     assert "partial (3/4)" in partial.stdout
     explained = call(place, "explain", "runs/bad", "0001")
     assert "ValueError: lost the way" in explained.stdout
+    assert "see it" not in explained.stdout
     assert "Traceback" in explained.stdout
 
 

@@ -58,6 +58,13 @@ def test_a_value_that_is_not_finite_is_named_with_its_column_and_row():
     assert "heading of state 1 is nan" in find_fault(plan, NOW, NEXT).message
 
 
+def test_a_pose_that_is_not_finite_is_named_and_not_the_velocity_made_of_it():
+    poses = np.zeros((10, 3))
+    poses[3, 1] = np.nan
+    plan = Trajectory.from_poses(0.1 * np.arange(10), poses)
+    assert "y of state 3 is nan" in find_fault(plan, NOW, NEXT).message
+
+
 def test_a_plan_is_short_that_ends_before_what_the_tracker_reads():
     assert is_short(trajectory([0, 500_000, 999_999]))
     assert not is_short(trajectory([0, 500_000, 1_000_000]))
