@@ -41,7 +41,10 @@ from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AX, AY, PACIFICA, Tracks, Trajectory, speeds
 
 _PARTS = ("metrics", "aggregator_metric", "simulation_log")  # folders that nuPlan makes
-_CHALLENGES = {"closed_loop_nonreactive_agents": "NR", "closed_loop_reactive_agents": "R"}
+_CHALLENGES = {
+    **{"closed_loop_nonreactive_agents": "NR", "closed_loop_reactive_agents": "R"},
+    "closed_loop_elsewhere_agents": "R",  # they were not simulated here, and not replayed
+}
 _TWINS = {"SimplePlanner": "simple", "IDMPlanner": "idm", "LogFuturePlanner": "log-future"}
 _LABELS = {  # columns that name things, or say what only their own run can know
     *("metric_computator", "metric_statistics_name", "time_series_selected_frames", "log_name"),
@@ -127,6 +130,9 @@ def _compare_results(path: Path, challenge: str, find: FindScenario, report: Rep
                 source = "exported"
                 if not recorded.is_exported:
                     source = rollouts.origin(challenge, recorded.ego, recorded.plans)
+                elif scenario:  # it may have been driven in part
+                    rows = scenario.iteration_rows[: recorded.ego.num_rows + 1]
+                    scenario = replace(scenario, iteration_rows=rows)
                 report.remarks.append(f"{run}: {rollouts.ORIGINS[source]}")
             if recorded and recorded.dropped_us:
                 report.remarks.append(f"{run}: the last sample repeats a time (dt = 0): dropped")
@@ -328,9 +334,8 @@ def _compare_runner(run: Run, row: Source, recorded: Recorded | None) -> bool:
         reason = str(row["error_message"][0]).strip().rpartition("\n")[2]
         row.report.skip(f"{where}: it failed in nuPlan: {reason}")
         return False
-    row.match(
-        where, {"succeeded": [True], "duration": row["end_time"] - row["start_time"]}, TOLERANCE
-    )
+    begin, end = (row[name].astype(np.float64) for name in ("start_time", "end_time"))
+    row.match(where, {"succeeded": [True], "duration": end - begin}, TOLERANCE)
     if recorded and recorded.seconds:
         runtimes = {f"compute_trajectory_runtimes_{n}": [f(recorded.seconds)] for n, f in _RUNTIMES}
         row.match(where, runtimes, TOLERANCE)

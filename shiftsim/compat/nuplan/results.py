@@ -39,7 +39,6 @@ from shiftsim.runs.workers import map_unordered
 
 Row: TypeAlias = dict[str, Any]
 
-CHALLENGES = ("closed_loop_nonreactive_agents", "closed_loop_reactive_agents")
 _DATA = Path("~/nuplan/dataset")  # where the devkit looks by default
 _RECORDINGS = ("*.db", "*/*.db", "nuplan-v1.1/splits/*/*.db")
 _METRICS, _MEANS, _LOGS = "metrics", "aggregator_metric", "simulation_log"
@@ -61,8 +60,8 @@ def export_results(
     out: str | Path,
     *,
     store: str | None = None,
-    logs: str | Path = _DATA,
-    maps: str | Path = _DATA / "maps",
+    logs: str | Path | None = None,
+    maps: str | Path | None = None,
     simulation_logs: bool = True,
     workers: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -75,9 +74,18 @@ def export_results(
     if len(set(map(plain_name, planners))) < len(planners):
         what = f"two of the planners {', '.join(planners)} would have the same folder"
         raise ConfigError(what, hint="run them with other names")
+    if undefined := run.manifest.get("elsewhere", {}).get("undefined"):
+        what = f"run {run.path.name!r} was scored without the others: {', '.join(undefined)} and"
+        hint = "score it again with --tracks FILE or --tracks recorded: nuPlan has no undefined"
+        raise DataError(f"{what} the score are undefined", hint)
+    for name, place in {"logs": logs, "maps": maps}.items():
+        if simulation_logs and place is not None and not Path(place).expanduser().is_dir():
+            hint = f"name the folder of the {name} that nuBoard opens, or leave --{name} out"
+            raise ConfigError(f"--{name}: no folder {str(place)!r}", hint)
     opened, found = open_run_store(run, store), dict[Task, Row]()
     folders = {task_of(row): _folder(out, run, task_of(row)) for row in rows}
-    places = (Path(place).expanduser().resolve() for place in (logs, maps))
+    given = (Path(logs or _DATA), Path(maps or _DATA / "maps"))
+    places = (place.expanduser().resolve() for place in given)
     written_to = folders if simulation_logs else {}
     exporter = partial(_exporter, run.path.resolve(), opened, written_to, *places)
     with closing(map_unordered(exporter, tasks, workers=workers, alone=1)) as outcomes:
@@ -103,9 +111,11 @@ def export_results(
 
 def _folder(out: Path, run: Run, task: Task) -> Path:
     """The folder of a noise and seed, below that of the challenge, whose name others read."""
-    is_replayed = run.manifest["determining"]["traffic"] == "nonreactive"
+    traffic = run.manifest["determining"]["traffic"]
+    if traffic not in ("nonreactive", "reactive"):  # those of a model of traffic react
+        traffic = "elsewhere" if "elsewhere" in run.manifest else "reactive"
     name = "no-noise" if task.noise == "none" else f"{task.noise}-seed-{task.seed}"
-    return out / CHALLENGES[not is_replayed] / plain_name(name)
+    return out / f"closed_loop_{traffic}_agents" / plain_name(name)
 
 
 def _exporter(
@@ -129,6 +139,7 @@ def _exporter(
         key = {"log_name": name, "scenario_name": task.token, "scenario_type": kind}
         key |= {"planner_name": planner}
         seconds = {n: float(of(log.planning_seconds)) for n, of in _RUNTIMES.items()}
+        seconds = seconds if log.planning_seconds.any() else {}  # not known where all are 0
         rows = {
             metric: {
                 **key,

@@ -125,9 +125,10 @@ def write_simulation_log(
     """Write a rollout as a simulation log; nuPlan's tools look in `database` and `maps`."""
     was_enabled = gc.isenabled()
     gc.disable()  # among so many objects that takes as long as all the rest
+    seconds = log.planning_seconds.tolist()
     try:
         planner = _DEVKIT.SimplePlanner(
-            _compute_trajectory_runtimes=log.planning_seconds.tolist(),
+            _compute_trajectory_runtimes=seconds if any(seconds) else [],  # 0: not known
             name=partial(str, task.planner),
             shiftsim={"version": __version__, **task._asdict()},
         )

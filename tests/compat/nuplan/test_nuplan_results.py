@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import msgpack
 import numpy as np
 import places
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from commands import call
@@ -247,3 +248,49 @@ def test_the_command_writes_tables_alone_and_says_where(made, tmp_path):
     again = call(tmp_path, "export", "results", str(made.run.path), "--out", "x")
     assert again.returncode == 1
     assert again.stderr.splitlines()[0] == "error: 'x' is there and not empty"
+
+
+@pytest.mark.parametrize("tracks", ["recorded", "own", "none"])
+def test_what_was_driven_elsewhere_is_exported_as_far_as_it_is_known(made, tmp_path, tracks):
+    task, name = Task("idm", "none", 0, LOGGED), "poses.parquet"
+    place = made.run.rollout_places[task]
+    table = pq.read_table(place.file).slice(place.row, 60)
+    kept = ["token", "planner", "time_us", "x_m", "y_m", "heading_rad"]
+    boxes = {"track_tokens": [["one"]] * 60, "track_kinds": [[0]] * 60}
+    near = {"x_m": 9.0, "y_m": 0.0, "heading_rad": 0.0, "vx_mps": 0.0, "vy_mps": 0.0}
+    boxes |= {
+        f"track_{n}": [[v]] * 60 for n, v in (near | {"length_m": 4.0, "width_m": 2.0}).items()
+    }
+    boxes["track_x_m"], boxes["track_y_m"] = (
+        [[value + 9.0] for value in table[axis].to_pylist()] for axis in ("x_m", "y_m")
+    )
+    table = table.select(kept)
+    for column, values in boxes.items() if tracks == "own" else ():
+        table = table.append_column(column, pa.array(values))
+    pq.write_table(table, tmp_path / name)
+    settings = {"store": str(made.folder / "store"), "workers": 1, "out": str(tmp_path / "run")}
+    settings |= {"tracks": "recorded"} if tracks == "recorded" else {}
+    run = shiftsim.score_files(tmp_path / name, partial=True, **settings)
+    if tracks == "none":
+        with pytest.raises(DataError, match=r"without the others: no_ego_at_fault_coll") as caught:
+            run.export_results(tmp_path / "out")
+        assert "--tracks" in caught.value.hint
+        return
+    report = run.export_results(tmp_path / "out", workers=1)
+    [folder] = report.folders
+    traffic = {"recorded": "nonreactive", "own": "elsewhere"}[tracks]
+    assert folder.parent.name == f"closed_loop_{traffic}_agents"
+    row = pq.read_table(folder / "runner_report.parquet").to_pylist()[0]
+    assert row["compute_trajectory_runtimes_mean"] is row["duration"] is None
+    report = verify_experiment(
+        tmp_path / "out", partial(find, shiftsim.open_store(made.folder / "store"))
+    )
+    assert (report.mismatches, report.not_covered) == ([], {})
+    assert report.quantities["scores score"].cases == 1
+
+
+@pytest.mark.parametrize("name", ["logs", "maps"])
+def test_a_folder_that_nuboard_could_not_open_is_refused(made, tmp_path, name):
+    with pytest.raises(ConfigError, match=f"--{name}: no folder 'nosuch'") as caught:
+        made.run.export_results(tmp_path / "out", **{name: "nosuch"})
+    assert f"leave --{name} out" in caught.value.hint
