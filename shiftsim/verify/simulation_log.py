@@ -190,10 +190,10 @@ def _driven(path: Path) -> Driven:
         words.append(f"plans every {np.median(steps):.2g} s" if len(steps) else "no plans")
     if recorded.dropped_us:
         words.append("the last sample repeats a time and is dropped")
-    remarks = [f"simulation log: {', '.join(words)}"]
+    remarks = (f"simulation log: {', '.join(words)}",)
     times = recorded.ego["time_us"].astype(np.int64)
     boxes = Boxes(times, tracks_of(recorded.objects, count))
-    return Driven(path.name, times, ego, np.arange(count), boxes, remarks=tuple(remarks))
+    return Driven(path.name, times, ego, np.arange(count), boxes, {}, remarks, is_simulated=True)
 
 
 def read_simulation_log(path: Path, report: Report) -> Recorded:

@@ -257,6 +257,18 @@ BAD = {
         r"row 0: .* 1\.461 m ahead of the .*: it is of the c",
     ),
     "map velocity": (lambda c: {"vx": 0 * c["x"] + 28.8}, r"row 0: vx is 28\.8 m/s, but .* 8 m/s"),
+    "no acceleration": (
+        lambda c: {"x": c["x"] - 4.0 * (0.1 * np.arange(25)) ** 2, "ax": 0 * c["x"]},
+        r"row 0: ax is 0 m/s², but the positions move by -8 m/s² along .* for 8 samples",
+    ),
+    "no mild acceleration": (
+        lambda c: {"x": c["x"] + 0.5 * (0.1 * np.arange(25)) ** 2, "ax": 0 * c["x"]},
+        r"row 0: ax is 0 m/s², but the positions move by 1 m/s²",
+    ),
+    "unit g": (
+        lambda c: {"x": c["x"] + 1.5 * (0.1 * np.arange(25)) ** 2, "ax": np.linspace(0.3, 0.4, 25)},
+        r"row 0: ax is 0\.3 m/s², but the positions move by 3 m/s²",
+    ),
     "other times": (
         lambda c: {"time_us": c["time_us"] - 10**10},
         r"row 24: .* before the scenario",
@@ -297,6 +309,60 @@ def test_small_headings_in_degrees_are_those_of_the_recording():
         DataError, match=r"row 0: heading 2\.865, in degrees the recorded one, 0\.05"
     ):
         shiftsim.score_rollout(columns, scene)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            lambda h: h + np.pi,
+            r"heading 4\.342, backwards the recorded one, 1\.2 rad",
+        ),
+        (lambda h: -h, r"heading -1\.2, counted clockwise the recorded one, 1\.2 rad"),
+        (
+            lambda h: np.pi / 2 - h,
+            r"heading 0\.3708, of a compass the recorded one, 1\.2 rad",
+        ),
+        (lambda h: 0.0 * h, r"heading 0, not the recorded one, 1\.2 rad, at iteration 0"),
+    ],
+)
+def test_a_start_that_is_turned_is_refused_with_its_cause(change, words):
+    scene = cruise_scenario(iterations=25, start=(10.0, 0.0, 1.2))
+    for first in (0, scene.iteration_times[0]):  # times from 0 on, and time stamps
+        columns = columns_of(scene, time_us=scene.iteration_times - first)
+        columns["heading"] = columns["heading"] + 0.3
+        assert shiftsim.score_rollout(columns_of(scene) | {"heading": columns["heading"]}, scene)
+        columns["heading"] = change(columns["heading"] - 0.3)
+        with pytest.raises(DataError, match=f"row 0: {words}"):
+            shiftsim.score_rollout(columns, scene)
+
+
+@pytest.mark.parametrize("controller", ["perfect", "lqr"])
+def test_states_of_our_own_simulator_are_accepted(toy, tmp_path, controller):
+    class Stops:
+        """Brakes by 8 m/s², with a plan of poses alone."""
+
+        def reset(self, scene):
+            self.speed = None
+
+        def plan(self, observation):
+            x, y, heading = observation.ego.pose
+            self.speed = max(0.0, (self.speed or observation.ego.speed) - 0.8)
+            along = self.speed * 0.1 * np.arange(81)
+            poses = [x + along * np.cos(heading), y + along * np.sin(heading), 0 * along + heading]
+            return shiftsim.Trajectory.from_poses(0.1 * np.arange(81), np.transpose(poses))
+
+    settings = {
+        "store": str(toy),
+        "workers": 1,
+        "noise": "ou-high" if controller == "lqr" else "none",
+    }
+    run = shiftsim.run(Stops(), controller=controller, out=str(tmp_path / "run"), **settings)
+    source = read_source(run.path / "rollouts")
+    again = score_elsewhere(
+        source, store=str(toy), recorded=True, out=str(tmp_path / "again"), workers=1
+    )
+    assert again.scores["cls"].equals(run.scores["cls"])
 
 
 def test_the_rear_axle_is_not_taken_for_the_center(scene):

@@ -23,7 +23,7 @@ from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.metrics import MetricResult, Thresholds, compute_metrics
 from shiftsim.metrics.score import without
 from shiftsim.runs.rollouts import Task
-from shiftsim.runs.rollouts.files import KEY, KINDS, SEEN, STATES, TRACKS
+from shiftsim.runs.rollouts.files import COMMAND_COLUMNS, KEY, KINDS, SEEN, STATES, TRACKS
 from shiftsim.runs.rollouts.poses import NEED_BOXES, POINTS, REAR_AXLE, Boxes, Driven, rollout_of
 from shiftsim.sim.log import SimulationLog
 from shiftsim.world.scenario import Scenario
@@ -214,7 +214,8 @@ def table_source(
     for key, rows in _groups(table, where).items():
         task = Task(**{"planner": where.partition(".")[0], "noise": "none", "seed": 0, **dict(key)})
         fields = {} if seconds is None else {"planning_seconds": seconds[rows]}
-        driven = Driven(where, time_us[rows], states[rows], rows, fields=fields)
+        given = (where, time_us[rows], states[rows], rows, None, fields)
+        driven = Driven(*given, is_simulated=COMMAND_COLUMNS[0] in table.column_names)
         entries.append(Entry(task, partial(_with_boxes, driven, boxes_of and boxes_of(task))))
     if not entries:
         raise DataError(f"{where} has no rows", hint=_HINT)

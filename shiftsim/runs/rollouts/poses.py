@@ -28,10 +28,14 @@ _EXACT, _NEAR = 1_000, 25_000  # us from an iteration: taken as it is, or interp
 _LONGEST_STEP = 150_000  # us
 _OTHER_MAP = 50.0  # m from the recorded pose at iteration 0
 _SAME_START = (0.05, 0.01)  # m, rad from it
+_TURNED, _MISTAKEN = 0.5, 0.1  # rad from it, and where another meaning of the number explains it
 _STANDING = 1e-3  # m per iteration
 _JUMP = (10.0, 1.0)  # m, rad in 0.1 s
 _SPACING = 0.02  # m between neighbouring numbers in single precision
-_CONTRADICTION, _IN_A_ROW = 0.5, 3  # m/s between velocity and positions; samples
+_CHECKED = {  # state that contradicts the positions: by how much, in how many samples in a row
+    VX: ("velocities", "m/s", 0.5, 3),
+    state.AX: ("accelerations", "m/s²", 1.5, 8),
+}
 _ON_EGO = (0.5, 0.1)  # m, rad between a box and the ego
 _RADIANS = "give radians, counter-clockwise from x, within ±pi"
 
@@ -54,6 +58,7 @@ class Driven:
     boxes: Boxes | None = None  # the others, where they are given
     fields: Mapping[str, Any] = field(default_factory=dict)  # (R, …) other ones of `SimulationLog`
     remarks: tuple[str, ...] = ()  # what a reader of the score must know
+    is_simulated: bool = False  # by shiftsim or nuPlan: perfect tracking knows no acceleration
 
     def refuse(self, bad: BoolArray, words: Callable[[int], str], hint: str) -> None:
         """Refuse the first of the samples (R,) that is bad; `words` say why."""
@@ -223,10 +228,13 @@ def _check_start(
                 f"recorded rear axle: it is of the {other.replace('_', ' ')}",
                 f"say so: --point {other}",
             )
-    as_radians = np.array([*pose[:2], np.radians(pose[HEADING])])
-    if turn > 0.1 and _apart(as_radians, expert)[1] < _SAME_START[1]:
-        words = f"heading {pose[HEADING]:.4g}, in degrees the recorded one, {expert[2]:.4g} rad"
-        driven.refuse_one(row, words, _RADIANS)
+    heading, said = driven.states[row, HEADING], expert[HEADING]
+    meant = {"in degrees": np.radians(heading), "counted clockwise": -heading}
+    meant |= {"of a compass": np.pi / 2 - heading, "backwards": heading + np.pi}
+    near = [how for how in meant if abs(wrap_angles(meant[how] - said)) < _SAME_START[1]]
+    if turn > (_MISTAKEN if near else _TURNED):
+        words = f"heading {heading:.4g}, {[*near, 'not'][0]} the recorded one, {said:.4g} rad"
+        driven.refuse_one(row, f"{words}, at iteration 0", _RADIANS)
 
 
 def _check_end(driven: Driven, times: IntArray, reached: int, *, partial: bool) -> None:
@@ -273,16 +281,19 @@ def _at(states: FloatArray, samples: _Samples) -> FloatArray:
 def _fill(ego: FloatArray, times: IntArray, driven: Driven, samples: _Samples) -> list[str]:
     """Derive the columns of states (K, 11) that are NaN; what was derived, in words."""
     derived, is_given = derived_states(times, ego[:, :3]), ~np.isnan(ego[0])
-    wrong = np.abs(ego[:, VX] - derived[:, VX]) > _CONTRADICTION
-    runs = np.convolve(wrong, np.ones(_IN_A_ROW), "valid") == _IN_A_ROW
-    if runs.any():
-        at = int(np.argmax(runs))
-        driven.refuse_one(
-            int(samples.at[at]),
-            f"vx is {ego[at, VX]:.3g} m/s, but the positions move by {derived[at, VX]:.3g} m/s "
-            f"along the heading, and so on for {_IN_A_ROW} samples",
-            "give velocities in m/s in the frame of the ego, or leave them out",
-        )
+    for column, (kind, unit, limit, count) in _CHECKED.items():
+        limit /= 1.0 + (np.ptp(ego[:, column]) == 0.0)  # what never changes was hardly measured
+        wrong = np.abs(ego[:, column] - derived[:, column]) > limit
+        runs = np.convolve(wrong, np.ones(count), "valid") == count
+        if runs.any() and not (driven.is_simulated and column != VX):
+            at = int(np.argmax(runs))
+            given, known = (f"{states[at, column]:.3g} {unit}" for states in (ego, derived))
+            driven.refuse_one(
+                int(samples.at[at]),
+                f"{STATE_COLUMNS[column]} is {given}, but the positions move by {known} along the "
+                f"heading, and so on for {count} samples",
+                f"give {kind} in {unit} in the frame of the ego, or leave them out",
+            )
     names, remarks = [STATE_COLUMNS[column] for column in _READ if not is_given[column]], []
     if names:
         remarks.append(f"derived from poses: {', '.join(names)}")
