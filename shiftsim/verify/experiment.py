@@ -41,10 +41,8 @@ from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import AX, AY, PACIFICA, Tracks, Trajectory, speeds
 
 _PARTS = ("metrics", "aggregator_metric", "simulation_log")  # folders that nuPlan makes
-_CHALLENGES = {
-    **{"closed_loop_nonreactive_agents": "NR", "closed_loop_reactive_agents": "R"},
-    "closed_loop_elsewhere_agents": "R",  # they were not simulated here, and not replayed
-}
+_CHALLENGES = {"closed_loop_nonreactive_agents": "NR", "closed_loop_reactive_agents": "R"}
+_CHALLENGES |= {"closed_loop_elsewhere_agents": "R"}  # neither simulated here nor replayed
 _TWINS = {"SimplePlanner": "simple", "IDMPlanner": "idm", "LogFuturePlanner": "log-future"}
 _LABELS = {  # columns that name things, or say what only their own run can know
     *("metric_computator", "metric_statistics_name", "time_series_selected_frames", "log_name"),
@@ -130,15 +128,12 @@ def _compare_results(path: Path, challenge: str, find: FindScenario, report: Rep
                 source = "exported"
                 if not recorded.is_exported:
                     source = rollouts.origin(challenge, recorded.ego, recorded.plans)
-                elif scenario:  # it may have been driven in part
-                    rows = scenario.iteration_rows[: recorded.ego.num_rows + 1]
-                    scenario = replace(scenario, iteration_rows=rows)
                 report.remarks.append(f"{run}: {rollouts.ORIGINS[source]}")
             if recorded and recorded.dropped_us:
                 report.remarks.append(f"{run}: the last sample repeats a time (dt = 0): dropped")
-                if scenario:
-                    rows = scenario.iteration_rows[:-1]
-                    scenario = replace(scenario, iteration_rows=rows)
+            if recorded and scenario and (recorded.dropped_us or recorded.is_exported):
+                end = recorded.ego.num_rows + 1 if recorded.is_exported else -1  # it may end early
+                scenario = replace(scenario, iteration_rows=scenario.iteration_rows[:end])
             if scenario is None:
                 report.skip(f"{run}: there is no such scenario")
                 continue
@@ -356,6 +351,5 @@ def _finish(path: Path, tables: Collection[Groups], left_out: set[str], report: 
     if left_out:
         report.note("simulation_log: heights of objects, outlines, other values kept for reuse")
         report.note(f"simulation_log: objects of {', '.join(sorted(left_out))}")
-    others = {file.name for file in path.iterdir()} - {*_PARTS, "runner_report.parquet"}
-    for name in sorted(others):
-        report.note(f"{name}")
+    for name in sorted({file.name for file in path.iterdir()} - {*_PARTS, "runner_report.parquet"}):
+        report.note(name)

@@ -192,8 +192,8 @@ def _driven(path: Path) -> Driven:
         words.append("the last sample repeats a time and is dropped")
     remarks = (f"simulation log: {', '.join(words)}",)
     times = recorded.ego["time_us"].astype(np.int64)
-    boxes = Boxes(times, tracks_of(recorded.objects, count))
-    return Driven(path.name, times, ego, np.arange(count), boxes, {}, remarks, is_simulated=True)
+    boxes, rows = partial(Boxes, times, tracks_of(recorded.objects, count)), np.arange(count)
+    return Driven(path.name, times, ego, rows, boxes, {}, remarks, is_simulated=True)
 
 
 def read_simulation_log(path: Path, report: Report) -> Recorded:

@@ -437,9 +437,22 @@ BAD_BOXES = {
     "types": (lambda b, c: {"type": ["VEHICLE", *["BARRIER"] * 24]}, r"row 1: its track changes"),
     "size": (lambda b, c: {"length": np.zeros(25)}, r"row 0: length and width must be above 0"),
     "hole": (lambda b, c: {"x": np.full(25, np.nan)}, r"row 0: a number is missing"),
+    "degrees": (
+        lambda b, c: {"heading": np.full(25, -15.6)},
+        r"tracks 'heading', row 0: -15\.6 is",
+    ),
+    "long": (lambda b, c: {"length": np.full(25, 450.0)}, r"tracks 'length', row 0: 450 is beyond"),
+    "far": (
+        lambda b, c: {"x": b["x"] + 1000.0},
+        r"tracks: the nearest box is 1012 m from the ego, the nearest recorded one 12\.\d+ m",
+    ),
+    "single precision": (
+        lambda b, c: {"x": (b["x"] + 4e5 + 0.3 * np.arange(25)).astype(np.float32)},
+        r"tracks: x is 400040, and in all rows of single precision, which has steps of 0\.03125 m",
+    ),
     "end": (
         lambda b, c: of_rows(b, slice(9)),
-        r"no boxes of others at iteration 9, \d+ us, .* has 1",
+        r"tracks: no boxes of others at iteration 9, \d+ us, .* recording of '.*' has 1",
     ),
     "twice": (lambda b, c: of_rows(b, [*range(25), 4]), r"row 25: its track is there twice at one"),
 }
@@ -453,6 +466,15 @@ def test_boxes_that_cannot_be_right_are_named(scene, name):
         shiftsim.score_rollout(columns, scene, tracks={**boxes, **change(boxes, columns)})
 
 
+@pytest.mark.parametrize("are_poses_from_zero", [False, True])
+def test_boxes_may_have_the_other_kind_of_times(scene, are_poses_from_zero):
+    columns, boxes = columns_of(scene), boxes_of(scene)
+    times = columns if are_poses_from_zero else boxes
+    times["time_s"] = (times.pop("time_us") - scene.iteration_times[0]) * 1e-6
+    found = shiftsim.score_rollout(columns, scene, tracks=boxes)
+    np.testing.assert_array_equal(found.log.tracks.poses[:, 0], [[40.0, 3.5, 0.0]] * 24)
+
+
 def test_the_ego_is_left_out_by_its_type(scene):
     boxes, columns = boxes_of(scene), columns_of(scene)
     two = {name: [*boxes[name], *boxes[name]] for name in boxes}
@@ -462,6 +484,20 @@ def test_the_ego_is_left_out_by_its_type(scene):
 
 
 # tables and runs
+
+
+def test_planning_times_are_times_or_lack(scene):
+    columns = columns_of(scene, seconds=np.full(25, 0.1))
+    assert (shiftsim.score_rollout(columns, scene).log.planning_seconds == 0.1).all()
+    columns["seconds"] = np.full(25, np.nan)  # as beside a file that has them
+    assert not shiftsim.score_rollout(columns, scene).log.planning_seconds.any()
+    for row, value in ((4, -1.0), (5, np.inf), (6, np.nan)):
+        columns["seconds"] = np.where(np.arange(25) == row, value, 0.1)
+        with pytest.raises(
+            DataError, match=rf"poses.*seconds.*|poses, row {row}: seconds"
+        ) as caught:
+            shiftsim.score_rollout(columns, scene)
+        assert f"row {row}" in str(caught.value)
 
 
 def test_columns_that_lack_or_are_not_used_are_named(scene):
@@ -478,6 +514,8 @@ def test_columns_that_lack_or_are_not_used_are_named(scene):
         shiftsim.score_rollout(columns_of(scene, x_m=columns["x"]), scene)
     with pytest.raises(DataError, match="column 'x' is no double"):
         shiftsim.score_rollout(columns_of(scene, x=["far"] * 25), scene)
+    with pytest.raises(DataError, match=r"poses: no table: .* expected length 25 but got length 9"):
+        shiftsim.score_rollout(columns_of(scene, x=columns["x"][:9]), scene)
     with pytest.raises(ValueError, match=r"poses \(K, 3\)"):
         shiftsim.score_rollout(np.zeros((5, 2)), scene)
 

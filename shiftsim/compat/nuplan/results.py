@@ -78,14 +78,13 @@ def export_results(
         what = f"run {run.path.name!r} was scored without the others: {', '.join(undefined)} and"
         hint = "score it again with --tracks FILE or --tracks recorded: nuPlan has no undefined"
         raise DataError(f"{what} the score are undefined", hint)
-    for name, place in {"logs": logs, "maps": maps}.items():
-        if simulation_logs and place is not None and not Path(place).expanduser().is_dir():
+    places = [Path(one).expanduser().resolve() for one in (logs or _DATA, maps or _DATA / "maps")]
+    for name, given, place in zip(("logs", "maps"), (logs, maps), places, strict=True):
+        if simulation_logs and given and not place.is_dir():
             hint = f"name the folder of the {name} that nuBoard opens, or leave --{name} out"
-            raise ConfigError(f"--{name}: no folder {str(place)!r}", hint)
+            raise ConfigError(f"--{name}: no folder {str(given)!r}", hint)
     opened, found = open_run_store(run, store), dict[Task, Row]()
     folders = {task_of(row): _folder(out, run, task_of(row)) for row in rows}
-    given = (Path(logs or _DATA), Path(maps or _DATA / "maps"))
-    places = (place.expanduser().resolve() for place in given)
     written_to = folders if simulation_logs else {}
     exporter = partial(_exporter, run.path.resolve(), opened, written_to, *places)
     with closing(map_unordered(exporter, tasks, workers=workers, alone=1)) as outcomes:
@@ -225,5 +224,4 @@ def _write_nuboard(folder: Path, began: datetime, *, with_logs: bool) -> None:
     names = {"simulation_main_path": place, "metric_main_path": place}
     names |= {"metric_folder": _METRICS, "aggregator_metric_folder": _MEANS}
     names |= {"simulation_folder": _LOGS} if with_logs else {}
-    path = folder / f"nuboard_{began.timestamp():.0f}.nuboard"
-    path.write_bytes(pickle.dumps(names))
+    (folder / f"nuboard_{began.timestamp():.0f}.nuboard").write_bytes(pickle.dumps(names))

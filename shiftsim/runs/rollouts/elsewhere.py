@@ -26,6 +26,7 @@ from shiftsim.runs.rollouts import Task
 from shiftsim.runs.rollouts.files import COMMAND_COLUMNS, KEY, KINDS, SEEN, STATES, TRACKS
 from shiftsim.runs.rollouts.poses import NEED_BOXES, POINTS, REAR_AXLE, Boxes, Driven, rollout_of
 from shiftsim.sim.log import SimulationLog
+from shiftsim.world.ranges import Range, require
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import STATE_COLUMNS, AgentKind, tracks_of_boxes
 
@@ -37,6 +38,8 @@ _SAME = {  # other names of columns, those of our own rollouts among them
 }
 _TIMES, _POSE = {"time_us": 1.0, "time_s": 1e6}, ("x", "y", "heading")
 _BOX = (*STATE_COLUMNS[:5], "length", "width")
+_PLAUSIBLE = {"heading": Range(-7.0, 7.0, "rad"), "length": Range(0.0, 200.0, "m")}
+_PLAUSIBLE |= {"width": _PLAUSIBLE["length"], "seconds": Range(0.0, 1e5, "s")}
 _KNOWN = {*KEY, *_TIMES, *STATE_COLUMNS, *_BOX, "seconds", "track_token", "type"}
 _KNOWN |= {*STATES.names, *TRACKS.names, *SEEN.names, KINDS, "iteration"}  # of rollouts of our own
 _EGO = -2  # in place of an AgentKind
@@ -136,8 +139,8 @@ def score_rollout(
     """
     one_of("point", point, POINTS)
     is_recorded = isinstance(tracks, str) and bool(one_of("tracks", tracks, [RECORDED]))
-    boxes = None if tracks is None or is_recorded else _as_table(tracks, scenario)
-    source = table_source(_as_table(poses, scenario), "poses", boxes)
+    boxes = None if tracks is None or is_recorded else _as_table(tracks, scenario, "tracks")
+    source = table_source(_as_table(poses, scenario, "poses"), "poses", boxes)
     if len(source.entries) != 1:
         words = f"{len(source.entries)} rollouts of scenario {scenario.token!r} in the poses"
         raise DataError(words, hint="give those of one")
@@ -149,19 +152,18 @@ def score_rollout(
     return ScoredRollout(total, result.scores, remarks, log, result)
 
 
-def _as_table(given: Any, scenario: Scenario) -> pa.Table:
+def _as_table(given: Any, scenario: Scenario, where: str) -> pa.Table:
     """What is given of one scenario as a table."""
-    if isinstance(given, (pa.Table, Mapping)):
-        table = given if isinstance(given, pa.Table) else pa.table(dict(given))
-    elif hasattr(given, "iloc"):
-        table = pa.Table.from_pandas(given, preserve_index=False)
-    else:
+    if not (isinstance(given, (pa.Table, Mapping)) or hasattr(given, "iloc")):
         poses, times = np.asarray(given, np.float64), scenario.iteration_times
         if poses.ndim != 2 or poses.shape[1] != 3 or len(poses) > len(times):
             raise ValueError(f"need a table, or poses (K, 3) with K <= {len(times)}: {poses.shape}")
-        columns = dict(zip(_POSE, poses.T, strict=True))
-        table = pa.table({"time_us": times[: len(poses)], **columns})
-    table = _renamed(table, "poses")
+        given = {"time_us": times[: len(poses)], **dict(zip(_POSE, poses.T, strict=True))}
+    try:
+        table = given if isinstance(given, pa.Table) else pa.table(dict(given))
+    except pa.ArrowException as error:
+        raise DataError(f"{where}: no table: {error}", "give columns of one length") from error
+    table = _renamed(table, where)
     if "token" not in table.column_names:
         return table.append_column("token", pa.array([scenario.token] * len(table), pa.string()))
     return table.filter(pc.equal(table["token"], scenario.token))
@@ -209,14 +211,16 @@ def table_source(
     boxes = None if boxes is None else _renamed(boxes, where_boxes)
     boxes_of = None if boxes is None else _read_boxes(boxes, where_boxes)
     time_us, states = _times(table, where), _numbers(table, STATE_COLUMNS, where)
-    seconds = _numbers(table, ["seconds"], where)[:, 0] if "seconds" in table.column_names else None
-    entries = []
+    seconds = _numbers(table, ["seconds"], where)[:, 0]
+    require(_PLAUSIBLE, "seconds", seconds, where, may_be_nan=True)
+    entries, is_own = [], COMMAND_COLUMNS[0] in table.column_names
     for key, rows in _groups(table, where).items():
         task = Task(**{"planner": where.partition(".")[0], "noise": "none", "seed": 0, **dict(key)})
-        fields = {} if seconds is None else {"planning_seconds": seconds[rows]}
-        given = (where, time_us[rows], states[rows], rows, None, fields)
-        driven = Driven(*given, is_simulated=COMMAND_COLUMNS[0] in table.column_names)
-        entries.append(Entry(task, partial(_with_boxes, driven, boxes_of and boxes_of(task))))
+        is_known = ~np.isnan(seconds[rows])
+        _refuse(~is_known & is_known.any(), where, "seconds is missing", _EVERY, rows)
+        fields = {"planning_seconds": seconds[rows]} if is_known.all() else {}
+        given = (where, time_us[rows], states[rows], rows, boxes_of and boxes_of(task), fields)
+        entries.append(Entry(task, partial(Driven, *given, is_simulated=is_own)))
     if not entries:
         raise DataError(f"{where} has no rows", hint=_HINT)
     names = {*table.column_names, *(boxes.column_names if boxes is not None else ())}
@@ -224,10 +228,6 @@ def table_source(
     remarks = (f"columns not used: {unused}",) if unused else ()
     entries.sort(key=lambda entry: (entry.task.token, entry.task))
     return Source(where, (), tuple(entries), boxes is not None, point, remarks)
-
-
-def _with_boxes(driven: Driven, make: Callable[[], Boxes] | None) -> Driven:
-    return driven if make is None else replace(driven, boxes=make())
 
 
 def _renamed(table: pa.Table, where: str) -> pa.Table:
@@ -319,6 +319,8 @@ def _read_boxes(table: pa.Table, where: str) -> Callable[[Task], Callable[[], Bo
     broken = ~np.isfinite(values[:, [0, 1, 2, 5, 6]])
     _refuse(np.logical_or.reduce(broken, axis=1), where, "a number is missing")
     _refuse(values[:, 5:].min(axis=1) <= 0.0, where, "length and width must be above 0")
+    for name in ("heading", "length", "width"):
+        require(_PLAUSIBLE, name, values[:, _BOX.index(name)], where)
 
     def of(task: Task) -> Callable[[], Boxes]:
         rows = groups.get(tuple((name, getattr(task, name)) for name in names), _NO_ROWS)
@@ -363,4 +365,5 @@ def _boxes(
     _refuse(kinds[first][track] != kinds, where, "its track changes its type", rows=rows)
     dense = np.full((len(times), len(first), len(_BOX)), np.nan)
     dense[frame, track] = values
-    return Boxes(times, tracks_of_boxes(dense, kinds[first], numbered.dictionary.to_pylist()))
+    tracks = tracks_of_boxes(dense, kinds[first], numbered.dictionary.to_pylist())
+    return Boxes(times, tracks, where)

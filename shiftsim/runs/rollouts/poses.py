@@ -37,6 +37,7 @@ _CHECKED = {  # state that contradicts the positions: by how much, in how many s
     state.AX: ("accelerations", "m/s²", 1.5, 8),
 }
 _ON_EGO = (0.5, 0.1)  # m, rad between a box and the ego
+_FAR = 200.0  # m from the ego to the nearest box
 _RADIANS = "give radians, counter-clockwise from x, within ±pi"
 
 
@@ -45,6 +46,7 @@ class Boxes(NamedTuple):
 
     time_us: IntArray  # (F,) increasing; time stamps or from 0 on, as those of the ego [us]
     tracks: Tracks  # F rows; kinds may be -1 and velocities NaN where they are not given
+    where: str = ""  # the file, where it is another one than that of the ego
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +57,7 @@ class Driven:
     time_us: IntArray  # (R,) time stamps of the recording, or from 0 on [us]
     states: FloatArray  # (R, 11) of the ego; columns behind the pose are NaN where not given
     rows: IntArray  # (R,) row of each in the file, from 0 on
-    boxes: Boxes | None = None  # the others, where they are given
+    boxes: Callable[[], Boxes] | None = None  # what makes the others, where they are given
     fields: Mapping[str, Any] = field(default_factory=dict)  # (R, …) other ones of `SimulationLog`
     remarks: tuple[str, ...] = ()  # what a reader of the score must know
     is_simulated: bool = False  # by shiftsim or nuPlan: perfect tracking knows no acceleration
@@ -120,7 +122,7 @@ def rollout_of(
     fields = {name: values[samples.at] for name, values in driven.fields.items()}
     log = replace(as_recorded(scenario), ego=ego, **fields)
     if driven.boxes is not None:
-        tracks, more = _others(driven, driven.boxes, shift, log)
+        tracks, more = _others(driven, driven.boxes(), shift, log)
         return replace(log, tracks=tracks), (*remarks, *more)
     if recorded:
         return log, (*remarks, "others replayed from the recording")
@@ -162,16 +164,7 @@ def _check_rows(driven: Driven) -> None:
         lambda row: f"heading {headings[row]:.6g}, {turns[row]:.3g} from the row before: degrees?",
         _RADIANS,
     )
-    for name, values in zip("xy", states[:, :2].T, strict=True):
-        single = values.astype(np.float32)
-        spacing = float(np.spacing(np.abs(single).max()))
-        if spacing > _SPACING and np.ptp(values) > 0.0 and (values == single).all():
-            driven.refuse_one(
-                0,
-                f"{name} is {values[0]:.10g}, and in all rows of single precision, which has steps "
-                f"of {spacing:g} m there",
-                "write float64: speeds and accelerations of such positions are noise",
-            )
+    _refuse_single(f"{driven.where}, row {driven.rows[0]}", states)
     moved = np.hypot(*np.diff(states[:, :2], axis=0, prepend=states[:1, :2]).T)
     turned = np.abs(wrap_angles(turns))
     tenths = np.maximum(steps / _STEP, 1.0)
@@ -183,6 +176,19 @@ def _check_rows(driven: Driven) -> None:
         ),
         "a vehicle does not jump: check units, and that the rows are of one rollout",
     )
+
+
+def _refuse_single(where: str, poses: FloatArray) -> None:
+    """Refuse positions (R, …) that went through single precision, where its steps are large."""
+    for name, values in zip("xy", poses.T[:2], strict=True):
+        single = values.astype(np.float32)
+        spacing = float(np.spacing(np.abs(single).max(initial=0.0)))
+        if spacing > _SPACING and np.ptp(values) > 0.0 and (values == single).all():
+            raise DataError(
+                f"{where}: {name} is {values[0]:.10g}, and in all rows of single precision, which "
+                f"has steps of {spacing:g} m there",
+                "write float64: speeds and accelerations of such positions are noise",
+            )
 
 
 def _apart(pose: FloatArray, other: FloatArray) -> tuple[float, float]:
@@ -311,9 +317,13 @@ def _others(
 ) -> tuple[Tracks, list[str]]:
     """The given boxes at the samples of a log, and what was done; between two times if at both."""
     times, given, remarks = log.time_us, boxes.tracks, list[str]()
+    where, (first, last) = boxes.where or driven.where, times[[0, -1]] + [-_NEAR, _NEAR]
+    if not ((boxes.time_us + shift >= first) & (boxes.time_us + shift <= last)).any():
+        shift = 0 if shift else int(times[0])  # of the two kinds of times they have the other one
     lost = np.ones(len(times), np.bool_)
     tracks = Tracks.empty(len(times))
     if len(given):
+        _refuse_single(where, given.poses[given.valid])
         samples = _locate(boxes.time_us + shift, times)
         lost = samples.distance > _NEAR
         after = np.minimum(samples.at + (samples.weight != 0.0), len(given) - 1)
@@ -329,16 +339,24 @@ def _others(
     if lost.any():
         step = int(np.argmax(lost))
         raise DataError(
-            f"{driven.where}: no boxes of others at iteration {step}, {times[step]} us, where the "
-            f"recording has {np.count_nonzero(log.tracks.valid[step])}",
+            f"{where}: no boxes of others at iteration {step}, {times[step]} us, where the "
+            f"recording of {log.token!r} has {np.count_nonzero(log.tracks.valid[step])}",
             "give those of all iterations; without any, collisions are undefined",
         )
-    _check_ego(driven, tracks, log.ego)
+    near, recorded_near = (
+        float(np.hypot(*(some.poses - log.ego[:, None, :3])[some.valid].T[:2]).min(initial=np.inf))
+        for some in (tracks, log.tracks)
+    )
+    if recorded_near <= _FAR < near < np.inf:
+        words = f"{where}: the nearest box is {near:.4g} m from the ego, the nearest recorded one"
+        hint = "give metres in the frame of the store's map, as for the ego"
+        raise DataError(f"{words} {recorded_near:.4g} m, scenario {log.token!r}", hint)
+    _check_ego(where, tracks, log.ego)
     kinds = np.array(tracks.kinds)
     recorded = dict(zip(log.tracks.tokens, log.tracks.kinds.tolist(), strict=True))
     for index in np.flatnonzero(kinds < 0).tolist():
         if (token := tracks.tokens[index]) not in recorded:
-            words = f"{driven.where}: track {token!r} has no type, and is not in the recording"
+            words = f"{where}: track {token!r} has no type, and is not in the recording"
             raise DataError(words, "add a column type: VEHICLE, PEDESTRIAN, BICYCLE, …")
         kinds[index] = recorded[token]
     velocities, moves = np.array(tracks.velocities), kinds <= state.LAST_AGENT_KIND
@@ -364,7 +382,7 @@ def _differences(tracks: Tracks, times: IntArray) -> FloatArray:
     return np.nan_to_num(np.where(np.isnan(before), after, before))
 
 
-def _check_ego(driven: Driven, tracks: Tracks, ego: FloatArray) -> None:
+def _check_ego(where: str, tracks: Tracks, ego: FloatArray) -> None:
     """Refuse a track that is the ego, by its centre or its rear axle."""
     is_ego = np.zeros(tracks.valid.shape, np.bool_)
     for poses in (ego[:, :3], center_poses(ego[:, :3])):
@@ -377,7 +395,7 @@ def _check_ego(driven: Driven, tracks: Tracks, ego: FloatArray) -> None:
     if found:
         which = found[0]
         raise DataError(
-            f"{driven.where}: track {tracks.tokens[which]!r} is on the ego, with its heading, in "
+            f"{where}: track {tracks.tokens[which]!r} is on the ego, with its heading, in "
             f"{counts[which]} of {there[which]} samples from {np.argmax(is_ego[:, which])} on",
             "leave the ego out of the boxes, or give it the type EGO",
         )
