@@ -42,12 +42,12 @@ def select_tasks(
         rows_by_task(table.filter(pc.equal(table["token"], full)))
         for table in (run.scores, run.metrics)
     )
-    out, edits = [], edit_words(run.manifest, full)
+    out, told = [], {"remarks": run.remarks, "edits": edit_words(run.manifest, full)}
     for row in rows:
         task = task_of(row)
         cls = scores[task][0]["cls"] if task in scores else None
         listed = with_roles(metrics.get(task, []))
-        out.append(row | {"cls": cls, "why": why(cls, listed), "edits": edits, "metrics": listed})
+        out.append(row | {"cls": cls, "why": why(cls, listed), **told, "metrics": listed})
     return out
 
 
@@ -147,7 +147,7 @@ def explain_lines(task: dict[str, Any]) -> list[str]:
     rule = "the score is the product of the × rows and the weighted mean of the + rows, all x 100"
     lines = [*task["edits"], task["why"], rule, *map(_metric_line, task["metrics"])]
     total = "undefined" if task["cls"] is None else f"{100.0 * task['cls']:.2f}"
-    return [f"{head}  CLS {total}", *(f"  {line}" for line in lines)]
+    return [f"{head}  CLS {total}", *(f"  {line}" for line in (*task["remarks"], *lines))]
 
 
 def _metric_line(row: dict[str, Any]) -> str:

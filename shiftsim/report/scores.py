@@ -67,9 +67,8 @@ def planner_notes(runs: Sequence[Run]) -> list[str]:
         "; ".join(sorted(own)): own,
         f"given the recorded future: {', '.join(sorted(informed))}": informed,
     }
-    told = (run.manifest.get("elsewhere", {}).get("remarks", ()) for run in runs)
-    elsewhere = (f"driven elsewhere: {'; '.join(remarks)}" for remarks in told if remarks)
-    return [*(note for note, names in notes.items() if names), *dict.fromkeys(elsewhere)]
+    elsewhere = dict.fromkeys(line for run in runs for line in run.remarks)
+    return [*(note for note, names in notes.items() if names), *elsewhere]
 
 
 def _describe(group: Group) -> str:

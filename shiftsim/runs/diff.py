@@ -78,6 +78,7 @@ class Difference:
     # mean score of the common rollouts in both runs; None where their durations differ
     means: tuple[float, float] | None
     changes: tuple[Change, ...]  # the rollouts that changed most
+    remarks: tuple[str, ...] = ()  # runs that were driven elsewhere
 
     def __repr__(self) -> str:
         return f"<Difference: same {self.same}, better {self.better}, worse {self.worse}>"
@@ -131,6 +132,7 @@ def diff_runs(
             _change(first, second, task, pairs[task], ours[task], theirs[pairs[task]], tolerance)
             for task in changed[:limit]
         ),
+        remarks=tuple(f"{r.path.name}: {line}" for r in (first, second) for line in r.remarks),
     )
 
 
@@ -143,6 +145,7 @@ def diff_lines(found: Difference) -> list[str]:
     counts = f" same {found.same} · better {found.better} · worse {found.worse}"
     counts += lone if found.only_first or found.only_second else ""
     lines = [f"{counts}      CLS of the common ones {means}"]
+    lines += [f" {line}" for line in found.remarks]
     if found.settings:
         lines.append(f" settings that differ: {', '.join(found.settings)}")
     for change in found.changes:

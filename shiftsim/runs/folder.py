@@ -76,8 +76,7 @@ class RunWriter:
 
     def result(self, task: Task) -> TaskResult:
         """What became of a task that has ended, without its rollout."""
-        rows = self._journal.values(self.ended[task].number)
-        return TaskResult.from_rows(rows, self.rollouts)
+        return TaskResult.from_rows(self._journal.values(self.ended[task].number), self.rollouts)
 
     def add(self, result: TaskResult) -> None:
         """Put a result on disk; a file of another run that holds its rollout is linked to."""

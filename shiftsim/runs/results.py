@@ -112,6 +112,12 @@ class Run:
         return RolloutReader()
 
     @property
+    def remarks(self) -> list[str]:
+        """What a reader must know of rollouts that were driven elsewhere, in one line."""
+        told = self.manifest.get("elsewhere", {}).get("remarks", ())
+        return [f"driven elsewhere: {'; '.join(told)}"] if told else []
+
+    @property
     def is_complete(self) -> bool:
         """Whether every expected task finished."""
         return bool(self.manifest["counts"]["ok"] == self.manifest["counts"]["expected"])

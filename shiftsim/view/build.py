@@ -164,11 +164,12 @@ class Gallery:
 
     def settings_words(self, token: str, part: int = 0) -> str:
         """How the rollouts of a page were driven and scored."""
-        manifests = [self._rollouts[task].run.manifest for task in self.tasks(token, part)]
         settings = (
-            f"traffic {made['config']['traffic']} · controller {made['config']['controller']} · "
-            f"thresholds {made['config']['thresholds']} · shiftsim {made['versions']['shiftsim']}"
-            for made in manifests
+            f"traffic {run.manifest['determining']['traffic']} · controller "
+            f"{run.manifest['determining']['controller']} · thresholds "
+            f"{run.manifest['config']['thresholds']} · shiftsim "
+            + " · ".join([run.manifest["versions"]["shiftsim"], *run.remarks])
+            for run in (self._rollouts[task].run for task in self.tasks(token, part))
         )
         return "; ".join(dict.fromkeys(settings))
 

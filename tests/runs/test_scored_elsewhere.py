@@ -18,6 +18,7 @@ from shiftsim.metrics.comfort import derived_states
 from shiftsim.report.explain import explain_lines, select_tasks
 from shiftsim.runs.derive import rescore, score_elsewhere
 from shiftsim.runs.rollouts.elsewhere import read_source, table_source
+from shiftsim.view.build import Gallery
 from shiftsim.world.state import AX, AY, VX, VY, YAW_ACCEL, YAW_RATE, AgentKind, center_poses
 
 UTM = (664_430.3, 3_998_750.7, 0.3)
@@ -587,6 +588,17 @@ def test_a_run_without_others_is_shown_everywhere(toy, tmp_path):
     again = rescore(run, thresholds="deepplan", out=str(tmp_path / "again"), workers=1)
     assert again.scores["cls"].null_count == 4
     assert remarks_of(again) == remarks_of(run)
+
+
+def test_that_it_was_driven_elsewhere_stands_wherever_a_run_is_shown(toy, tmp_path):
+    path, out = written(tmp_path, toy), tmp_path / "run"
+    run = shiftsim.score_files(path, store=str(toy), tracks="recorded", workers=1, out=str(out))
+    said = "driven elsewhere: mine.parquet; derived from poses: vx, vy, ax, ay, yaw_rate, yaw_accel"
+    [task] = select_tasks(run, "0001cafe")
+    settings = Gallery([run], shiftsim.open_store(toy)).settings_words("0001cafe")
+    assert "controller elsewhere" in settings
+    for words in (run.table(), "\n".join(explain_lines(task)), str(run.diff(run)), settings):
+        assert said in words
 
 
 def test_own_boxes_come_back_from_a_run(toy, tmp_path):

@@ -75,13 +75,13 @@ def export_results(
         what = f"two of the planners {', '.join(planners)} would have the same folder"
         raise ConfigError(what, hint="run them with other names")
     if undefined := run.manifest.get("elsewhere", {}).get("undefined"):
-        what = f"run {run.path.name!r} was scored without the others: {', '.join(undefined)} and"
-        hint = "score it again with --tracks FILE or --tracks recorded: nuPlan has no undefined"
-        raise DataError(f"{what} the score are undefined", hint)
+        what = f"run {run.path.name!r} was scored without the others: undefined are"
+        hint = "score it again with --tracks FILE or --tracks recorded"
+        raise DataError(f"{what} {', '.join(undefined)} and the score", hint)
     places = [Path(one).expanduser().resolve() for one in (logs or _DATA, maps or _DATA / "maps")]
     for name, given, place in zip(("logs", "maps"), (logs, maps), places, strict=True):
         if simulation_logs and given and not place.is_dir():
-            hint = f"name the folder of the {name} that nuBoard opens, or leave --{name} out"
+            hint = f"name the folder that nuBoard opens, or leave --{name} out"
             raise ConfigError(f"--{name}: no folder {str(given)!r}", hint)
     opened, found = open_run_store(run, store), dict[Task, Row]()
     folders = {task_of(row): _folder(out, run, task_of(row)) for row in rows}

@@ -38,8 +38,8 @@ _SAME = {  # other names of columns, those of our own rollouts among them
 }
 _TIMES, _POSE = {"time_us": 1.0, "time_s": 1e6}, ("x", "y", "heading")
 _BOX = (*STATE_COLUMNS[:5], "length", "width")
-_PLAUSIBLE = {"heading": Range(-7.0, 7.0, "rad"), "length": Range(0.0, 200.0, "m")}
-_PLAUSIBLE |= {"width": _PLAUSIBLE["length"], "seconds": Range(0.0, 1e5, "s")}
+_RANGES = {"heading": Range(-7, 7, "rad"), "seconds": Range(0, 1e5, "s")}
+_RANGES |= dict.fromkeys(("length", "width"), Range(0, 200, "m"))
 _KNOWN = {*KEY, *_TIMES, *STATE_COLUMNS, *_BOX, "seconds", "track_token", "type"}
 _KNOWN |= {*STATES.names, *TRACKS.names, *SEEN.names, KINDS, "iteration"}  # of rollouts of our own
 _EGO = -2  # in place of an AgentKind
@@ -176,8 +176,7 @@ def read_source(path: Path, tracks: str = "") -> Source:
     if tracks == RECORDED and TRACKS.names[0] in table.column_names:
         table = table.drop_columns([TRACKS.names[0]])
     others = [] if tracks in ("", RECORDED) else [Path(tracks)]
-    boxes = _read_table(others[0]) if others else None
-    source = table_source(table, path.name, boxes, tracks)
+    source = table_source(table, path.name, _read_table(others[0]) if others else None, tracks)
     return replace(source, files=(*files, *others))
 
 
@@ -212,7 +211,7 @@ def table_source(
     boxes_of = None if boxes is None else _read_boxes(boxes, where_boxes)
     time_us, states = _times(table, where), _numbers(table, STATE_COLUMNS, where)
     seconds = _numbers(table, ["seconds"], where)[:, 0]
-    require(_PLAUSIBLE, "seconds", seconds, where, may_be_nan=True)
+    require(_RANGES, "seconds", seconds, where, may_be_nan=True)
     entries, is_own = [], COMMAND_COLUMNS[0] in table.column_names
     for key, rows in _groups(table, where).items():
         task = Task(**{"planner": where.partition(".")[0], "noise": "none", "seed": 0, **dict(key)})
@@ -320,7 +319,7 @@ def _read_boxes(table: pa.Table, where: str) -> Callable[[Task], Callable[[], Bo
     _refuse(np.logical_or.reduce(broken, axis=1), where, "a number is missing")
     _refuse(values[:, 5:].min(axis=1) <= 0.0, where, "length and width must be above 0")
     for name in ("heading", "length", "width"):
-        require(_PLAUSIBLE, name, values[:, _BOX.index(name)], where)
+        require(_RANGES, name, values[:, _BOX.index(name)], where)
 
     def of(task: Task) -> Callable[[], Boxes]:
         rows = groups.get(tuple((name, getattr(task, name)) for name in names), _NO_ROWS)

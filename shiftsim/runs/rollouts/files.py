@@ -61,8 +61,6 @@ TRACKS = _schema(
         **dict.fromkeys((f"track_{name}" for name in BOX), list_of(pa.float64())),
     }
 )
-
-
 SEEN = _schema(  # what the planner saw; NaN and empty where that was the truth
     {
         **dict.fromkeys(("seen_x_m", "seen_y_m", "seen_heading_rad"), pa.float64()),
@@ -130,8 +128,7 @@ def complete_rollout(
     """The stored rollout of a task, completed by its noise and scenario; or a DataError."""
     time_us = rows["time_us"].to_numpy()
     if is_partial:
-        shown = scenario.iteration_rows[: len(time_us) + 1]
-        scenario = replace(scenario, iteration_rows=shown)
+        scenario = replace(scenario, iteration_rows=scenario.iteration_rows[: len(time_us) + 1])
     log, may_end = as_recorded(scenario), scenario.script and scenario.script.termination
     samples = slice(len(time_us) if may_end else None)  # it may have ended before its time
     if not np.array_equal(time_us, log.time_us[samples]):
@@ -359,8 +356,7 @@ def _row_groups(
 def part_file(folder: Path, name: str) -> Path:
     """The file of rollouts in a folder that a table or a journal names, or a DataError."""
     if not _PART.fullmatch(name):
-        what = f"{str(folder)!r}: {name!r} is no file of rollouts"
-        raise DataError(what, hint="make the run again")
+        raise DataError(f"{str(folder)!r}: {name!r} is no file of rollouts", "make the run again")
     return folder / name
 
 

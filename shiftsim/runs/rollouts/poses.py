@@ -32,12 +32,10 @@ _TURNED, _MISTAKEN = 0.5, 0.1  # rad from it, and where another meaning of the n
 _STANDING = 1e-3  # m per iteration
 _JUMP = (10.0, 1.0)  # m, rad in 0.1 s
 _SPACING = 0.02  # m between neighbouring numbers in single precision
-_CHECKED = {  # state that contradicts the positions: by how much, in how many samples in a row
-    VX: ("velocities", "m/s", 0.5, 3),
-    state.AX: ("accelerations", "m/s²", 1.5, 8),
-}
-_ON_EGO = (0.5, 0.1)  # m, rad between a box and the ego
-_FAR = 200.0  # m from the ego to the nearest box
+# state that contradicts the positions: by how much, in how many samples in a row
+_CHECKED = {VX: ("m/s", 0.5, 3), state.AX: ("m/s²", 1.5, 8)}
+_ON_EGO, _FAR = (0.5, 0.1), 200.0  # m, rad between a box and the ego; m to the nearest one
+_FRAME = "give metres in the frame of the store's map: no local frame, no latitude"
 _RADIANS = "give radians, counter-clockwise from x, within ±pi"
 
 
@@ -184,11 +182,9 @@ def _refuse_single(where: str, poses: FloatArray) -> None:
         single = values.astype(np.float32)
         spacing = float(np.spacing(np.abs(single).max(initial=0.0)))
         if spacing > _SPACING and np.ptp(values) > 0.0 and (values == single).all():
-            raise DataError(
-                f"{where}: {name} is {values[0]:.10g}, and in all rows of single precision, which "
-                f"has steps of {spacing:g} m there",
-                "write float64: speeds and accelerations of such positions are noise",
-            )
+            words = f"{where}: {name} is {values[0]:.10g}, and in all rows of single precision"
+            hint = "write float64: speeds and accelerations of such positions are noise"
+            raise DataError(f"{words}, which has steps of {spacing:g} m there", hint)
 
 
 def _apart(pose: FloatArray, other: FloatArray) -> tuple[float, float]:
@@ -222,8 +218,7 @@ def _check_start(
     gap, turn = _apart(pose, expert)
     words = f"({pose[0]:.10g}, {pose[1]:.10g}) at iteration 0, the recording is {gap:.4g} m away"
     if gap > _OTHER_MAP:
-        hint = "give metres in the frame of the store's map: no local frame, no latitude"
-        driven.refuse_one(row, f"{words}, at ({expert[0]:.10g}, {expert[1]:.10g})", hint)
+        driven.refuse_one(row, f"{words}, at ({expert[0]:.10g}, {expert[1]:.10g})", _FRAME)
     for other in {*POINTS} - {point}:
         mistaken = center_poses(expert[:3]) if other == CENTER else rear_poses(expert[:3])
         if _apart(pose, mistaken)[0] < _SAME_START[0]:
@@ -263,8 +258,7 @@ def _locate(time_us: IntArray, wanted: IntArray) -> _Samples:
     last = len(time_us) - 1
     after = np.clip(np.searchsorted(time_us, wanted), min(1, last), last)
     before = np.maximum(after - 1, 0)
-    is_before = wanted - time_us[before] <= time_us[after] - wanted
-    nearest = np.where(is_before, before, after)
+    nearest = np.where(wanted - time_us[before] <= time_us[after] - wanted, before, after)
     distance = np.abs(time_us[nearest] - wanted)
     between = (wanted - time_us[before]) / np.maximum(time_us[after] - time_us[before], 1)
     is_exact = distance <= _EXACT
@@ -287,19 +281,16 @@ def _at(states: FloatArray, samples: _Samples) -> FloatArray:
 def _fill(ego: FloatArray, times: IntArray, driven: Driven, samples: _Samples) -> list[str]:
     """Derive the columns of states (K, 11) that are NaN; what was derived, in words."""
     derived, is_given = derived_states(times, ego[:, :3]), ~np.isnan(ego[0])
-    for column, (kind, unit, limit, count) in _CHECKED.items():
+    for column, (unit, limit, count) in _CHECKED.items():
+        name, gaps = STATE_COLUMNS[column], np.abs(ego[:, column] - derived[:, column])
         limit /= 1.0 + (np.ptp(ego[:, column]) == 0.0)  # what never changes was hardly measured
-        wrong = np.abs(ego[:, column] - derived[:, column]) > limit
-        runs = np.convolve(wrong, np.ones(count), "valid") == count
+        runs = np.convolve(gaps > limit, np.ones(count), "valid") == count
         if runs.any() and not (driven.is_simulated and column != VX):
             at = int(np.argmax(runs))
             given, known = (f"{states[at, column]:.3g} {unit}" for states in (ego, derived))
-            driven.refuse_one(
-                int(samples.at[at]),
-                f"{STATE_COLUMNS[column]} is {given}, but the positions move by {known} along the "
-                f"heading, and so on for {count} samples",
-                f"give {kind} in {unit} in the frame of the ego, or leave them out",
-            )
+            words = f"{name} is {given}, but the positions move by {known} along the heading"
+            hint = f"give {name} in {unit} in the frame of the ego, or leave it out"
+            driven.refuse_one(int(samples.at[at]), f"{words}, and so on for {count} samples", hint)
     names, remarks = [STATE_COLUMNS[column] for column in _READ if not is_given[column]], []
     if names:
         remarks.append(f"derived from poses: {', '.join(names)}")
@@ -349,8 +340,7 @@ def _others(
     )
     if recorded_near <= _FAR < near < np.inf:
         words = f"{where}: the nearest box is {near:.4g} m from the ego, the nearest recorded one"
-        hint = "give metres in the frame of the store's map, as for the ego"
-        raise DataError(f"{words} {recorded_near:.4g} m, scenario {log.token!r}", hint)
+        raise DataError(f"{words} {recorded_near:.4g} m, scenario {log.token!r}", _FRAME)
     _check_ego(where, tracks, log.ego)
     kinds = np.array(tracks.kinds)
     recorded = dict(zip(log.tracks.tokens, log.tracks.kinds.tolist(), strict=True))

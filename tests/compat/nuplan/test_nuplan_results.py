@@ -272,7 +272,9 @@ def test_what_was_driven_elsewhere_is_exported_as_far_as_it_is_known(made, tmp_p
     settings |= {"tracks": "recorded"} if tracks == "recorded" else {}
     run = shiftsim.score_files(tmp_path / name, partial=True, **settings)
     if tracks == "none":
-        with pytest.raises(DataError, match=r"without the others: no_ego_at_fault_coll") as caught:
+        with pytest.raises(
+            DataError, match=r"others: undefined are no_ego_at_fault_coll"
+        ) as caught:
             run.export_results(tmp_path / "out")
         assert "--tracks" in caught.value.hint
         return
