@@ -351,7 +351,9 @@ def test_states_of_our_own_simulator_are_accepted(toy, tmp_path, controller):
             self.speed = max(0.0, (self.speed or observation.ego.speed) - 0.8)
             along = self.speed * 0.1 * np.arange(81)
             poses = [x + along * np.cos(heading), y + along * np.sin(heading), 0 * along + heading]
-            return shiftsim.Trajectory.from_poses(0.1 * np.arange(81), np.transpose(poses))
+            plan = shiftsim.Trajectory.from_poses(0.1 * np.arange(81), np.transpose(poses))
+            plan.states[:, VX] += 2.0  # which perfect tracking takes as it is
+            return plan
 
     settings = {
         "store": str(toy),

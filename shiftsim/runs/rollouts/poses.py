@@ -58,7 +58,7 @@ class Driven:
     boxes: Callable[[], Boxes] | None = None  # what makes the others, where they are given
     fields: Mapping[str, Any] = field(default_factory=dict)  # (R, …) other ones of `SimulationLog`
     remarks: tuple[str, ...] = ()  # what a reader of the score must know
-    is_simulated: bool = False  # by shiftsim or nuPlan: perfect tracking knows no acceleration
+    is_simulated: bool = False  # by shiftsim or nuPlan, whose perfect tracking is as the plan says
 
     def refuse(self, bad: BoolArray, words: Callable[[int], str], hint: str) -> None:
         """Refuse the first of the samples (R,) that is bad; `words` say why."""
@@ -285,7 +285,7 @@ def _fill(ego: FloatArray, times: IntArray, driven: Driven, samples: _Samples) -
         name, gaps = STATE_COLUMNS[column], np.abs(ego[:, column] - derived[:, column])
         limit /= 1.0 + (np.ptp(ego[:, column]) == 0.0)  # what never changes was hardly measured
         runs = np.convolve(gaps > limit, np.ones(count), "valid") == count
-        if runs.any() and not (driven.is_simulated and column != VX):
+        if runs.any() and not driven.is_simulated:
             at = int(np.argmax(runs))
             given, known = (f"{states[at, column]:.3g} {unit}" for states in (ego, derived))
             words = f"{name} is {given}, but the positions move by {known} along the heading"
