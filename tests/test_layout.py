@@ -23,7 +23,7 @@ BUDGETS = {
     "shiftsim/sim": 2_480,  # goal 1_600
     "shiftsim/sim/traffic": 2_335,  # goal 2_200
     "metrics": 2_837,
-    "shiftsim/runs": 5_347,  # goal 3_300
+    "shiftsim/runs": 5_373,  # goal 3_300
     "planners": 4_272,  # goal 4_300
     "planners/learned": 4_900,  # goal 4_600; attention of all scenes at once on a GPU brings 40
     "data/maps": 3_620,  # goal 3_000
@@ -37,10 +37,10 @@ BUDGETS = {
     "shiftsim/train": 3_255,  # goal 1_600; rasters and rounds on a GPU, faster samples bring 30
     "shiftsim/compat": 3_590,  # goal 2_300
     "shiftsim/verify": 1_199,  # goal 1_200
-    "shiftsim/cli": 2_659,  # goal 2_300
+    "shiftsim/cli": 2_661,  # goal 2_300
     "benchmarks": 755,  # goal 700; the tracks finding and sensor-drift bring 40
 }
-MOST_LINES, MOST_MODULES, MOST_KERNELS = 63_663, 300, 220  # the goal is 52_000 lines
+MOST_LINES, MOST_MODULES, MOST_KERNELS = 63_697, 300, 220  # the goal is 52_000 lines
 LONGEST_MODULE, CROWDED = 450, 16
 # modules of under 80 lines that one other module imports, and why they stand alone
 SMALL_AND_ALONE = {

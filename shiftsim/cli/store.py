@@ -229,6 +229,9 @@ def export_results(
     with progress_bar(quiet=quiet or as_json) as advance:
         values = {"simulation_logs": not tables_only, "progress": advance, **settings, **places}
         report = run.export_results(out, **values)
+    for name, folder in places.items():
+        if not folder.is_dir() and not tables_only:
+            echo(f"--{name}: there is no folder {folder} here, where nuBoard will look", err=True)
     place = settings.get("store") or run.manifest["config"]["store"]
     print_result(asdict(report), _result_lines(report, run, place), as_json=as_json)
 

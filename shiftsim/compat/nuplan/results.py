@@ -60,8 +60,8 @@ def export_results(
     out: str | Path,
     *,
     store: str | None = None,
-    logs: str | Path | None = None,
-    maps: str | Path | None = None,
+    logs: str | Path = _DATA,
+    maps: str | Path = _DATA / "maps",
     simulation_logs: bool = True,
     workers: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -78,13 +78,9 @@ def export_results(
         what = f"run {run.path.name!r} was scored without the others: undefined are"
         hint = "score it again with --tracks FILE or --tracks recorded"
         raise DataError(f"{what} {', '.join(undefined)} and the score", hint)
-    places = [Path(one).expanduser().resolve() for one in (logs or _DATA, maps or _DATA / "maps")]
-    for name, given, place in zip(("logs", "maps"), (logs, maps), places, strict=True):
-        if simulation_logs and given and not place.is_dir():
-            hint = f"name the folder that nuBoard opens, or leave --{name} out"
-            raise ConfigError(f"--{name}: no folder {str(given)!r}", hint)
     opened, found = open_run_store(run, store), dict[Task, Row]()
     folders = {task_of(row): _folder(out, run, task_of(row)) for row in rows}
+    places = (Path(place).expanduser().resolve() for place in (logs, maps))
     written_to = folders if simulation_logs else {}
     exporter = partial(_exporter, run.path.resolve(), opened, written_to, *places)
     with closing(map_unordered(exporter, tasks, workers=workers, alone=1)) as outcomes:

@@ -38,7 +38,7 @@ _SAME = {  # other names of columns, those of our own rollouts among them
 }
 _TIMES, _POSE = {"time_us": 1.0, "time_s": 1e6}, ("x", "y", "heading")
 _BOX = (*STATE_COLUMNS[:5], "length", "width")
-_RANGES = {"heading": Range(-7, 7, "rad"), "seconds": Range(0, 1e5, "s")}
+_RANGES = {"heading": Range(-13, 13, "rad"), "seconds": Range(0, 1e5, "s")}
 _RANGES |= dict.fromkeys(("length", "width"), Range(0, 200, "m"))
 _KNOWN = {*KEY, *_TIMES, *STATE_COLUMNS, *_BOX, "seconds", "track_token", "type"}
 _KNOWN |= {*STATES.names, *TRACKS.names, *SEEN.names, KINDS, "iteration"}  # of rollouts of our own

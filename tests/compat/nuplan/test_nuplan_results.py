@@ -289,10 +289,3 @@ def test_what_was_driven_elsewhere_is_exported_as_far_as_it_is_known(made, tmp_p
     )
     assert (report.mismatches, report.not_covered) == ([], {})
     assert report.quantities["scores score"].cases == 1
-
-
-@pytest.mark.parametrize("name", ["logs", "maps"])
-def test_a_folder_that_nuboard_could_not_open_is_refused(made, tmp_path, name):
-    with pytest.raises(ConfigError, match=f"--{name}: no folder 'nosuch'") as caught:
-        made.run.export_results(tmp_path / "out", **{name: "nosuch"})
-    assert f"leave --{name} out" in caught.value.hint
