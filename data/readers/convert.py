@@ -59,6 +59,7 @@ class ConversionReport:
     skipped: dict[str, str] = field(default_factory=dict)  # why, by name, the others are not
     converted: int = 0  # how many recordings this call has converted
     kept: int = 0  # how many were converted before, by an interrupted or an earlier call
+    replaced: dict[str, int] = field(default_factory=dict)  # scenarios that recordings had before
     # count by kind of what was repaired in the map
     map_warnings: dict[str, int] = field(default_factory=dict)
     details: dict[str, Any] = field(default_factory=dict)  # what the reader adds
@@ -146,6 +147,7 @@ def _convert_into(
         failure = failures[name]
         report.skipped[name] = failure.message + f" ({failure.hint})" * bool(failure.hint)
     parts = {name: stage.part(name) or {} for name in waiting if name not in failures}
+    report.replaced = {n: before[n]["summary"]["accepted"] for n in parts if n in before}
     entries |= {name: part["entry"] for name, part in parts.items()}
     report.details = reader.summarise(list(entries.values()))
     map_warnings = Counter(site.warnings if site is not None else {})

@@ -103,6 +103,7 @@ def convert_tracks(
     city: str | None = None,
     hz: float | None = None,
     columns: dict[str, Any] | None = None,
+    replace: bool = False,
     **thresholds: Any,
 ) -> "ConversionReport":
     """Convert tracks of any source: tables with a row per object and time, and their map.
@@ -115,6 +116,7 @@ def convert_tracks(
         city: Name of the map; that of the file by default.
         hz: Frames per second, where time is given in frames.
         columns: Names, units and kinds of columns, as in the TOML file of `--columns`.
+        replace: Replace the recording that other tables of that name became.
         thresholds: Fields of `ConversionConfig`, such as `window_s`.
 
     Raises:
@@ -135,7 +137,7 @@ def convert_tracks(
     reader = TracksReader(
         paths, Path(map_path), city=city, overrides=columns or {}, hz=hz, config=config
     )
-    return convert_tracks(reader, store_path(store), egos=egos)
+    return convert_tracks(reader, store_path(store), egos=egos, replace=replace)
 
 
 def convert_dataset(

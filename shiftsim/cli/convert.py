@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from shiftsim.data.readers.convert import ConversionReport
-    from shiftsim.data.readers.scenarios import RecordingSummary
     from shiftsim.data.readers.tracks.reader import TracksReader
     from shiftsim.data.readers.windows import ConversionConfig
 
@@ -178,6 +177,7 @@ def tracks(
     ),
     columns: Path | None = Option(None, help="Names, units and kinds of the columns in TOML."),
     city: str | None = Option(None, help="Name of the map. [name of MAP]"),
+    replace: bool = Option(False, help="Replace what other tables of that name became."),
     window_s: Window = None,
     overlap_s: Overlap = None,
     history_s: History = None,
@@ -209,7 +209,7 @@ def tracks(
     picture = picture_file(folder, inspection.road.name, inspection.table.name)
     errors = inspection.diagnostics.errors
     try:
-        report = convert_tracks(inspection, folder, egos=egos)
+        report = convert_tracks(inspection, folder, egos=egos, replace=replace)
     except ConversionError:
         for wrong in errors:
             echo(f" wrong: {wrong.what}\n   remedy: {wrong.remedy}")
@@ -233,7 +233,7 @@ def tracks(
                 echo(f" {what}: {value}")
         if any(read.shift):
             echo(f" shift: ({read.shift[0]:.1f}, {read.shift[1]:.1f}) m")
-        echo("\n".join(_recording_lines(report.recordings[0])))
+        echo("\n".join(_recording_lines(report)))
         for warning in inspection.diagnostics.warnings:
             echo(f" unusual: {warning.what}\n   remedy: {warning.remedy}")
     _draw_tracks(picture, inspection, folder)
@@ -333,8 +333,7 @@ def _site_lines(report: "ConversionReport", store: Path, *, is_short: bool) -> "
     )
     for name, count in report.map_warnings.items():
         yield f" map: {name} ({count})"
-    for summary in report.recordings:
-        yield from _recording_lines(summary)
+    yield from _recording_lines(report)
     for name, reason in report.skipped.items():
         yield f" skipped: {name}: {reason}"
     if report.kept:
@@ -344,16 +343,19 @@ def _site_lines(report: "ConversionReport", store: Path, *, is_short: bool) -> "
     yield f" {plural(report.accepted, 'scenario')} → {store}"
 
 
-def _recording_lines(summary: "RecordingSummary") -> "Iterator[str]":
-    yield (
-        f" {summary.name}: {summary.duration_s:.1f} s, {plural(summary.tracks, 'track')}, "
-        f"{plural(summary.windows, 'window')}, {plural(summary.candidates, 'candidate')}, "
-        f"{summary.accepted} accepted"
-    )
-    for rule, count in summary.rejected.items():
-        yield f"   not accepted by rule {rule}: {count}"
-    for name, count in summary.warnings.items():
-        yield f"   repaired: {name} ({count})"
+def _recording_lines(report: "ConversionReport") -> "Iterator[str]":
+    for summary in report.recordings:
+        yield (
+            f" {summary.name}: {summary.duration_s:.1f} s, {plural(summary.tracks, 'track')}, "
+            f"{plural(summary.windows, 'window')}, {plural(summary.candidates, 'candidate')}, "
+            f"{summary.accepted} accepted"
+        )
+        for rule, count in summary.rejected.items():
+            yield f"   not accepted by rule {rule}: {count}"
+        for name, count in summary.warnings.items():
+            yield f"   repaired: {name} ({count})"
+        if summary.name in report.replaced:
+            yield f"   replaced: {plural(report.replaced[summary.name], 'scenario')} of before"
 
 
 def _contents(report: "ConversionReport") -> dict[str, Any]:

@@ -7,6 +7,7 @@ scenarios are made.
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -23,9 +24,10 @@ from shiftsim.data.readers.tracks.axes import Diagnostics
 from shiftsim.data.readers.tracks.diagnostics import diagnose
 from shiftsim.data.readers.tracks.table import TrackTable, read_tracks
 from shiftsim.data.readers.windows import ConversionConfig
-from shiftsim.data.store.map import read_map_file
-from shiftsim.data.store.tables import MANIFEST, map_file
-from shiftsim.errors import ConversionError
+from shiftsim.data.store.map import write_map
+from shiftsim.data.store.reading import read_report
+from shiftsim.data.store.tables import MANIFEST, digest, map_file
+from shiftsim.errors import ConversionError, plural
 from shiftsim.kernels import FloatArray
 from shiftsim.world.map import VectorMap
 
@@ -52,6 +54,7 @@ class TracksReader(Reader):
         self.paths = [tracks] if isinstance(tracks, Path) else tracks
         self.source, self.map_path = self.paths[0], map_path
         table = read_tracks(self.paths, overrides=overrides, hz=hz)
+        self.tables = [digest(path) for path in self.paths]  # tells others of that name apart
         drive, self.name = read_opendrive(map_path), city or map_path.stem
         self.site: BuiltMap = opendrive_site(drive, name=self.name, country=config.country)
         if table.origin and "shift_m" not in (overrides or {}):
@@ -96,7 +99,11 @@ class TracksReader(Reader):
             config=self.config,
             egos=self.egos,
             needs_scenario=True,
-            details={"figures": self.diagnostics.figures, "columns": columns},
+            details={
+                "figures": self.diagnostics.figures,
+                "columns": columns,
+                "tables": self.tables,
+            },
         )
 
 
@@ -130,24 +137,33 @@ def _note_inputs(files: Sequence[Path], table: TrackTable, out: Diagnostics) -> 
 
 
 def convert_tracks(
-    reader: TracksReader, store: Path, *, egos: Sequence[str] | None = None
+    reader: TracksReader,
+    store: Path,
+    *,
+    egos: Sequence[str] | None = None,
+    replace: bool = False,
 ) -> ConversionReport:
-    """Add tracks to a store, made if needed; what it held of the recording is replaced.
+    """Add tracks to a store, made if needed; what it held of the same tables is replaced.
 
     `egos` are the ids of the egos; every vehicle that can be one by default. It is a DataError if
-    something cannot be right, no scenario is left, or the store has another map of that name.
+    something cannot be right, no scenario is left, or the store has another map of that name, or
+    the recording of that name from other tables, unless these are to be replaced.
     """
-    errors, road = reader.diagnostics.errors, reader.road
+    errors, road, name = reader.diagnostics.errors, reader.road, reader.table.name
     if errors:
         what = "; ".join(error.what for error in errors)
         raise ConversionError(what, "; ".join(error.remedy for error in errors))
     path = map_file(store, road.name)
     if (store / MANIFEST).is_file() and path.is_file():
-        other, edges = read_map_file(path).edges, road.edges
-        if other.ids != edges.ids or not np.array_equal(
-            other.polygons.bounds, edges.polygons.bounds
-        ):
-            what = f"store {store} has another map named {road.name!r}"
-            raise ConversionError(what, "name this one: --city NAME")
+        with TemporaryDirectory() as folder:  # equal maps have equal bytes
+            write_map(written := Path(folder) / "map", road)
+            if digest(written) != digest(path):
+                what = f"{reader.map_path}: store {store} has another map named {road.name!r}"
+                raise ConversionError(what, "name this one: --city NAME; or give another --store")
+    before = read_report(store, road.name).get("recordings", {}).get(name, {})
+    if not replace and before.get("tables", reader.tables) != reader.tables:
+        count = plural(before["summary"]["accepted"], "scenario")
+        what = f"{reader.source}: store {store} has {name!r} of another table, with {count}"
+        raise ConversionError(what, "rename the file to add both; --replace to lose that one")
     reader.egos = reader.settings["egos"] = egos
     return convert(reader, store)

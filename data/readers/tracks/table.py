@@ -25,6 +25,7 @@ from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.world.state import AgentKind
 
 _DELIMITERS = ",;\t|"
+_ENDINGS = re.compile(r"(\.[a-z]+)?(\.(gz|bz2|lz4|zst|br))?$", re.IGNORECASE)  # not the name
 _MAX_ROWS = 40_000  # that statistics look at
 _IN_US = Column("", "us")
 
@@ -128,7 +129,7 @@ def read_tracks(
     if np.isnan(velocities).all():
         velocities = stacked("speed") * motion.unit_vectors(headings)
     table = TrackTable(
-        paths[0].name.partition(".")[0],
+        _ENDINGS.sub("", paths[0].name),
         columns,
         rate,
         time_us[order],

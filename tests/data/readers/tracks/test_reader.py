@@ -277,6 +277,50 @@ def test_a_recording_that_is_converted_again_takes_the_place_of_the_old_one(town
         convert_tracks(other, tmp_path / "s")
 
 
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [
+        ("05-01.cam1.csv", "05-01.cam1"),
+        ("t.csv.gz", "t"),
+        ("a.v2.pq", "a.v2"),
+        ("2024.05", "2024.05"),
+    ],
+)
+def test_a_recording_has_the_name_of_its_file(file, name, town, tmp_path):
+    if file.endswith("pq"):
+        pq.write_table(pa.table(town[0]), tmp_path / file)
+    else:
+        with pa.output_stream(str(tmp_path / file), compression="detect") as stream:
+            pc.write_csv(pa.table(town[0]), stream)
+    assert read_tracks(tmp_path / file).name == name
+
+
+def test_another_table_or_map_of_the_same_name_is_refused(town, tmp_path):
+    for folder in ("a", "b", "s"):
+        (tmp_path / folder).mkdir()
+    first, second = (write_tracks(tmp_path / n / "t.csv", town[0]) for n in "ab")
+    store, limits = (
+        tmp_path / "s",
+        town[1].read_text().replace("<speed max=", '<speed max="3" was='),
+    )
+    before = convert_tracks(TracksReader(first, town[1]), store)
+    again = convert_tracks(TracksReader(second, town[1]), store)  # the same table
+    assert (before.replaced, again.converted, again.replaced) == ({}, 0, {})
+    other = write_tracks(second, town[0], vx_mps=None, vy_mps=None)
+    with pytest.raises(
+        ConversionError, match=rf"b/t.csv: .* has 't' .* {before.accepted} scen"
+    ) as e:
+        convert_tracks(TracksReader(other, town[1]), store)
+    assert "--replace" in e.value.hint
+    report = convert_tracks(TracksReader(other, town[1]), store, replace=True)
+    assert (report.converted, report.replaced) == (1, {"t": before.accepted})
+    map_path = tmp_path / "b/map.xodr"
+    map_path.write_text(limits)
+    with pytest.raises(ConversionError, match=r"b/map.xodr: .* another map named 'map'") as e:
+        convert_tracks(TracksReader(first, map_path), store, replace=True)
+    assert "--store" in e.value.hint
+
+
 def _convert(folder, capsys, *words):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
