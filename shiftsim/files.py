@@ -40,12 +40,15 @@ _IMPORT = re.compile(
 def store_path(name: str | Path) -> Path:
     """Folder of a store: a path, or a name below `SHIFTSIM_DATA` (`./shiftsim-data`).
 
-    A store in the current directory may be named without `./`, unless the name is taken below.
+    A text with a separator is a path. A store in the current directory may be named without `./`,
+    unless the name is taken below.
     """
     name = str(name)
     path = expand(name)
-    if path.is_absolute() or len(path.parts) != 1 or name in (".", ".."):
+    if len(path.parts) != 1 or name in (".", ".."):
         return path
+    if "/" in name:  # `./x`, which a Path would make the name `x`
+        return path.absolute()
     below = Path(os.environ.get("SHIFTSIM_DATA", "shiftsim-data")) / name
     return path if (path / "store.json").is_file() and not below.exists() else below
 

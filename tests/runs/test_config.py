@@ -84,6 +84,10 @@ def test_stores_are_found_by_name_or_path(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert store_path("mini") == Path("shiftsim-data/mini")
     assert store_path("some/where") == Path("some/where")
+    for text in ("./mini", "mini/", "../mini"):
+        assert store_path(text).resolve() == store_path(store_path(text)).resolve()
+        assert store_path(text).resolve() == (tmp_path / text).resolve()
+    assert store_path(Path("./mini")) == Path("shiftsim-data/mini")
     monkeypatch.setenv("SHIFTSIM_DATA", "/data")
     assert store_path("mini") == Path("/data/mini")
     (tmp_path / "mini").mkdir()
