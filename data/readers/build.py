@@ -104,6 +104,11 @@ def make_samples(
     derived, contradicts = velocity_rule(velocities, xy, time, track, frames.period)
     contradicts[track[(np.abs(velocities) > _MAX_SPEED).any(axis=1)]] = True
     velocities = motion.believed_velocities(velocities, derived, contradicts, track, warnings)
+    if len(beyond := motion.beyond_turn(headings, velocities)):
+        row = beyond[0]
+        words = f"{where}: {len(beyond)} headings are beyond 2 pi rad, such as {headings[row]:g} of"
+        words += f" object {track_ids[track[row]].item()!r} at {time[row]:g} s"
+        raise ConversionError(words, "give radians within ±pi: np.deg2rad(degrees)")
     raw = full_headings(headings, velocities, track, warnings)
     samples = TrackSamples(
         name=name,

@@ -18,6 +18,9 @@ _SLOW = 0.3  # m/s, below which there is no direction of motion
 _END = 1.0  # s at both ends of a track, where trackers settle
 MAX_SHARE, _LEAST_ERROR = 0.1, 0.3  # of the speed; m/s that noise of positions may cause
 _MAX_STANDING_TURN = 0.5  # rad/s
+_TURN = 2.0 * np.pi + 0.01  # rad
+FAST = 2.0  # m/s, above which a direction of motion is sure
+MAX_HEADING = 0.2  # rad, median angle between heading and motion
 
 
 def track_ends(track: IntArray) -> IntArray:
@@ -43,6 +46,18 @@ def track_medians(values: FloatArray, track: IntArray, num_tracks: int = 0) -> F
 def unit_vectors(headings: FloatArray) -> FloatArray:
     """(A, 2) vectors of length 1 in the directions (A,) [rad]."""
     return np.column_stack([np.cos(headings), np.sin(headings)])
+
+
+def beyond_turn(headings: FloatArray, velocities: FloatArray) -> IntArray:
+    """(n,) rows with headings (A,) beyond a whole turn [rad], as degrees are.
+
+    None where those of them that move (A, 2) point ahead: radians that were unwrapped.
+    """
+    rows = np.flatnonzero(np.abs(headings) > _TURN)
+    way, ahead = velocities[rows], unit_vectors(headings[rows])
+    speed = np.hypot(*way.T)
+    cos = (way * ahead).sum(axis=1)[speed > FAST] / speed[speed > FAST]
+    return rows[:0] if len(cos) and np.median(cos) > np.cos(MAX_HEADING) else rows
 
 
 def fitted_velocities(

@@ -34,11 +34,9 @@ _AXES = {
     "turned by a quarter turn to the right": np.array([[0.0, 1.0], [-1.0, 0.0]]),
     "with x and y swapped and mirrored": np.array([[0.0, -1.0], [-1.0, 0.0]]),
 }
-FAST = 2.0  # m/s, above which a direction of motion is sure
 # share of the moving vehicles whose velocities contradict their positions; more than the first is
 # wrong if one explanation fits all of them
 LEAST_CONTRADICTING, _MAX_CONTRADICTING = 0.1, 0.5
-_MAX_HEADING = 0.2  # rad, median angle between heading and motion
 _MAX_BACKWARDS = 0.1  # share of the rows
 _MAX_VELOCITY = 0.1  # of the speed, median error of velocities that fit
 _TURNING, _LEAST_TURN = 0.1, 0.5  # rad/s; rad over a track
@@ -196,7 +194,7 @@ class Diagnostics:
 
 def check_headings(table: TrackTable, fit: Fit, out: Diagnostics) -> None:
     """Whether headings are the directions of motion."""
-    rows = table.moving_rows(FAST)
+    rows = table.moving_rows(motion.FAST)
     rows = rows[np.isfinite(table.headings[rows])]
     if not len(rows):
         return
@@ -226,14 +224,21 @@ def check_headings(table: TrackTable, fit: Fit, out: Diagnostics) -> None:
     }
     best, errors = _best_guess(guesses, lambda angles: np.abs(wrap_angles(angles - direction)))
     out.figures["heading_error_rad"] = errors[""]
-    if errors[""] > _MAX_HEADING:
-        fits = best and errors[best] < _MAX_HEADING
+    if errors[""] > motion.MAX_HEADING:
+        fits = best and errors[best] < motion.MAX_HEADING
         out.error(
             f"headings differ from the direction of motion by {errors['']:.2f} rad in the middle of"
-            f" {len(rows)} rows, at most {_MAX_HEADING:g} rad",
+            f" {len(rows)} rows, at most {motion.MAX_HEADING:g} rad",
             best if fits else f"no other unit or axis fits; {leave_out}",
         )
         return
+    if len(beyond := motion.beyond_turn(table.headings, fit.turned(table.derived))):
+        row, is_rad = beyond[0], column.unit == "rad"
+        out.error(
+            f"{len(beyond)} headings are beyond 2 pi rad, such as {table.headings[row]:g} of object"
+            f" {table.track_ids[table.track[row]].item()!r} at {table.time[row]:g} s",
+            [*guesses][1] if is_rad else f"write angles within a turn; or {leave_out}",
+        )
     backwards = float((np.abs(wrap_angles(heading - direction)) > quarter).mean())
     out.figures["backwards_share"] = backwards
     if backwards > _MAX_BACKWARDS:
@@ -246,7 +251,7 @@ def check_headings(table: TrackTable, fit: Fit, out: Diagnostics) -> None:
 
 def check_velocities(table: TrackTable, fit: Fit, out: Diagnostics) -> None:
     """Whether velocities are those of the positions."""
-    stored, rows = table.velocities, table.moving_rows(FAST)
+    stored, rows = table.velocities, table.moving_rows(motion.FAST)
     if not len(rows) or np.isnan(stored).all():
         return
     moving = np.unique(table.track[rows])
@@ -307,7 +312,7 @@ def check_reference(table: TrackTable, out: Diagnostics) -> None:
         return
     number = len(table.track_ids)
     known = table.is_vehicle & np.isfinite(table.headings)
-    fast = known & (table.speed > FAST)
+    fast = known & (table.speed > motion.FAST)
     rows = np.flatnonzero(fast)
     turned = np.bincount(table.track[rows], np.abs(_turns(table, rows)), number)
     rows = np.flatnonzero(known & (turned > _LEAST_TURN)[table.track])

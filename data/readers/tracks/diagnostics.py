@@ -8,7 +8,7 @@ import numpy as np
 
 from shiftsim.data.readers.build import find_pause, find_twice
 from shiftsim.data.readers.codes import KINDS
-from shiftsim.data.readers.motion import contradiction
+from shiftsim.data.readers.motion import FAST, contradiction
 from shiftsim.data.readers.tracks import axes
 from shiftsim.data.readers.tracks.axes import MIN_ALONG, Fit, fit_map
 from shiftsim.data.readers.tracks.table import TrackTable
@@ -193,7 +193,7 @@ def _check_starts(table: TrackTable, out: axes.Diagnostics) -> None:
 def _check_map(table: TrackTable, road: VectorMap, min_share: float, out: axes.Diagnostics) -> Fit:
     """Whether vehicles are on the map, and as fast as its limits allow."""
     stored, moving = table.velocities, table.moving_rows(_MOVING)
-    fast = table.moving_rows(axes.FAST)
+    fast = table.moving_rows(FAST)
     # another unit of length would show elsewhere, too
     is_metric = table.vehicle_size is not None and _is_usual(*table.vehicle_size)
     if is_metric and np.isfinite(stored).any() and len(fast):
@@ -231,7 +231,7 @@ def _check_map(table: TrackTable, road: VectorMap, min_share: float, out: axes.D
 
 def _check_accelerations(table: TrackTable, out: axes.Diagnostics) -> None:
     """Along and across, over half a second: three times too fast they are nine times as large."""
-    time, rows = table.time, table.moving_rows(axes.FAST)
+    time, rows = table.time, table.moving_rows(FAST)
     after = np.minimum(rows + max(1, round(_ACCELERATION_S / table.period)), len(time) - 1)
     used = (table.track[after] == table.track[rows]) & (time[after] > time[rows])
     used &= time[after] < time[rows] + 2.0 * max(_ACCELERATION_S, table.period)

@@ -412,6 +412,22 @@ def test_rows_without_a_heading_get_the_direction_of_motion(town, tmp_path):
     assert "'deg'" in _diagnose(wrong, road).errors[0].remedy
 
 
+def test_a_few_headings_in_degrees_are_named_and_unwrapped_radians_are_not(town, tmp_path):
+    columns, road = town
+    heading, track = columns["heading_rad"], columns["track"]
+    few = np.isin(track, np.unique(track)[:: len(np.unique(track)) // 4])
+    degrees = np.where(few, np.rad2deg(heading), heading)
+    (found,) = _diagnose(
+        write_tracks(tmp_path / "t.csv", columns, heading_rad=degrees), road
+    ).errors
+    assert "headings are beyond 2 pi rad, such as" in found.what
+    assert "[units] heading = 'deg'" in found.remedy
+    unwrapped = np.where(few, heading + 4.0 * np.pi, heading)
+    assert not _diagnose(
+        write_tracks(tmp_path / "t.csv", columns, heading_rad=unwrapped), road
+    ).errors
+
+
 def test_front_positions_need_neither_heading_nor_size(town, tmp_path):
     columns, _ = town
     ahead = _along(0.5)({**columns, "length_m": np.where(columns["kind"] == "truck", 12.0, 4.6)})

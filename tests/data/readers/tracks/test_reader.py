@@ -182,6 +182,16 @@ def test_fitted_velocities_of_a_parabola_are_exact(hz):
     np.testing.assert_allclose(found[inner], expected[inner], rtol=0, atol=1e-9)
 
 
+def test_arrays_of_headings_in_degrees_are_refused(town):
+    heading, first = town[0]["heading_rad"], town[0]["track"] == town[0]["track"][0]
+    degrees = np.where(first, np.rad2deg(heading) + 30.0, heading)
+    with pytest.raises(
+        ConversionError, match=r"t: .* headings are beyond 2 pi rad, such as .* of"
+    ) as e:
+        _samples(town[0], heading_rad=degrees)
+    assert "np.deg2rad" in e.value.hint
+
+
 def test_two_rows_of_an_object_at_one_time_are_refused(town):
     twice = {name: np.r_[values, values[:1]] for name, values in town[0].items()}
     with pytest.raises(ConversionError, match="has two rows at"):
