@@ -13,6 +13,7 @@ from shiftsim.data.readers.tracks import axes
 from shiftsim.data.readers.tracks.axes import MIN_ALONG, Fit, fit_map
 from shiftsim.data.readers.tracks.table import TrackTable
 from shiftsim.errors import listed
+from shiftsim.kernels import FloatArray
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AgentKind
 
@@ -24,6 +25,8 @@ _MAX_GAP = 1.0  # s without a row of any object
 _LEAST_OBJECTS = 5  # that begin at once
 _DEGREE = 1e5  # m, about
 _JUMP_SPEED, _JUMP = 100.0, 5.0  # m/s and m between two rows of an object
+# m, m/s²: how much farther than by its speed before or after an object may get; 1.9 m in real logs
+_LEAP, _GAIN = 2.5, 10.0
 _LENGTHS, _WIDTHS = (2.8, 9.0), (1.3, 2.9)  # m, of the median vehicle
 _LONGEST, _WIDEST = 60.0, 12.0  # m, of any object
 _LONGEST_WALKER = 2.0  # m, median of pedestrians
@@ -112,6 +115,8 @@ def _check_jumps(table: TrackTable, out: axes.Diagnostics) -> bool:
     far = np.flatnonzero(same & (way > _JUMP) & (way > _JUMP_SPEED * step))
     out.figures["jumps"] = float(len(far))
     if not len(far):
+        speed = np.divide(way, step, out=np.full(len(way), np.inf), where=same)
+        _check_leaps(table, step, way, speed, out)
         return True
     speed = way[same] / step[same]
     if np.median(speed[speed > _MOVING]) > _MAX_SPEED:
@@ -132,6 +137,24 @@ def _check_jumps(table: TrackTable, out: axes.Diagnostics) -> bool:
         remedy,
     )
     return len(far) < 0.01 * int(same.sum())
+
+
+def _check_leaps(
+    table: TrackTable, step: FloatArray, way: FloatArray, speed: FloatArray, out: axes.Diagnostics
+) -> None:
+    """Steps [s], [m] that the speed of the object before and after does not explain."""
+    own = np.minimum(np.r_[np.inf, speed[:-1]], np.r_[speed[1:], np.inf])  # inf between objects
+    rows = np.flatnonzero(np.isfinite(speed))
+    rows = rows[way[rows] - own[rows] * step[rows] - _GAIN * step[rows] ** 2 > _LEAP]
+    if len(rows):
+        row = rows[0]
+        out.warn(
+            f"object {table.track_ids[table.track[row]].item()!r} moves {way[row]:.1f} m within"
+            f" {step[row]:g} s at {table.time[row]:g} s, at {own[row]:.1f} m/s before or after"
+            f" ({len(rows)} such steps)",
+            "ids that are swapped or used again, or a wrong row: give objects ids of their own, or"
+            " leave the row out; an ego would drive so in log replay",
+        )
 
 
 def _check_speeds(table: TrackTable, out: axes.Diagnostics) -> bool:

@@ -126,6 +126,24 @@ def test_jumps_are_far_and_fast(hz, way, words):
 
 
 @pytest.mark.parametrize(
+    ("way", "speed", "words"),
+    [
+        (2.5, 10.0, ""),
+        (2.7, 10.0, "moves 3.7 m within 0.1 s at 4.1 s, at 10.0 m/s before or after (1 such"),
+        (2.7, 40.0, "moves 6.7 m within 0.1 s"),
+    ],
+)
+def test_a_step_is_unusual_where_the_speed_beside_it_does_not_explain_it(way, speed, words):
+    table = table_of(("car", 10.0, 0.0, 10.0, 0.0, 9.0), ("car", 5.0, 3.5, speed, 0.0, 9.0))
+    table.xy[table.track == 1] += np.where(table.time < 4.15, 0.0, way)[table.track == 1, None] * [
+        1,
+        0,
+    ]
+    found = [note.what for note in diagnose(table, ROAD, 0.0).warnings if "moves" in note.what]
+    assert words in str(found) if words else not found
+
+
+@pytest.mark.parametrize(
     ("count", "speed", "last", "words"),
     [
         (5, 0.84, 9.0, "walks with 0.84 m/s"),
