@@ -69,6 +69,16 @@ def require(
     raise error(f"{where} {field!r}{row}: {value:.10g} is {what}{more}", CHECK)
 
 
+def single_step(values: NDArray[np.float64], unit: float = 1.0) -> float:
+    """Steps of positions (n,) that are all of single precision, where these are coarse [m]; else 0.
+
+    Speeds and accelerations of such positions are noise.
+    """
+    single = values.astype(np.float32)
+    step = unit * float(np.spacing(np.abs(single).max()))
+    return step if step > _COARSE and np.ptp(values) > 0.0 and (values == single).all() else 0.0
+
+
 def _same(names: str, low: float, high: float, unit: str = "") -> dict[str, Range]:
     return dict.fromkeys(names.split(", "), Range(low, high, unit))
 
@@ -76,6 +86,7 @@ def _same(names: str, low: float, high: float, unit: str = "") -> dict[str, Rang
 _TIME = Range(-(2.0**55), 2.0**55, "us")  # a thousand years; sums of two stay exact enough
 _COUNT = 2.0**31
 _ROUNDING = 1e-9
+_COARSE = 0.02  # m
 _ANY = float(np.finfo(np.float64).max)
 
 # attributes of OpenDRIVE by element; a road whose geometry has no place is left out instead

@@ -22,6 +22,7 @@ from shiftsim.data.readers.files import SourceFile
 from shiftsim.data.readers.tracks.columns import QUANTITIES, Column, Columns, recognise
 from shiftsim.errors import ConfigError, ConversionError
 from shiftsim.kernels import BoolArray, FloatArray, IntArray
+from shiftsim.world.ranges import single_step
 from shiftsim.world.state import AgentKind
 
 _DELIMITERS = ",;\t|"
@@ -290,10 +291,16 @@ class _TableFile(SourceFile):
             f"are {'empty or ' * needed}not finite",
             f"leave these {'rows out of the file' if needed else 'values empty'}",
         )
-        values *= column.factor(role)
+        raw, values = values, values * column.factor(role)
         if QUANTITIES[role] in ("position", "heading"):
             kept = values[np.isfinite(values)]
             self.require(QUANTITIES[role], kept, f"column {column.name!r}")
+        if needed and (step := single_step(raw, abs(column.factor(role)))):
+            what = (
+                f"column {column.name!r} is {raw[0]:.10g} in data row 1, and in all rows of single"
+            )
+            what += f" precision, which has steps of {step:g} m there"
+            raise self.fault(what, "write float64, or subtract the origin before writing float32")
         return np.pi / 2 - values if column.unit == "compass" else values
 
     def times(self) -> tuple[IntArray, float | None]:

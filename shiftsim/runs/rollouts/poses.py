@@ -17,6 +17,7 @@ from shiftsim.kernels import BoolArray, FloatArray, IntArray
 from shiftsim.metrics.comfort import MIN_SAMPLES, derived_states
 from shiftsim.sim.log import SimulationLog, as_recorded
 from shiftsim.world import state
+from shiftsim.world.ranges import single_step
 from shiftsim.world.scenario import Scenario
 from shiftsim.world.state import HEADING, STATE_COLUMNS, VX, VY, Tracks, center_poses, rear_poses
 
@@ -31,7 +32,6 @@ _SAME_START = (0.05, 0.01)  # m, rad from it
 _TURNED, _MISTAKEN = 0.5, 0.1  # rad from it, and where another meaning of the number explains it
 _STANDING = 1e-3  # m per iteration
 _JUMP = (10.0, 1.0)  # m, rad in 0.1 s
-_SPACING = 0.02  # m between neighbouring numbers in single precision
 # state that contradicts the positions: by how much, in how many samples in a row
 _CHECKED = {VX: ("m/s", 0.5, 3), state.AX: ("m/s²", 1.5, 8)}
 _ON_EGO, _FAR = (0.5, 0.1), 200.0  # m, rad between a box and the ego; m to the nearest one
@@ -179,12 +179,10 @@ def _check_rows(driven: Driven) -> None:
 def _refuse_single(where: str, poses: FloatArray) -> None:
     """Refuse positions (R, …) that went through single precision, where its steps are large."""
     for name, values in zip("xy", poses.T[:2], strict=True):
-        single = values.astype(np.float32)
-        spacing = float(np.spacing(np.abs(single).max(initial=0.0)))
-        if spacing > _SPACING and np.ptp(values) > 0.0 and (values == single).all():
+        if len(values) and (step := single_step(values)):
             words = f"{where}: {name} is {values[0]:.10g}, and in all rows of single precision"
             hint = "write float64: speeds and accelerations of such positions are noise"
-            raise DataError(f"{words}, which has steps of {spacing:g} m there", hint)
+            raise DataError(f"{words}, which has steps of {step:g} m there", hint)
 
 
 def _apart(pose: FloatArray, other: FloatArray) -> tuple[float, float]:

@@ -388,6 +388,19 @@ def test_places_that_are_no_numbers_are_named_with_their_row(value, town, tmp_pa
         read_tracks(write_tracks(tmp_path / "t.csv", town[0], x_m=x))
 
 
+@pytest.mark.parametrize(("unit", "offset"), [("m", 512_345.0), ("cm", 51_234_500.0)])
+def test_coordinates_of_single_precision_are_refused_where_it_is_coarse(
+    unit, offset, town, tmp_path
+):
+    x = (town[0]["x_m"] * (offset // 512_345) + offset).astype(np.float32).astype(np.float64)
+    what = {"x_m": None, f"x_{unit}": x, "y_m": None, f"y_{unit}": town[0]["y_m"]}
+    path = write_tracks(tmp_path / "t.csv", town[0], **what)
+    with pytest.raises(ConversionError, match=rf"'x_{unit}' is .* row 1, .* steps of 0.0") as error:
+        read_tracks(path, overrides={"shift_m": [-512_345.0, 0.0]})
+    assert "float64" in error.value.hint
+    read_tracks(write_tracks(path, town[0], x_m=town[0]["x_m"].astype(np.float32)))
+
+
 @pytest.mark.parametrize("name", ["vx_mps", "length_m"])
 def test_an_infinite_speed_or_size_is_no_missing_one(name, town, tmp_path):
     values = town[0][name].copy()
