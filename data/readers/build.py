@@ -71,17 +71,21 @@ def make_samples(
 ) -> TrackSamples:
     """A recording from its columns. A rows, one per object and time, in any order.
 
-    Raises ConversionError: a value is not finite, a category is unknown, an object has two rows at
-    one time, nothing is seen for an hour, or the rows span more than a day.
+    Raises ConversionError: a value is not finite, a size negative, a category is unknown, an object
+    has two rows at one time, nothing is seen for an hour, or the rows span more than a day.
     """
     where, warnings = where or name, Counter[str]()
     headings = np.full(len(xy), np.nan) if headings is None else headings
     velocities = np.full((len(xy), 2), np.nan) if velocities is None else velocities
     sizes = np.zeros((len(xy), 2)) if sizes is None else sizes
-    for what, is_bad in ("position", ~np.isfinite(xy)), ("heading", np.isinf(headings)):
+    for what, is_bad, hint in (
+        ("position are not finite", ~np.isfinite(xy), "leave those rows out"),
+        ("heading are not finite", np.isinf(headings), "leave those rows out"),
+        ("size are negative", sizes < 0.0, "turn the sign, or give NaN where it is not known"),
+    ):
         if is_bad.any():
-            words = f"{where}: {is_bad.sum()} values of {what} are not finite"
-            raise ConversionError(words, "leave those rows out")
+            words = f"{where}: {is_bad.sum()} values of {what}, the first in row"
+            raise ConversionError(f"{words} {np.argwhere(is_bad)[0, 0]}", hint)
     if frames is None and (len(time_us) < 2 or time_us.min() == time_us.max()):
         words = f"{where}: {len(time_us)} rows at one time"
         raise ConversionError(words, "give rows at two times or more")

@@ -306,10 +306,13 @@ def _check_sizes(table: TrackTable, out: axes.Diagnostics) -> None:
             f" ({len(large)} rows), at most {_LONGEST:g} m and {_WIDEST:g} m",
             "correct its size, or leave it empty for the usual one of its kind",
         )
-    if (sizes < 0.0).all():
+    if len(rows := np.flatnonzero((sizes < 0.0).any(axis=1))):
+        row, count = rows[0], "all" if len(rows) == len(sizes) else len(rows)
         out.error(
-            "all lengths and widths are negative",
-            "turn the signs: [columns] length = '-NAME', width = '-NAME'; or leave the columns out",
+            f"{count} lengths and widths are negative, the first {sizes[row].min():g} m, of object"
+            f" {table.track_ids[table.track[row]].item()!r} at {table.time[row]:g} s",
+            "turn the signs: [columns] length = '-NAME', width = '-NAME'; or leave the columns out,"
+            " or those cells that are not known empty",
         )
     lengths = sizes[table.is_of(AgentKind.PEDESTRIAN), 0]
     lengths = lengths[lengths > 0.0]

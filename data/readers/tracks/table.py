@@ -351,13 +351,18 @@ class _TableFile(SourceFile):
             "write each into a file of its own",
         )
         column = self.table[name]
-        if empty := int(column.is_null(nan_is_null=True).to_numpy().sum()):
-            raise self.fault(f"column {name!r} is empty in {empty} rows", "give objects ids")
-        if pa.types.is_floating(column.type):
+        is_float, is_integer = pa.types.is_floating(column.type), pa.types.is_integer(column.type)
+        empty = column.is_null(nan_is_null=True).to_numpy()
+        if not is_float and not is_integer:
+            column = self._cast(name, pa.string(), "texts in UTF-8")
+            empty = empty | (pa.compute.utf8_trim_whitespace(column).to_numpy() == "")
+        if empty.any():
+            what = f"column {name!r} is empty in {empty.sum()} rows, the first in data row"
+            raise self.fault(f"{what} {empty.argmax() + 1}", "give objects ids")
+        if is_float:
             values = column.to_numpy()
-            if (values == np.rint(values)).all():
-                return pa.chunked_array([values.astype(np.int64)])
-        is_integer = pa.types.is_integer(column.type)
+            is_integer = bool((values == np.rint(values)).all())
+            column = pa.chunked_array([values.astype(np.int64)]) if is_integer else column
         return column if is_integer else self._cast(name, pa.string(), "texts in UTF-8")
 
     def _cast(self, name: str, kind: pa.DataType, need: str) -> pa.ChunkedArray:

@@ -200,6 +200,18 @@ SPOILT = {
         "length = '-NAME'",
         {"columns": {"length": "-length_m", "width": "-width_m"}},
     ),
+    "negative lengths": (
+        _times(("length_m",), -1),
+        "all lengths and widths are negative, the first -",
+        "length = '-NAME'",
+        {"columns": {"length": "-length_m"}},
+    ),
+    "a negative width": (
+        lambda c: {"width_m": np.where(np.arange(len(c["track"])) == 7, -1.0, c["width_m"])},
+        "1 lengths and widths are negative, the first -1 m, of object",
+        "cells that are not known empty",
+        None,
+    ),
     "one car of 300 m": (
         lambda c: {"length_m": np.where(c["track"] == c["track"][0], 300.0, c["length_m"])},
         "300 m long",
@@ -535,6 +547,16 @@ def test_times_may_be_dates_or_durations(kind, town, tmp_path):
     found = read_tracks(tmp_path / "t.parquet", overrides={"units": {"time": unit}})
     assert set(np.diff(np.unique(found.time_us)).tolist()) == {1_000_000}
     assert found.time_us.min() == 1_700_000_000_000_000
+
+
+@pytest.mark.parametrize("empty", ["", " "])
+def test_an_empty_text_is_no_id(empty, town, tmp_path):
+    names = np.array([f"car{number}" for number in town[0]["track"]])
+    names[[3, 5]] = empty
+    with pytest.raises(
+        ConversionError, match="'track' is empty in 2 rows, the first in data row 4"
+    ):
+        read_tracks(write_tracks(tmp_path / "t.csv", town[0], track=names))
 
 
 def test_objects_without_an_id_are_named(town, tmp_path):

@@ -174,7 +174,11 @@ def test_five_pedestrians_that_walk_tell_the_clock(count, speed, last, words):
         ([(4.5, 2.91)] * 3, "2.91 m wide"),
         ([(4.5, 1.9), (4.5, 1.9), (0.9, 0.5)], ""),
         ([(-4.5, -1.9)] * 3, "all lengths and widths are negative"),
-        ([(-0.9, -0.5), (-0.9, -0.5), (0.9, 0.5)], "0.9 m long"),
+        (
+            [(4.5, 1.9), (4.5, -1.9), (4.5, 1.9)],
+            "91 lengths and widths are negative, the first -1.9",
+        ),
+        ([(0.0, 0.0), (0.0, 0.0), (0.9, 0.5)], "0.9 m long"),
     ],
 )
 def test_sizes_of_vehicles(sizes, words):
@@ -189,7 +193,7 @@ def test_sizes_of_vehicles(sizes, words):
     [
         ([2.0, 2.0, 9.0], ""),
         ([2.01, 2.01, 0.5], "the median pedestrian is 2.01 m long"),
-        ([-9.0, 3.0, -9.0], "the median pedestrian is 3 m long"),
+        ([0.0, 3.0, np.nan], "the median pedestrian is 3 m long"),
         ([np.nan] * 3, ""),
     ],
 )

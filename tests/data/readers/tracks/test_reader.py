@@ -192,6 +192,15 @@ def test_arrays_of_headings_in_degrees_are_refused(town):
     assert "np.deg2rad" in e.value.hint
 
 
+def test_arrays_of_negative_sizes_are_refused(town):
+    width = town[0]["width_m"].copy()
+    width[7] = -1.0
+    with pytest.raises(
+        ConversionError, match="t: 1 values of size are negative, the first in row 7"
+    ):
+        _samples(town[0], width_m=width)
+
+
 def test_two_rows_of_an_object_at_one_time_are_refused(town):
     twice = {name: np.r_[values, values[:1]] for name, values in town[0].items()}
     with pytest.raises(ConversionError, match="has two rows at"):
