@@ -212,7 +212,7 @@ def tracks(
         report = convert_tracks(inspection, folder, egos=egos, replace=replace)
     except ConversionError:
         for wrong in errors:
-            echo(f" wrong: {wrong.what}\n   remedy: {wrong.remedy}")
+            echo(f" wrong: {source[0]}: {wrong.what}\n   remedy: {wrong.remedy}", err=True)
         _draw_tracks(picture, inspection, None)
         if not errors:
             raise
@@ -222,6 +222,7 @@ def tracks(
     names = {role: column.words for role, column in read.found.items()}
     if as_json:
         content = _contents(report) | {"city": report.name, "summary": asdict(report.recordings[0])}
+        content["unusual"] = [warning._asdict() for warning in inspection.diagnostics.warnings]
         print_json(content | {"figures": inspection.diagnostics.figures, "columns": names})
     else:
         echo(f"map {report.name}: {report.lanes} lanes and connectors")

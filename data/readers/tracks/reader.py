@@ -152,7 +152,9 @@ def convert_tracks(
     errors, road, name = reader.diagnostics.errors, reader.road, reader.table.name
     if errors:
         what = "; ".join(error.what for error in errors)
-        raise ConversionError(what, "; ".join(error.remedy for error in errors))
+        raise ConversionError(
+            f"{reader.source}: {what}", "; ".join(error.remedy for error in errors)
+        )
     path = map_file(store, road.name)
     if (store / MANIFEST).is_file() and path.is_file():
         with TemporaryDirectory() as folder:  # equal maps have equal bytes

@@ -1,6 +1,7 @@
 """Tables of tracks become the scenarios that the same recording in the layout of DSC3D becomes."""
 
 import json
+import re
 
 import numpy as np
 import pyarrow as pa
@@ -356,8 +357,10 @@ def test_the_command_converts_and_draws_what_is_right_and_what_is_wrong(town, tm
     code, out, _ = _convert(tmp_path, capsys, right, town[1], "--store", tmp_path / "s")
     assert (code, "scenarios → " in out) == (0, True)
     assert "x = x_m" in out
-    code, out, err = _convert(tmp_path, capsys, wrong, town[1], "--store", tmp_path / "w")
-    assert (code, "with y mirrored" in out, "1 thing cannot be right" in err) == (2, True, True)
+    words = (wrong, town[1], "--store", tmp_path / "w", "--json")
+    code, out, err = _convert(tmp_path, capsys, *words)
+    assert (code, out, "1 thing cannot be right" in err) == (2, "", True)
+    assert re.search("wrong: .*wrong.csv: .* with y mirrored\n.*remedy: .*y = '-y_m'", err)
     assert not (tmp_path / "w/store.json").exists()
     pytest.importorskip("matplotlib")
     assert (tmp_path / "s/reports/map_right.png").stat().st_size > 10_000
@@ -367,7 +370,7 @@ def test_the_command_converts_and_draws_what_is_right_and_what_is_wrong(town, tm
     (tmp_path / "c.toml").write_text("[columns]\ny = '-y_m'\n")
     words = (wrong, town[1], "--store", tmp_path / "w", "--columns", "c.toml", "--json")
     code, out, _ = _convert(tmp_path, capsys, *words)
-    assert (code, json.loads(out)["city"]) == (0, "map")
+    assert (code, json.loads(out)["city"], json.loads(out)["unusual"]) == (0, "map", [])
 
 
 def test_the_command_says_why_no_scenario_is_left(town, tmp_path, capsys):
