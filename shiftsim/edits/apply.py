@@ -69,6 +69,14 @@ def _apply_tables(scenario: Scenario, edit: spec.Edit) -> Scenario:
     builder, speed = ScenarioBuilder(scenario, edit, seed), edit.speed
     if edit.window_s is not None:
         _set_window(builder, edit.window_s)
+    end = builder.seconds[builder.scenario.iteration_rows[-1]]
+    for name in ("slow", "stop", "light"):
+        for table in getattr(edit, name):
+            if table.from_s >= end:
+                what = (
+                    f"{name}: from_s is {table.from_s:g}, when the scenario of {end:.1f} s is over"
+                )
+                raise ConfigError(what, f"give a time from 0 to {end:.1f} s, or a longer window_s")
     for remove in edit.remove:
         _remove(builder, remove)
     _change_motion(builder)

@@ -311,6 +311,10 @@ def _contradictions(edit: Edit) -> Iterator[tuple[str, str]]:
         yield ": give either tokens or a split", ""
     if any(bool(light.connectors) == light.route for light in edit.light):
         yield ", light: give either connectors or route = true", ""
+    if any(light.to_s is not None and light.to_s <= light.from_s for light in edit.light):
+        yield ", light: to_s is not after from_s", "leave to_s out for the end of the scenario"
+    if any(not block.length_m for block in edit.block_lane):
+        yield ", block_lane: length_m is 0", "give the length of what is closed, such as 10"
     if any(not slow.tokens and not slow.kinds for slow in edit.slow):
         yield ", slow: say which tracks, by tokens or kinds", ""
     if any(not stop.tokens for stop in edit.stop):
@@ -346,7 +350,9 @@ def _check(name: str, value: Any, where: str) -> None:
     """Refuse a number that is none or negative, and a word that is not among the choices."""
     if isinstance(value, (int, float)):
         if not math.isfinite(value) or (value < 0.0 and name not in _FREE_SIGN):
-            raise ConfigError(f"{where}: {name} {value!r} is not a number that it can be")
+            signed = "finite" if name in _FREE_SIGN else "0 or more"
+            allowed = "from 0 to 1" if name in ("factor", "share") else signed
+            raise ConfigError(f"{where}: {name} {value!r} must be {allowed}")
     elif value and name in _CHOICES:
         one_of(f"{where}: {name}", value, _CHOICES[name])
 
