@@ -45,10 +45,8 @@ def store_path(name: str | Path) -> Path:
     """
     name = str(name)
     path = expand(name)
-    if len(path.parts) != 1 or name in (".", ".."):
-        return path
-    if "/" in name:  # `./x`, which a Path would make the name `x`
-        return path.absolute()
+    if "/" in name or name == ".." or len(path.parts) != 1:  # the Path of `./x` would be a name
+        return path.absolute() if len(path.parts) == 1 else path
     below = Path(os.environ.get("SHIFTSIM_DATA", "shiftsim-data")) / name
     return path if (path / "store.json").is_file() and not below.exists() else below
 

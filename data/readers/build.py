@@ -78,14 +78,12 @@ def make_samples(
     headings = np.full(len(xy), np.nan) if headings is None else headings
     velocities = np.full((len(xy), 2), np.nan) if velocities is None else velocities
     sizes = np.zeros((len(xy), 2)) if sizes is None else sizes
-    for what, is_bad, hint in (
-        ("position are not finite", ~np.isfinite(xy), "leave those rows out"),
-        ("heading are not finite", np.isinf(headings), "leave those rows out"),
-        ("size are negative", sizes < 0.0, "turn the sign, or give NaN where it is not known"),
-    ):
+    wrong = {"position are not finite": ~np.isfinite(xy), "size are negative": sizes < 0.0}
+    for what, is_bad in (wrong | {"heading are not finite": np.isinf(headings)}).items():
         if is_bad.any():
-            words = f"{where}: {is_bad.sum()} values of {what}, the first in row"
-            raise ConversionError(f"{words} {np.argwhere(is_bad)[0, 0]}", hint)
+            first = f"the first in row {np.argwhere(is_bad)[0, 0]}"
+            hint = "leave those rows out, or give NaN for a heading or size that is not known"
+            raise ConversionError(f"{where}: {is_bad.sum()} values of {what}, {first}", hint)
     if frames is None and (len(time_us) < 2 or time_us.min() == time_us.max()):
         words = f"{where}: {len(time_us)} rows at one time"
         raise ConversionError(words, "give rows at two times or more")
@@ -108,11 +106,8 @@ def make_samples(
     derived, contradicts = velocity_rule(velocities, xy, time, track, frames.period)
     contradicts[track[(np.abs(velocities) > _MAX_SPEED).any(axis=1)]] = True
     velocities = motion.believed_velocities(velocities, derived, contradicts, track, warnings)
-    if len(beyond := motion.beyond_turn(headings, velocities)):
-        row = beyond[0]
-        words = f"{where}: {len(beyond)} headings are beyond 2 pi rad, such as {headings[row]:g} of"
-        words += f" object {track_ids[track[row]].item()!r} at {time[row]:g} s"
-        raise ConversionError(words, "give radians within ±pi: np.deg2rad(degrees)")
+    if words := motion.beyond_turn(headings, velocities, time, track, track_ids):
+        raise ConversionError(f"{where}: {words}", "give radians within ±pi: np.deg2rad(degrees)")
     raw = full_headings(headings, velocities, track, warnings)
     samples = TrackSamples(
         name=name,

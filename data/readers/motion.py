@@ -5,6 +5,7 @@ Rows are sorted by track, then time, as in `TrackSamples`.
 
 from collections import Counter
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -48,16 +49,20 @@ def unit_vectors(headings: FloatArray) -> FloatArray:
     return np.column_stack([np.cos(headings), np.sin(headings)])
 
 
-def beyond_turn(headings: FloatArray, velocities: FloatArray) -> IntArray:
-    """(n,) rows with headings (A,) beyond a whole turn [rad], as degrees are.
+def beyond_turn(
+    headings: FloatArray, velocities: FloatArray, time: FloatArray, track: IntArray, ids: Any
+) -> str:
+    """What is wrong with headings (A,) beyond a whole turn [rad], as degrees are.
 
-    None where those of them that move (A, 2) point ahead: radians that were unwrapped.
+    Nothing where those of them that move, (A, 2), point ahead: radians that were unwrapped.
     """
     rows = np.flatnonzero(np.abs(headings) > _TURN)
-    way, ahead = velocities[rows], unit_vectors(headings[rows])
-    speed = np.hypot(*way.T)
-    cos = (way * ahead).sum(axis=1)[speed > FAST] / speed[speed > FAST]
-    return rows[:0] if len(cos) and np.median(cos) > np.cos(MAX_HEADING) else rows
+    speed, ahead = np.hypot(*velocities[rows].T), unit_vectors(headings[rows])
+    cos = ((velocities[rows] * ahead).sum(axis=1) / np.maximum(speed, FAST))[speed > FAST]
+    if not len(rows) or (len(cos) and np.median(cos) > np.cos(MAX_HEADING)):
+        return ""
+    first = f"{headings[rows[0]]:g} of object {ids[track[rows[0]]].item()!r} at {time[rows[0]]:g} s"
+    return f"{len(rows)} headings are beyond 2 pi rad, such as {first}"
 
 
 def fitted_velocities(

@@ -218,6 +218,7 @@ def tracks(
             raise
         echo(f"error: {source[0]}: {plural(len(errors), 'thing')} cannot be right", err=True)
         raise typer.Exit(cli.DATA) from None
+    _draw_tracks(picture, inspection, folder)
     read = inspection.table.columns
     names = {role: column.words for role, column in read.found.items()}
     if as_json:
@@ -226,8 +227,6 @@ def tracks(
         print_json(content | {"figures": inspection.diagnostics.figures, "columns": names})
     else:
         echo(f"map {report.name}: {report.lanes} lanes and connectors")
-        for name, count in report.map_warnings.items():
-            echo(f" map: {name} ({count})")
         echo(f" columns: {', '.join(f'{ours} = {name}' for ours, name in names.items())}")
         for what, value in ("layout", read.layout), ("point given", read.reference):
             if value:
@@ -237,8 +236,6 @@ def tracks(
         echo("\n".join(_recording_lines(report)))
         for warning in inspection.diagnostics.warnings:
             echo(f" unusual: {warning.what}\n   remedy: {warning.remedy}")
-    _draw_tracks(picture, inspection, folder)
-    if not as_json:
         echo(f" {plural(report.accepted, 'scenario')} → {folder}")
         echo(f" next: shiftsim check {store}, then shiftsim run --planner idm --store {store}")
 
@@ -332,8 +329,6 @@ def _site_lines(report: "ConversionReport", store: Path, *, is_short: bool) -> "
         f"site {report.name}: {report.lanes} lanes and connectors, "
         f"{100.0 * report.details['drivable_share']:.1f} % of moving vehicles on drivable area"
     )
-    for name, count in report.map_warnings.items():
-        yield f" map: {name} ({count})"
     yield from _recording_lines(report)
     for name, reason in report.skipped.items():
         yield f" skipped: {name}: {reason}"
@@ -345,6 +340,8 @@ def _site_lines(report: "ConversionReport", store: Path, *, is_short: bool) -> "
 
 
 def _recording_lines(report: "ConversionReport") -> "Iterator[str]":
+    for name, count in report.map_warnings.items():
+        yield f" map: {name} ({count})"
     for summary in report.recordings:
         yield (
             f" {summary.name}: {summary.duration_s:.1f} s, {plural(summary.tracks, 'track')}, "

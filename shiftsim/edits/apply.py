@@ -73,9 +73,7 @@ def _apply_tables(scenario: Scenario, edit: spec.Edit) -> Scenario:
     for name in ("slow", "stop", "light"):
         for table in getattr(edit, name):
             if table.from_s >= end:
-                what = (
-                    f"{name}: from_s is {table.from_s:g}, when the scenario of {end:.1f} s is over"
-                )
+                what = f"{name}: from_s is {table.from_s:g}, the scenario ends at {end:.1f} s"
                 raise ConfigError(what, f"give a time from 0 to {end:.1f} s, or a longer window_s")
     for remove in edit.remove:
         _remove(builder, remove)

@@ -77,10 +77,10 @@ def _jaywalker(scenario: Scenario, draws: random.Random) -> Tables | None:
     if ahead > _driven(scenario) or not _is_straight(scenario, ahead):
         return None
     walk = {
-        "from": {"ahead_m": _rounded(ahead), "left_m": _rounded(side * aside)},
-        "to": {"ahead_m": _rounded(ahead), "left_m": _rounded(-side * aside)},
-        "ego_within_m": _rounded(within),
-        "speed_mps": _rounded(pace),
+        "from": {"ahead_m": round(ahead, 2), "left_m": round(side * aside, 2)},
+        "to": {"ahead_m": round(ahead, 2), "left_m": round(-side * aside, 2)},
+        "ego_within_m": round(within, 2),
+        "speed_mps": round(pace, 2),
     }
     return {"walk": [walk]}
 
@@ -90,8 +90,8 @@ def _parked(scenario: Scenario, draws: random.Random) -> Tables | None:
     ahead, left = draws.uniform(15.0, 70.0), draws.uniform(-2.0, 1.0)
     if ahead > _driven(scenario):
         return None
-    place = {"ahead_m": _rounded(ahead), "left_m": _rounded(left)}
-    spawn = {"at": place | {"turn": _rounded(draws.uniform(-0.1, 0.1))}, "behavior": "stopped"}
+    place = {"ahead_m": round(ahead, 2), "left_m": round(left, 2)}
+    spawn = {"at": place | {"turn": round(draws.uniform(-0.1, 0.1), 2)}, "behavior": "stopped"}
     return {"spawn": [spawn]}
 
 
@@ -100,7 +100,7 @@ def _works(scenario: Scenario, draws: random.Random) -> Tables | None:
     ahead, length = draws.uniform(20.0, 70.0), draws.uniform(4.0, 16.0)
     if ahead > _driven(scenario):
         return None
-    block = {"at": {"ahead_m": _rounded(ahead)}, "length_m": _rounded(length), "taper_m": 4.0}
+    block = {"at": {"ahead_m": round(ahead, 2)}, "length_m": round(length, 2), "taper_m": 4.0}
     return {"block_lane": [block]}
 
 
@@ -109,10 +109,6 @@ KINDS: dict[str, Callable[[Scenario, random.Random], Tables | None]] = {
     "parked": _parked,
     "works": _works,
 }
-
-
-def _rounded(value: float) -> float:
-    return round(value, 2)
 
 
 def _driven(scenario: Scenario) -> float:

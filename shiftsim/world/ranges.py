@@ -70,10 +70,7 @@ def require(
 
 
 def single_step(values: NDArray[np.float64], unit: float = 1.0) -> float:
-    """Steps of positions (n,) that are all of single precision, where these are coarse [m]; else 0.
-
-    Speeds and accelerations of such positions are noise.
-    """
+    """Steps of positions (n,) [m] that are of single precision where it is coarse; else 0."""
     single = values.astype(np.float32)
     step = unit * float(np.spacing(np.abs(single).max()))
     return step if step > _COARSE and np.ptp(values) > 0.0 and (values == single).all() else 0.0

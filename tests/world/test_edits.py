@@ -259,10 +259,10 @@ def test_the_path_goes_on_beyond_the_recording(scene):
         ({"spawn": {"at": {"ahead_m": 30.0, "left_m": 12.0}}}, "is on no lane"),
         ({"remove": {"tokens": ["nobody"]}}, "there is no track 'nobody'"),
         ({"light": {"connectors": ["10"], "status": "red"}}, "'10' is a lane"),
-        ({"light": {"route": True, "status": "red", "from_s": 6.0}}, "light: from_s is 6, when"),
+        ({"light": {"route": True, "status": "red", "from_s": 6.0}}, "light: from_s is 6, the"),
         (
             {"stop": {"tokens": ["0" * 16], "from_s": 99.0}},
-            "from_s is 99, when the scenario of 6.0 s",
+            "from_s is 99, the scenario ends at 6.0 s",
         ),
         ({"slow": {"factor": 0.5, "kinds": ["vehicle"], "from_s": 6.0}}, "slow: from_s is 6"),
         ({"reroute": {"route": ["3"]}}, "does not hold roadblock '1' of the ego"),

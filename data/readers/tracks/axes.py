@@ -66,16 +66,11 @@ class Guess:
         """What to write into the TOML file, by the names of the columns."""
         out = []
         if self.axes:
-            rows = [
-                f"{axis} = '{'-' if row.sum() < 0 else ''}{(x, y)[int(row[1] != 0)]}'".replace(
-                    "--", ""
-                )
-                for axis, row in zip("xy", _AXES[self.axes], strict=True)
-            ]
-            out.append(
-                f"[columns] {', '.join(rows)} (heading and velocities too, where they have these"
-                " axes)"
-            )
+            rows = _AXES[self.axes].tolist()
+            named = ["-" * (sum(row) < 0) + (x, y)[row[1] != 0] for row in rows]
+            x, y = (name.replace("--", "") for name in named)
+            also = "heading and velocities too, where they have these axes"
+            out.append(f"[columns] x = '{x}', y = '{y}' ({also})")
         if self.unit != "m":
             out.append(f"[units] position = {self.unit!r}")
         if self.shift.any():
@@ -232,13 +227,10 @@ def check_headings(table: TrackTable, fit: Fit, out: Diagnostics) -> None:
             best if fits else f"no other unit or axis fits; {leave_out}",
         )
         return
-    if len(beyond := motion.beyond_turn(table.headings, fit.turned(table.derived))):
-        row, is_rad = beyond[0], column.unit == "rad"
-        out.error(
-            f"{len(beyond)} headings are beyond 2 pi rad, such as {table.headings[row]:g} of object"
-            f" {table.track_ids[table.track[row]].item()!r} at {table.time[row]:g} s",
-            [*guesses][1] if is_rad else f"write angles within a turn; or {leave_out}",
-        )
+    velocities, when = fit.turned(table.derived), (table.time, table.track, table.track_ids)
+    if what := motion.beyond_turn(table.headings, velocities, *when):
+        usual = f"write angles within a turn; or {leave_out}"
+        out.error(what, [*guesses][1] if column.unit == "rad" else usual)
     backwards = float((np.abs(wrap_angles(heading - direction)) > quarter).mean())
     out.figures["backwards_share"] = backwards
     if backwards > _MAX_BACKWARDS:

@@ -13,7 +13,6 @@ from shiftsim.data.readers.tracks import axes
 from shiftsim.data.readers.tracks.axes import MIN_ALONG, Fit, fit_map
 from shiftsim.data.readers.tracks.table import TrackTable
 from shiftsim.errors import listed
-from shiftsim.kernels import FloatArray
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import AgentKind
 
@@ -109,17 +108,25 @@ def _check_times(table: TrackTable, out: axes.Diagnostics) -> bool:
 
 
 def _check_jumps(table: TrackTable, out: axes.Diagnostics) -> bool:
-    """Single rows that are far from their neighbours; whether speeds mean anything beside them."""
+    """Steps that no motion explains, or not that beside them; whether speeds mean anything then."""
     same = np.diff(table.track) == 0
     step, way = np.diff(table.time), np.hypot(*np.diff(table.xy, axis=0).T)
     far = np.flatnonzero(same & (way > _JUMP) & (way > _JUMP_SPEED * step))
     out.figures["jumps"] = float(len(far))
+    speed = np.divide(way, step, out=np.full(len(way), np.inf), where=same)
     if not len(far):
-        speed = np.divide(way, step, out=np.full(len(way), np.inf), where=same)
-        _check_leaps(table, step, way, speed, out)
+        own = np.minimum(np.r_[np.inf, speed[:-1]], np.r_[speed[1:], np.inf])[same]
+        usual = own * step[same] + _GAIN * step[same] ** 2
+        rows = np.flatnonzero(same)[way[same] - usual > _LEAP]
+        for row in rows[:1].tolist():
+            out.warn(
+                f"object {table.name_of(row)} moves {way[row]:.1f} m within {step[row]:g} s at"
+                f" {table.time[row]:g} s, farther than its speed before and after explains"
+                f" ({len(rows)} such steps)",
+                "swapped ids, or a wrong row: give objects ids of their own, or leave the row out",
+            )
         return True
-    speed = way[same] / step[same]
-    if np.median(speed[speed > _MOVING]) > _MAX_SPEED:
+    if np.median(speed[same & (speed > _MOVING)]) > _MAX_SPEED:
         return True  # all do: a matter of units
     remedy = "one id names two objects, or a row is wrong: give objects ids of their own"
     for axis, places in zip("xy", table.xy[far + 1].T, strict=True):
@@ -131,30 +138,12 @@ def _check_jumps(table: TrackTable, out: axes.Diagnostics) -> bool:
             )
     row = far[0]
     out.error(
-        f"object {table.track_ids[table.track[row]].item()!r} jumps {way[row]:.1f} m within"
-        f" {table.time[row + 1] - table.time[row]:g} s at {table.time[row]:g} s ({len(far)}"
-        f" such jumps; more than {_JUMP_SPEED:g} m/s is no motion)",
+        f"object {table.name_of(row)} jumps {way[row]:.1f} m within {step[row]:g} s at"
+        f" {table.time[row]:g} s ({len(far)} such jumps; more than {_JUMP_SPEED:g} m/s is no"
+        " motion)",
         remedy,
     )
     return len(far) < 0.01 * int(same.sum())
-
-
-def _check_leaps(
-    table: TrackTable, step: FloatArray, way: FloatArray, speed: FloatArray, out: axes.Diagnostics
-) -> None:
-    """Steps [s], [m] that the speed of the object before and after does not explain."""
-    own = np.minimum(np.r_[np.inf, speed[:-1]], np.r_[speed[1:], np.inf])  # inf between objects
-    rows = np.flatnonzero(np.isfinite(speed))
-    rows = rows[way[rows] - own[rows] * step[rows] - _GAIN * step[rows] ** 2 > _LEAP]
-    if len(rows):
-        row = rows[0]
-        out.warn(
-            f"object {table.track_ids[table.track[row]].item()!r} moves {way[row]:.1f} m within"
-            f" {step[row]:g} s at {table.time[row]:g} s, at {own[row]:.1f} m/s before or after"
-            f" ({len(rows)} such steps)",
-            "ids that are swapped or used again, or a wrong row: give objects ids of their own, or"
-            " leave the row out; an ego would drive so in log replay",
-        )
 
 
 def _check_speeds(table: TrackTable, out: axes.Diagnostics) -> bool:
@@ -219,11 +208,9 @@ def _check_map(table: TrackTable, road: VectorMap, min_share: float, out: axes.D
     fast = table.moving_rows(FAST)
     # another unit of length would show elsewhere, too
     is_metric = table.vehicle_size is not None and _is_usual(*table.vehicle_size)
-    if is_metric and np.isfinite(stored).any() and len(fast):
+    if is_metric := is_metric and len(fast) > 0 and bool(np.isfinite(stored).any()):
         wrong, _ = contradiction(stored, table.derived, table.time, table.track)
         is_metric = bool(wrong[table.track[fast]].mean() <= axes.LEAST_CONTRADICTING)
-    else:
-        is_metric = False
     fit = fit_map(road, table.xy[moving], table.derived[moving], min_share, only_metres=is_metric)
     out.figures |= {"drivable_share": fit.share, "along_share": fit.along}
     if fit.is_good:
@@ -235,11 +222,10 @@ def _check_map(table: TrackTable, road: VectorMap, min_share: float, out: axes.D
                 "check --hz or the unit of time, unless the limits of the map are wrong",
             )
         return fit
-    what = f"only {fit.along:.0%} of the moving vehicles drive along the lane they are on, need"
-    what += f" {MIN_ALONG:.0%}"
+    what, share, least = "drive along the lane they are on", fit.along, MIN_ALONG
     if fit.share < min_share:
-        what = f"only {fit.share:.0%} of the moving vehicles are on drivable area, need"
-        what += f" {min_share:.0%}"
+        what, share, least = "are on drivable area", fit.share, min_share
+    what = f"only {share:.0%} of the moving vehicles {what}, need {least:.0%}"
     remedy = (
         "no other unit, axis or origin fits better: give the map of this place, and check that it"
         " is of this recording"
@@ -300,19 +286,18 @@ def _check_sizes(table: TrackTable, out: axes.Diagnostics) -> None:
     large = np.flatnonzero((sizes[:, 0] > _LONGEST) | (sizes[:, 1] > _WIDEST))
     if 0 < len(large) < 0.5 * len(sizes):
         row = large[0]
-        name = table.track_ids[table.track[row]].item()
         out.error(
-            f"object {name!r} is {sizes[row, 0]:.4g} m long and {sizes[row, 1]:.4g} m wide"
-            f" ({len(large)} rows), at most {_LONGEST:g} m and {_WIDEST:g} m",
+            f"object {table.name_of(row)} is {sizes[row, 0]:.4g} m long and {sizes[row, 1]:.4g} m"
+            f" wide ({len(large)} rows), at most {_LONGEST:g} m and {_WIDEST:g} m",
             "correct its size, or leave it empty for the usual one of its kind",
         )
     if len(rows := np.flatnonzero((sizes < 0.0).any(axis=1))):
         row, count = rows[0], "all" if len(rows) == len(sizes) else len(rows)
         out.error(
-            f"{count} lengths and widths are negative, the first {sizes[row].min():g} m, of object"
-            f" {table.track_ids[table.track[row]].item()!r} at {table.time[row]:g} s",
+            f"{count} lengths and widths are negative, the first {np.nanmin(sizes[row]):g} m, of"
+            f" object {table.name_of(row)} at {table.time[row]:g} s",
             "turn the signs: [columns] length = '-NAME', width = '-NAME'; or leave the columns out,"
-            " or those cells that are not known empty",
+            " or cells that are not known empty",
         )
     lengths = sizes[table.is_of(AgentKind.PEDESTRIAN), 0]
     lengths = lengths[lengths > 0.0]

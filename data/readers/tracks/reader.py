@@ -28,7 +28,6 @@ from shiftsim.data.store.map import write_map
 from shiftsim.data.store.reading import read_report
 from shiftsim.data.store.tables import MANIFEST, digest, map_file
 from shiftsim.errors import ConversionError, plural
-from shiftsim.kernels import FloatArray
 from shiftsim.world.map import VectorMap
 
 
@@ -54,13 +53,14 @@ class TracksReader(Reader):
         self.paths = [tracks] if isinstance(tracks, Path) else tracks
         self.source, self.map_path = self.paths[0], map_path
         table = read_tracks(self.paths, overrides=overrides, hz=hz)
-        self.tables = [digest(path) for path in self.paths]  # tells others of that name apart
         drive, self.name = read_opendrive(map_path), city or map_path.stem
         self.site: BuiltMap = opendrive_site(drive, name=self.name, country=config.country)
         if table.origin and "shift_m" not in (overrides or {}):
             table = _at_origin(table, self.road, table.origin)
         self.table, self.diagnostics = table, diagnose(table, self.road, config.min_drivable_share)
         _note_inputs(self.paths, table, self.diagnostics)
+        tables = [digest(path) for path in self.paths]  # which others of that name have not
+        self.details = {"figures": self.diagnostics.figures, "tables": tables}
         columns = asdict(table.columns) | {"hz": table.hz}
         self.settings: dict[str, Any] = {"config": asdict(config), "columns": columns, "egos": None}
 
@@ -99,22 +99,15 @@ class TracksReader(Reader):
             config=self.config,
             egos=self.egos,
             needs_scenario=True,
-            details={
-                "figures": self.diagnostics.figures,
-                "columns": columns,
-                "tables": self.tables,
-            },
+            details=self.details | {"columns": columns},
         )
 
 
 def _at_origin(table: TrackTable, road: VectorMap, origin: tuple[float, float]) -> TrackTable:
     """Tracks moved by the origin of their frame, where that brings them nearer to the map."""
-    middle, (low, high) = np.median(table.xy, axis=0), extent_of(road)
-
-    def gap(place: FloatArray) -> float:
-        return float(np.hypot(*(place - np.clip(place, low, high))))
-
-    if gap(middle + origin) >= gap(middle):
+    middles = np.median(table.xy, axis=0) + np.array([(0.0, 0.0), origin])
+    gap, gap_then = np.hypot(*(middles - np.clip(middles, *extent_of(road))).T)
+    if gap_then >= gap:
         return table
     return replace(table, xy=table.xy + origin, columns=replace(table.columns, shift=origin))
 
@@ -137,11 +130,7 @@ def _note_inputs(files: Sequence[Path], table: TrackTable, out: Diagnostics) -> 
 
 
 def convert_tracks(
-    reader: TracksReader,
-    store: Path,
-    *,
-    egos: Sequence[str] | None = None,
-    replace: bool = False,
+    reader: TracksReader, store: Path, *, egos: Sequence[str] | None = None, replace: bool = False
 ) -> ConversionReport:
     """Add tracks to a store, made if needed; what it held of the same tables is replaced.
 
@@ -149,12 +138,10 @@ def convert_tracks(
     something cannot be right, no scenario is left, or the store has another map of that name, or
     the recording of that name from other tables, unless these are to be replaced.
     """
-    errors, road, name = reader.diagnostics.errors, reader.road, reader.table.name
+    errors, road = reader.diagnostics.errors, reader.road
     if errors:
-        what = "; ".join(error.what for error in errors)
-        raise ConversionError(
-            f"{reader.source}: {what}", "; ".join(error.remedy for error in errors)
-        )
+        what, remedy = map("; ".join, zip(*errors, strict=True))
+        raise ConversionError(f"{reader.source}: {what}", remedy)
     path = map_file(store, road.name)
     if (store / MANIFEST).is_file() and path.is_file():
         with TemporaryDirectory() as folder:  # equal maps have equal bytes
@@ -162,10 +149,11 @@ def convert_tracks(
             if digest(written) != digest(path):
                 what = f"{reader.map_path}: store {store} has another map named {road.name!r}"
                 raise ConversionError(what, "name this one: --city NAME; or give another --store")
-    before = read_report(store, road.name).get("recordings", {}).get(name, {})
-    if not replace and before.get("tables", reader.tables) != reader.tables:
+    before, tables = read_report(store, road.name), reader.details["tables"]
+    before = before.get("recordings", {}).get(reader.table.name, {})
+    if not replace and before.get("tables", tables) != tables:
         count = plural(before["summary"]["accepted"], "scenario")
-        what = f"{reader.source}: store {store} has {name!r} of another table, with {count}"
+        what = f"{reader.source}: store {store} has that recording of another table, {count}"
         raise ConversionError(what, "rename the file to add both; --replace to lose that one")
     reader.egos = reader.settings["egos"] = egos
     return convert(reader, store)

@@ -65,6 +65,10 @@ class TrackTable:
         """(N + 1,) first row of every object, and the number of rows."""
         return motion.track_ends(self.track)
 
+    def name_of(self, row: int) -> str:
+        """The object of a row, for messages."""
+        return repr(self.track_ids[self.track[row]].item())
+
     def is_of(self, kind: AgentKind) -> BoolArray:
         """(A,) whether a row is of an object of a kind."""
         known = [KINDS.get(name) == kind for name in self.categories]
@@ -296,11 +300,8 @@ class _TableFile(SourceFile):
             kept = values[np.isfinite(values)]
             self.require(QUANTITIES[role], kept, f"column {column.name!r}")
         if needed and (step := single_step(raw, abs(column.factor(role)))):
-            what = (
-                f"column {column.name!r} is {raw[0]:.10g} in data row 1, and in all rows of single"
-            )
-            what += f" precision, which has steps of {step:g} m there"
-            raise self.fault(what, "write float64, or subtract the origin before writing float32")
+            what = f"in data row 1, {raw[0]:.10g}, and all others has steps of {step:g} m: float32"
+            raise self.fault(f"column {column.name!r} {what}", "write float64")
         return np.pi / 2 - values if column.unit == "compass" else values
 
     def times(self) -> tuple[IntArray, float | None]:

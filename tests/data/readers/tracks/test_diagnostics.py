@@ -407,7 +407,9 @@ def test_coordinates_of_single_precision_are_refused_where_it_is_coarse(
     x = (town[0]["x_m"] * (offset // 512_345) + offset).astype(np.float32).astype(np.float64)
     what = {"x_m": None, f"x_{unit}": x, "y_m": None, f"y_{unit}": town[0]["y_m"]}
     path = write_tracks(tmp_path / "t.csv", town[0], **what)
-    with pytest.raises(ConversionError, match=rf"'x_{unit}' is .* row 1, .* steps of 0.0") as error:
+    with pytest.raises(
+        ConversionError, match=rf"'x_{unit}' in data row 1, .* steps of 0.0"
+    ) as error:
         read_tracks(path, overrides={"shift_m": [-512_345.0, 0.0]})
     assert "float64" in error.value.hint
     read_tracks(write_tracks(path, town[0], x_m=town[0]["x_m"].astype(np.float32)))

@@ -328,7 +328,7 @@ def test_another_table_or_map_of_the_same_name_is_refused(town, tmp_path):
     assert (before.replaced, again.converted, again.replaced) == ({}, 0, {})
     other = write_tracks(second, town[0], vx_mps=None, vy_mps=None)
     with pytest.raises(
-        ConversionError, match=rf"b/t.csv: .* has 't' .* {before.accepted} scen"
+        ConversionError, match=rf"b/t.csv: .* of another table, {before.accepted} scen"
     ) as e:
         convert_tracks(TracksReader(other, town[1]), store)
     assert "--replace" in e.value.hint
