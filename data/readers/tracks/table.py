@@ -300,7 +300,7 @@ class _TableFile(SourceFile):
             kept = values[np.isfinite(values)]
             self.require(QUANTITIES[role], kept, f"column {column.name!r}")
         if needed and (step := single_step(raw, abs(column.factor(role)))):
-            what = f"in data row 1, {raw[0]:.10g}, and all others has steps of {step:g} m: float32"
+            what = f"is float32 in all rows, in steps of {step:g} m at {raw[0]:.10g} (data row 1)"
             raise self.fault(f"column {column.name!r} {what}", "write float64")
         return np.pi / 2 - values if column.unit == "compass" else values
 

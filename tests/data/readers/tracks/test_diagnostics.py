@@ -408,7 +408,7 @@ def test_coordinates_of_single_precision_are_refused_where_it_is_coarse(
     what = {"x_m": None, f"x_{unit}": x, "y_m": None, f"y_{unit}": town[0]["y_m"]}
     path = write_tracks(tmp_path / "t.csv", town[0], **what)
     with pytest.raises(
-        ConversionError, match=rf"'x_{unit}' in data row 1, .* steps of 0.0"
+        ConversionError, match=rf"'x_{unit}' is float32 .* steps of 0.0.* row 1"
     ) as error:
         read_tracks(path, overrides={"shift_m": [-512_345.0, 0.0]})
     assert "float64" in error.value.hint
