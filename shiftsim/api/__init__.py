@@ -6,7 +6,7 @@ what objects answer when they are asked for something by another name.
 """
 
 import html
-import warnings
+import logging
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -61,7 +61,7 @@ def run(
             `limit`, `traffic`, `thresholds`, `workers`, `out`, …
 
     Returns:
-        The finished run; print `.table()`. A warning says what failed.
+        The finished run; print `.table()`. What failed is logged.
 
     Raises:
         ShiftsimError: A setting is wrong, or something it names is missing.
@@ -95,8 +95,8 @@ def run(
     done = execute(plan, **{"on_progress": on_progress} if on_progress else {})
     if lost := [row for row in failures(done) if row["error"]]:
         failed = f"{len(lost)} of {plural(len(done.tasks), 'task')} failed"
-        words = task_of(lost[0]).words
-        warnings.warn(f"{failed}, the first: {words}: {lost[0]['error']}", stacklevel=2)
+        words = f"{task_of(lost[0]).words}: {lost[0]['error']}"
+        logging.getLogger(__name__).warning("%s, the first: %s", failed, words)
     return _with_methods(done)
 
 

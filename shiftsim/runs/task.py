@@ -119,7 +119,7 @@ class TaskRunner:
             seconds[task]["simulate_seconds"] += share
             result = attempt(task, partial(self._score, task, rollout, log, seconds[task]))
             if isinstance(log, BaseException) and not isinstance(log, ShiftsimError):
-                result = replace(result, error=f"{result.error}, at iteration {rollout.iteration}")
+                result = replace(result, error=f"{result.error} (at iteration {rollout.iteration})")
             found[task] = result
         return [
             replace(result, seconds=seconds[task])

@@ -48,13 +48,15 @@ class Own(BaseException):
 @pytest.mark.parametrize(
     "error", [SystemExit(0), SystemExit("bye"), asyncio.CancelledError(), Own("own")]
 )
-def test_a_planner_that_leaves_fails_its_task(toy, tmp_path, error, method):
+def test_a_planner_that_leaves_fails_its_task(toy, tmp_path, caplog, error, method):
     planner = Leaving(error, method)
     run = shiftsim.run(planner, store=str(toy), workers=1, out=str(tmp_path / "run"))
     assert (run.manifest["counts"]["ok"], run.manifest["counts"]["failed"]) == (3, 1)
     (row,) = (row for row in run.tasks.to_pylist() if row["status"] == "failed")
     assert row["token"] == BAD
     assert type(error).__name__ in row["error"]
+    assert ("(at iteration 0)" in row["error"]) == (method == "plan")
+    assert f"1 of 4 tasks failed, the first: constant-velocity none: {row['error']}" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -110,7 +110,7 @@ def test_an_error_of_the_planner_is_that_of_its_task(toy, tmp_path):
 
     run = shiftsim.run(nuplan.wrap(Broken()), store=str(toy), workers=1, out=str(tmp_path / "run"))
     errors = pq.read_table(run.path / "tasks.parquet").column("error").to_pylist()
-    assert errors == ["ZeroDivisionError: of all things"] * 4
+    assert errors == ["ZeroDivisionError: of all things (at iteration 0)"] * 4
 
 
 def test_maps_and_their_objects_outlive_a_scenario():
