@@ -239,7 +239,7 @@ def _plan_lines(plan: "RunPlan") -> Iterator[str]:
     if is_learned or plan.fingerprint["batch_size"] > 1:
         strict = "   strict" if config.strict else ""
         yield f"networks    batch size {config.batch_size}{strict}"
-    where = f"{plural(plan.workers, 'worker')} x 1 thread"
+    where = f"workers {plan.workers} x 1 thread"
     if config.executor == "dask":
         where = f"dask {config.scheduler}"
     limit = f"   timeout {config.timeout:g} s" if config.timeout else ""
