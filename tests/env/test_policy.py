@@ -132,6 +132,11 @@ def test_observations_of_ones_own_know_no_recording(toy, tmp_path):
 GAIN = 0.1
 
 
+class Unwilling:
+    def __reduce__(self):
+        raise ValueError("not today")
+
+
 def steady(seen):
     return [GAIN, 0.0]
 
@@ -140,7 +145,7 @@ def test_what_a_function_refers_to_is_a_part_of_it(monkeypatch):
     before = run_planner(shiftsim.policy_planner(steady), {}).fingerprint
     monkeypatch.setitem(steady.__globals__, "GAIN", 0.2)
     after = run_planner(shiftsim.policy_planner(steady), {}).fingerprint
-    monkeypatch.setitem(steady.__globals__, "GAIN", lambda: 0.2)
+    monkeypatch.setitem(steady.__globals__, "GAIN", Unwilling())
     hidden = run_planner(shiftsim.policy_planner(steady), {}).fingerprint
     assert before["source"] != after["source"]
     assert [one.get("unseen", False) for one in (before, after, hidden)] == [False, False, True]
