@@ -233,7 +233,7 @@ def tracks(
                 echo(f" {what}: {value}")
         if any(read.shift):
             echo(f" shift: ({read.shift[0]:.1f}, {read.shift[1]:.1f}) m")
-        echo("\n".join(_recording_lines(report)))
+        echo("\n".join(_report_lines(report)))
         for warning in inspection.diagnostics.warnings:
             echo(f" unusual: {warning.what}\n   remedy: {warning.remedy}")
         echo(f" {plural(report.accepted, 'scenario')} → {folder}")
@@ -329,7 +329,7 @@ def _site_lines(report: "ConversionReport", store: Path, *, is_short: bool) -> "
         f"site {report.name}: {report.lanes} lanes and connectors, "
         f"{100.0 * report.details['drivable_share']:.1f} % of moving vehicles on drivable area"
     )
-    yield from _recording_lines(report)
+    yield from _report_lines(report)
     for name, reason in report.skipped.items():
         yield f" skipped: {name}: {reason}"
     if report.kept:
@@ -339,7 +339,7 @@ def _site_lines(report: "ConversionReport", store: Path, *, is_short: bool) -> "
     yield f" {plural(report.accepted, 'scenario')} → {store}"
 
 
-def _recording_lines(report: "ConversionReport") -> "Iterator[str]":
+def _report_lines(report: "ConversionReport") -> "Iterator[str]":
     for name, count in report.map_warnings.items():
         yield f" map: {name} ({count})"
     for summary in report.recordings:

@@ -14,7 +14,7 @@ from shiftsim.report import statistics
 from shiftsim.report.groups import COLUMNS, Group, by_set, distinct_sets, planner_identities
 from shiftsim.report.statistics import FEW_CLUSTERS, Comparison, score_interval
 from shiftsim.report.tables import Cell, Interval, Number, Record, Row, Table
-from shiftsim.report.words import REASONS
+from shiftsim.report.words import REASONS, UNITS
 from shiftsim.sim.perception import drift_order
 
 ALL_KINDS = "all"
@@ -350,7 +350,7 @@ def _open_loop_record(group: Group) -> Record:
         "noise": group.noise,
         "CLS": group.estimate(),
         "open loop": mean(open_loop.TOTAL, 100.0),
-        **{f"{error} {unit}": mean(m) for m, (error, unit, *_) in open_loop.METRICS.items()},
+        **{f"{name} {UNITS[unit]}": mean(m) for m, (name, unit, *_) in open_loop.METRICS.items()},
         "missed": mean(open_loop.MISS),
         "rollouts": Number(len(plans), 0),
         "plans": f"{counted:.0f} of {there:.0f}" if counted else None,

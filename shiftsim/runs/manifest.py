@@ -144,7 +144,7 @@ def check_space(folder: Path, num_tasks: int, *, with_rollouts: bool) -> None:
     place = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     needed = num_tasks * (_OF_TASK + _OF_ROLLOUT * with_rollouts)
     if needed > (free := shutil.disk_usage(place).free):
-        what = f"{plural(num_tasks, 'task')} need about {needed / 1e6:,.1f} MB, {str(place)!r} has"
+        what = f"{plural(num_tasks, 'task')}: about {needed / 1e6:,.1f} MB, but {str(place)!r} has"
         hint = "choose another --out" + ", or --save-rollouts failed" * with_rollouts
         raise DataError(f"{what} {free / 1e6:,.1f} MB free", hint)
 

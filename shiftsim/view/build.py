@@ -164,13 +164,13 @@ class Gallery:
 
     def settings_words(self, token: str, part: int = 0) -> str:
         """How the rollouts of a page were driven and scored."""
-        settings = (
-            f"traffic {run.manifest['determining']['traffic']} · controller "
-            f"{run.manifest['determining']['controller']} · thresholds "
-            f"{run.manifest['config']['thresholds']} · shiftsim "
-            + " · ".join([run.manifest["versions"]["shiftsim"], *run.remarks])
-            for run in (self._rollouts[task].run for task in self.tasks(token, part))
-        )
+        settings = []
+        for run in (self._rollouts[task].run for task in self.tasks(token, part)):
+            made, rules = run.manifest, run.manifest["determining"]
+            words = [f"{name} {rules[name]}" for name in ("traffic", "controller")]
+            words += [f"thresholds {rules['thresholds']['name']}"]
+            words += [f"shiftsim {made['versions']['shiftsim']}", *run.remarks]
+            settings.append(" · ".join(words))
         return "; ".join(dict.fromkeys(settings))
 
     def pages(

@@ -187,8 +187,7 @@ def caption(item: ShownRollout) -> str:
     name = item.planner
     name += "" if item.noise == "none" else f", {item.noise}, seed {item.seed}"
     score = "" if item.cls is None else f": score {100.0 * item.cls:.0f}"
-    found = violations(item.metrics)
-    worst = worst_moment(found) or worst_violation(found)
+    worst = worst_violation(violations(item.metrics))
     if worst is None:
         return f"{name}{score}"
     what, comma, more = violation_words(worst.row, item.log.tracks).partition(",")

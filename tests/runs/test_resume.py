@@ -320,8 +320,8 @@ def test_a_worker_that_died_is_told_from_one_that_was_late():
 @pytest.mark.parametrize(
     ("kept", "free", "message"),
     [
-        ("all", 500e3, r"12 tasks need about 1\.0 MB, '.*' has 0\.5 MB free"),
-        ("none", 50e3, "12 tasks need about"),
+        ("all", 500e3, r"12 tasks: about 1\.0 MB, but '.*' has 0\.5 MB free"),
+        ("none", 50e3, "12 tasks: about"),
         ("none", 500e3, ""),
         ("all", 2e6, ""),
     ],

@@ -14,7 +14,7 @@ from shiftsim.errors import ConfigError
 from shiftsim.planners.registry import load_planner
 from shiftsim.report.palette import ALARM, RECORDED, FigureFormat, planner_styles
 from shiftsim.sim.loop import simulate
-from shiftsim.view.drawing import save_tracks_picture
+from shiftsim.view.drawing import caption, save_tracks_picture
 from shiftsim.view.scene import ShownRollout
 from shiftsim.view.still import map_picture, picture, save_figure
 from shiftsim.world.state import AgentKind
@@ -277,3 +277,13 @@ def test_what_is_no_width_is_refused(width):
 def test_a_speed_that_is_none_is_refused(scenario, shown, tmp_path):
     with pytest.raises(ConfigError, match="speed"):
         save_figure(tmp_path / "a.gif", scenario, shown[:1], speed=0.0)
+
+
+def test_a_caption_names_what_cost_most_though_it_has_no_moment(shown):
+    rows = [
+        {"metric": "ego_is_making_progress", "score": 0.0, "first_violation_s": None},
+        {"metric": "ego_is_comfortable", "score": 0.0, "first_violation_s": 1.0},
+    ]
+    plain = {"first_violation_value": None, "unit": "boolean", "partner_token": None}
+    item = replace(shown[0], noise="none", cls=0.0, metrics=[row | plain for row in rows])
+    assert caption(item) == f"{item.planner}: score 0; no progress (EMP)"
