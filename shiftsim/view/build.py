@@ -169,8 +169,8 @@ class Gallery:
             made, rules = run.manifest, run.manifest["determining"]
             words = [f"{name} {rules[name]}" for name in ("traffic", "controller")]
             words += [f"thresholds {rules['thresholds']['name']}"]
-            words += [f"shiftsim {made['versions']['shiftsim']}", *run.remarks]
-            settings.append(" · ".join(words))
+            words += [f"shiftsim {made['versions']['shiftsim']}"]
+            settings.append(" · ".join([*run.remarks, *words]))  # a narrow page shows the first
         return "; ".join(dict.fromkeys(settings))
 
     def pages(
