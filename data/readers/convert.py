@@ -28,10 +28,11 @@ from shiftsim.data.store import schema
 from shiftsim.data.store.map import write_map
 from shiftsim.data.store.reading import read_report
 from shiftsim.data.store.recordings import write_ego, write_recording
-from shiftsim.data.store.tables import PARTIAL, digest, file_name
+from shiftsim.data.store.tables import MANIFEST, PARTIAL, digest, file_name, map_file
 from shiftsim.data.store.writing import StoreWriter, window_row
 from shiftsim.errors import ConversionError, DataError, ShiftsimError
 from shiftsim.files import safe_join
+from shiftsim.world.map import VectorMap
 
 _PART, _FILES, _MAP = "part.json", "files", "map"
 
@@ -123,6 +124,8 @@ def _convert_into(
     make = partial(_Stage, reader, work, keys)
     stage, site = make(), reader.site
     before = read_report(writer.path, reader.name).get("recordings", {}) if site else {}
+    if site is not None and before.keys() - set(names):
+        refuse_other_map(writer.path, site.road, reader.source)
     entries = {n: before[n] for n in names if n in before and before[n].get("key") == keys[n]}
     if site is not None:
         known = {entry["key"] for entry in entries.values()}
@@ -177,6 +180,18 @@ def _convert_into(
         writer.add_report(reader.name, content | report.details)
     writer.close()
     return report
+
+
+def refuse_other_map(store: Path, road: VectorMap, source: Path) -> None:
+    """Raise a ConversionError if a store has another map of that name than a source."""
+    path = map_file(store, road.name)
+    if (store / MANIFEST).is_file() and path.is_file():
+        with tempfile.TemporaryDirectory() as folder:  # equal maps have equal bytes
+            write_map(written := Path(folder) / _MAP, road)
+            if digest(written) != digest(path):
+                what = f"{source}: store {store} has another map named {road.name!r}"
+                hint = "name this one (--city or --site NAME), or give another --store"
+                raise ConversionError(what, hint)
 
 
 class _Stage:

@@ -7,7 +7,6 @@ scenarios are made.
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from shiftsim.data.maps.builder import BuiltMap
 from shiftsim.data.maps.opendrive.reading import read_opendrive
 from shiftsim.data.readers.build import make_samples
 from shiftsim.data.readers.codes import KINDS
-from shiftsim.data.readers.convert import ConversionReport, convert
+from shiftsim.data.readers.convert import ConversionReport, convert, refuse_other_map
 from shiftsim.data.readers.placement import extent_of
 from shiftsim.data.readers.reader import Reader, SourceRecording, opendrive_site
 from shiftsim.data.readers.scenarios import EGO_CATEGORIES
@@ -24,9 +23,8 @@ from shiftsim.data.readers.tracks.axes import Diagnostics
 from shiftsim.data.readers.tracks.diagnostics import diagnose
 from shiftsim.data.readers.tracks.table import TrackTable, read_tracks
 from shiftsim.data.readers.windows import ConversionConfig
-from shiftsim.data.store.map import write_map
 from shiftsim.data.store.reading import read_report
-from shiftsim.data.store.tables import MANIFEST, digest, map_file
+from shiftsim.data.store.tables import digest
 from shiftsim.errors import ConversionError, plural
 from shiftsim.world.map import VectorMap
 
@@ -142,13 +140,7 @@ def convert_tracks(
     if errors:
         what, remedy = map("; ".join, zip(*errors, strict=True))
         raise ConversionError(f"{reader.source}: {what}", remedy)
-    path = map_file(store, road.name)
-    if (store / MANIFEST).is_file() and path.is_file():
-        with TemporaryDirectory() as folder:  # equal maps have equal bytes
-            write_map(written := Path(folder) / "map", road)
-            if digest(written) != digest(path):
-                what = f"{reader.map_path}: store {store} has another map named {road.name!r}"
-                raise ConversionError(what, "name this one: --city NAME; or give another --store")
+    refuse_other_map(store, road, reader.map_path)
     before, tables = read_report(store, road.name), reader.details["tables"]
     before = before.get("recordings", {}).get(reader.table.name, {})
     if not replace and before.get("tables", tables) != tables:

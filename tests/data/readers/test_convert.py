@@ -83,6 +83,21 @@ def test_broken_recordings_are_skipped_and_others_are_kept(has_site, tmp_path):
     assert source.read_ones == ["c"]
 
 
+def test_another_map_is_taken_only_where_nothing_else_is_on_the_one_of_before(tmp_path):
+    source, other = Source(tmp_path, a=1), Source(tmp_path, b=1)
+    road = source.site.road
+    source.name = other.name = road.name
+    wider = replace(road, epsg=25832)
+    convert(source, tmp_path / "s")
+    other.site = replace(source.site, road=wider)
+    with pytest.raises(ConversionError, match=f"store .* has another map named {road.name!r}") as e:
+        convert(other, tmp_path / "s")
+    assert "--site" in e.value.hint
+    source.site = other.site
+    assert convert(source, tmp_path / "s").accepted == 2
+    assert convert(other, tmp_path / "s").accepted == 2
+
+
 def test_where_all_are_broken_the_first_is_told(tmp_path):
     source = Source(tmp_path, a=0, b=0)
     with pytest.raises(ConversionError, match=r"none of the 2 recordings .* the first is a: a is"):
