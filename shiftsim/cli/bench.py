@@ -40,7 +40,9 @@ save_rollouts allow_partial""".split()
 )
 def bench(
     settings: cli.Settings,
-    track: str = Argument(help="semantic-shift, state-drift, sensor-drift, edits or finding."),
+    track: str = Argument(
+        metavar="TRACK", help="semantic-shift, state-drift, sensor-drift, edits or finding."
+    ),
     traffic: list[str] | None = Option(
         None, help="Only these modes; repeatable, also package.module:Model."
     ),

@@ -66,7 +66,7 @@ def list_planners(as_json: Json = False) -> None:
 
 @app.command("check")
 def check_one_planner(
-    planner: str = Argument(help="Name, ./file.py:Class or package.module:Class."),
+    planner: str = Argument(metavar="PLANNER", help="Name, ./file.py:Class or module:Class."),
     planner_arg: list[str] | None = Option(None, "--planner-arg", help="key=value; repeatable."),
     store: str = Option("demo", help="Store with scenarios to try it on."),
     token: str | None = Option(None, help="Scenario. [the first]"),
@@ -181,7 +181,7 @@ def _on_message(quiet: bool) -> Callable[[str], None]:
 @cli.with_settings("planner", "out", "split", "seed", "workers", "samples", of=FeatureSettings)
 def features(
     settings: cli.Settings,
-    store: str = Argument(help="Store by name, path or URL."),
+    store: str = Argument(metavar="STORE", help="Store by name, path or URL."),
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -198,7 +198,7 @@ def features(
 
 
 def realism(
-    stores: list[str] = Argument(help="Stores by name, path or URL."),
+    stores: list[str] = Argument(metavar="STORES", help="Stores by name, path or URL."),
     traffic: list[str] | None = Option(
         None, "--traffic", help="Repeatable; by default what there is."
     ),
