@@ -190,16 +190,11 @@ class RunPlanner:
 
     @property
     def can_travel(self) -> bool:
-        """Whether workers can be sent it: they do not import a class of the main script."""
-        if isinstance(self.source, str):
-            return True
-        if _class_of(self.source).__module__ == "__main__":
-            return False
+        """Whether workers can be sent it: they do not import what the main script defines."""
         try:
-            pickle.dumps(self.source)
+            return isinstance(self.source, str) or b"__main__" not in pickle.dumps(self.source)
         except _NO_PICKLE:
             return False
-        return True
 
 
 def run_planner(source: Any, arguments: Mapping[str, Any], name: str = "") -> RunPlanner:

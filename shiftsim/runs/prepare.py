@@ -275,7 +275,7 @@ def _workers(
         raise ConfigError(
             f"planner {stuck[0]!r} cannot be sent to a worker process, as a timeout or a cluster "
             "needs it",
-            hint="put its class into a module of its own, beside the main script",
+            hint="put its class or function into a module of its own, beside the main script",
         )
     large = (
         entry.in_batches or getattr(type(entry.source), "shares_nothing", False)

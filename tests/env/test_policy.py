@@ -200,6 +200,16 @@ def test_a_function_is_told_from_another_by_its_code(tmp_path):
     assert one.can_travel
 
 
+def test_a_function_of_the_main_script_stays_in_its_process(monkeypatch):
+    def act(seen):
+        return [0.0, 0.0]
+
+    act.__module__, act.__qualname__ = "__main__", "act"
+    monkeypatch.setattr(sys.modules["__main__"], "act", act, raising=False)
+    pickle.dumps(act)
+    assert not run_planner(shiftsim.policy_planner(act), {}).can_travel
+
+
 def test_it_obeys_the_contract_of_planners(toy):
     scenes = [*shiftsim.open_store(toy)]
     planner = shiftsim.policy_planner(coast)
