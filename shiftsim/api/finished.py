@@ -279,11 +279,11 @@ class Run(results.Run):
 
     def _gallery(self, *, planner: Any = (), noise: Any = (), seed: Any = ()) -> Any:
         from shiftsim.runs.scenarios import open_run_store
-        from shiftsim.view.build import Choice, Gallery
+        from shiftsim.view.build import Choice, galleries
 
         given = (planner, noise, seed)
         choice = Choice(*((one,) if isinstance(one, (str, int)) else tuple(one) for one in given))
-        return Gallery([self], open_run_store(self), choice)
+        return galleries([self], [open_run_store(self)], choice)[0]
 
     def _opened(self, *others: results.Run) -> Any:
         from shiftsim.benchmarks.bench import OpenedRuns

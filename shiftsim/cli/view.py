@@ -236,7 +236,7 @@ def view(
     found = _galleries([run, *(others or ())], labels, store, planner, noise, seed)
     folder = out or safe_join(run, "view")
     if token is not None:
-        gallery, token = _holding(found, token)
+        gallery, token = _holding(found, token, others or ())
         folder.mkdir(parents=True, exist_ok=True)
         page = folder / page_name(token)
         for name, one in gallery.pages(token, fork=fork).items():
@@ -294,7 +294,7 @@ def plot(
     if token is None:
         raise ConfigError("no scenario", hint="shiftsim plot RUN TOKEN, or --open-against-closed")
     found = _galleries([run, *(others or ())], labels, store, planner, noise, seed)
-    gallery, token = _holding(found, token)
+    gallery, token = _holding(found, token, others or ())
     scenario = gallery.store.read(token)
     shown = gallery.shown(token, scenario)
     form = form._replace(note=gallery.shown_words(token))
@@ -360,10 +360,16 @@ def _galleries(
     return galleries(runs, [open_run_store(run, store) for run in runs], choice)
 
 
-def _holding(found: "list[Gallery]", token: str) -> "tuple[Gallery, str]":
-    """The gallery that holds a scenario, and its whole token."""
-    *others, last = found
-    for gallery in others:
+def _holding(found: "list[Gallery]", token: str, runs: "Sequence[Path]") -> "tuple[Gallery, str]":
+    """The gallery that holds a scenario, and its whole token; each of `runs` must have it, too."""
+    *others, gallery = found
+    for other in reversed(others):
         with suppress(ConfigError):
-            return gallery, gallery.find(token)
-    return last, last.find(token)
+            other.find(token)
+            gallery = other
+    token = gallery.find(token)
+    held = [one.run.path.resolve() for key, one in gallery.rollouts.items() if key.token == token]
+    for run in runs:
+        if not any(path.is_relative_to(run.resolve()) for path in held):
+            raise ConfigError(f"--with {run}: no rollout of scenario {token} of that store")
+    return gallery, token

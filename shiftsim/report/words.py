@@ -118,12 +118,12 @@ def severity(one: Violation) -> tuple[float, float, float]:
 
 
 def worst_violation(found: Iterable[Violation]) -> Violation | None:
-    """What cost most: the first multiplier in the order of metrics, else the lowest score."""
+    """The worst: the first multiplier in the order of metrics, else the lowest score."""
     return min(found, key=severity, default=None)
 
 
 def worst_moment(found: Iterable[Violation]) -> Violation | None:
-    """What cost most of those that have a moment."""
+    """The worst of those that have a moment."""
     return worst_violation(one for one in found if one.time is not None)
 
 

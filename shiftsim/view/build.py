@@ -22,6 +22,7 @@ from shiftsim.sim.perception import drift_order
 from shiftsim.view.page import MAX_ROLLOUTS, Page, framed, replay_page
 from shiftsim.view.scene import ShownRollout
 from shiftsim.view.thumbnails import thumbnails
+from shiftsim.world.scenario import FULL_DURATION
 
 _ENDS = [*Task._fields, "status", "error", "scenario_type"]
 _NO_PAGE = {"page": None, "index": 0}
@@ -76,7 +77,7 @@ class Gallery:
     def __init__(self, runs: Sequence[Run], store: Any, choice: Choice | None = None) -> None:
         """Index runs that were made with this open store; None where nothing is drawn."""
         self.store, self.choice = store, choice or Choice()
-        self._rollouts: dict[Task, _Rollout] = {}
+        self.rollouts: dict[Task, _Rollout] = {}
         for run, name in zip(runs, _names(runs), strict=True):
             if store is not None and run.manifest["determining"]["store"] != store.hash:
                 what = f"run {run.path.name!r} was made with another store than {str(store.path)!r}"
@@ -88,18 +89,18 @@ class Gallery:
                 (end,), (score,) = ends[key], scores.get(key, [{}])
                 is_drawable = store is not None and place is not None
                 one = _Rollout(run, key, end, score, metrics.get(key, []), is_drawable)
-                self._rollouts[key._replace(planner=planner)] = one
+                self.rollouts[key._replace(planner=planner)] = one
         # by scenario, all and those of the choice: failures first, then the lowest score
         self._all: dict[str, list[Task]] = {}
         self._chosen: dict[str, list[Task]] = {}
-        for task in sorted(self._rollouts, key=self._place):
+        for task in sorted(self.rollouts, key=self._place):
             self._all.setdefault(task.token, []).append(task)
             if task in self.choice:
                 self._chosen.setdefault(task.token, []).append(task)
         self.listed = list(self._chosen)
 
     def _place(self, task: Task) -> tuple[float, str, Task]:
-        cls = self._rollouts[task].score.get("cls", -1.0)
+        cls = self.rollouts[task].score.get("cls", -1.0)
         return 2.0 if cls is None else cls, task.token, task  # undefined ones last
 
     @property
@@ -109,17 +110,17 @@ class Gallery:
 
     def __len__(self) -> int:
         """All rollouts, whatever the choice."""
-        return len(self._rollouts)
+        return len(self.rollouts)
 
     def parts(self, token: str) -> list[list[Task]]:
         """The rollouts that can be drawn, page by page, the lowest scores on the first."""
-        drawn = [task for task in self._chosen.get(token, []) if self._rollouts[task].is_drawable]
+        drawn = [task for task in self._chosen.get(token, []) if self.rollouts[task].is_drawable]
         starts = range(0, len(drawn), MAX_ROLLOUTS)
         return [sorted(drawn[start : start + MAX_ROLLOUTS]) for start in starts]
 
     def shown_words(self, token: str, part: int = 0) -> str:
         """What a page draws of how much, such as "6 of 16 rollouts shown"; empty for all."""
-        found = [self._rollouts[task] for task in self._chosen[token]]
+        found = [self.rollouts[task] for task in self._chosen[token]]
         failed = sum(not one.score for one in found)
         lone = sum(not one.is_drawable for one in found)
         here, total = len(self.parts(token)[part]), len(found)
@@ -138,11 +139,9 @@ class Gallery:
         found = self.parts(token)
         if not found:
             tasks = self._all.get(token, [])
-            there = zip(*sorted(t for t in tasks if self._rollouts[t].is_drawable), strict=True)
-            names = zip(("planners", "noise", "seeds"), there, strict=False)
-            available = (f"{n}: {', '.join(map(str, dict.fromkeys(v)))}" for n, v in names)
+            there = _offered(task for task in tasks if self.rollouts[task].is_drawable)
             what = f"scenario {token!r} has no stored rollout with {self.choice}"
-            raise ConfigError(what, hint="; ".join(available) or "--save-rollouts all keeps them")
+            raise ConfigError(what, hint=there or "--save-rollouts all keeps them")
         return found[part]
 
     def shown(
@@ -151,7 +150,7 @@ class Gallery:
         """The rollouts of a page with what is known of them, with `fork` also their forks."""
         out = []
         for task in self.tasks(token, part):
-            one = self._rollouts[task]
+            one = self.rollouts[task]
             log = one.run.rollout(one.key, scenario)
             cls = one.score.get("cls")
             item = ShownRollout(task.planner, task.noise, task.seed, log, cls, one.metrics)
@@ -165,7 +164,7 @@ class Gallery:
     def settings_words(self, token: str, part: int = 0) -> str:
         """How the rollouts of a page were driven and scored."""
         settings = []
-        for run in (self._rollouts[task].run for task in self.tasks(token, part)):
+        for run in (self.rollouts[task].run for task in self.tasks(token, part)):
             made, rules = run.manifest, run.manifest["determining"]
             words = [f"{name} {rules[name]}" for name in ("traffic", "controller")]
             words += [f"thresholds {rules['thresholds']['name']}"]
@@ -210,10 +209,10 @@ class Gallery:
         return [about | self._row(t) | where.get(t, _NO_PAGE) | drawn.get(t, {}) for t in tasks]
 
     def _thumbnails(self, token: str, tasks: Iterable[Task]) -> dict[Task, dict[str, Any]]:
-        """What the list draws of stored rollouts, which mark what cost most."""
+        """What the list draws of stored rollouts, which mark the worst violation."""
         driven = {}
         for task in tasks:
-            one = self._rollouts[task]
+            one = self.rollouts[task]
             rows = one.run.rollout_rows(one.key)
             worst = words.worst_moment(words.violations(one.metrics))
             path = np.stack([rows[name].to_numpy() for name in ("x_m", "y_m")], axis=1)
@@ -224,7 +223,7 @@ class Gallery:
 
     def _about(self, token: str) -> dict[str, str]:
         """Type and city of a scenario; of one that never finished as its store has them."""
-        found = [self._rollouts[task] for task in self._all[token]]
+        found = [self.rollouts[task] for task in self._all[token]]
         kind = next(filter(None, (one.end["scenario_type"] for one in found)), "")
         city = next(filter(None, (one.score.get("city") for one in found)), "")
         if not (kind and city) and self.store is not None:
@@ -234,7 +233,7 @@ class Gallery:
         return {"type": kind, "city": city}
 
     def _row(self, task: Task) -> dict[str, Any]:
-        one = self._rollouts[task]
+        one = self.rollouts[task]
         found = words.violations(one.metrics)
         worst, cause = words.worst_moment(found), words.worst_violation(found)
         status, error, kind = (one.end[name] for name in ("status", "error", "scenario_type"))
@@ -248,7 +247,8 @@ class Gallery:
             "violated": {one.short: one.time for one in found},
             "at": worst and worst.time,
         }
-        return row | ({"type": kind} if kind else {})
+        window = one.score.get("duration_class") or FULL_DURATION
+        return row | ({"type": kind} if kind else {}) | {"window": window}
 
 
 def page_name(token: str, part: int = 0) -> str:
@@ -330,7 +330,19 @@ def galleries(runs: Sequence[Run], stores: Sequence[Any], choice: Choice) -> lis
         made_with = run.manifest["determining"]["store"]
         opened[made_with] = opened.get(made_with) or store
         members.setdefault(made_with, []).append(run)
-    return [Gallery(found, opened[made_with], choice) for made_with, found in members.items()]
+    found = [Gallery(same, opened[made_with], choice) for made_with, same in members.items()]
+    for name, values in vars(choice).items():
+        for only in (Choice(**{name: (value,)}) for value in values):
+            tasks = [task for gallery in found for task in gallery.rollouts]
+            if not any(task in only for task in tasks):
+                raise ConfigError(f"no rollout has {only}", hint=_offered(tasks))
+    return found
+
+
+def _offered(tasks: Iterable[Task]) -> str:
+    """Planners, noise and seeds of tasks, as a hint."""
+    names = zip(("planners", "noise", "seeds"), zip(*sorted(tasks), strict=True), strict=False)
+    return "; ".join(f"{n}: {', '.join(map(str, dict.fromkeys(v)))}" for n, v in names)
 
 
 def _names(runs: Sequence[Run]) -> list[str]:

@@ -150,8 +150,14 @@ function button(content, wanted, label) {
 
 const groupOf = (name, noise) => rows.filter((row) => row.planner === name && row.noise === noise);
 
+// of windows of several lengths, whose scores are not averaged: which ones
+function windowsOf(group) {
+  const lengths = new Set(group.filter((row) => row.cls !== null).map((row) => row.window));
+  return lengths.size > 1 ? [...lengths].sort((a, b) => parseFloat(a) - parseFloat(b)).join(", ") : "";
+}
+
 function meanOf(group) {
-  if (!group.length || group.some((row) => row.cls === null)) return null;
+  if (!group.length || group.some((row) => row.cls === null) || windowsOf(group)) return null;
   return group.reduce((sum, row) => sum + 100 * row.cls, 0) / group.length;
 }
 
@@ -161,9 +167,10 @@ function cellOf(name, noise, best) {
   const mean = meanOf(group);
   const done = group.filter((row) => row.cls !== null).length;
   const text = mean === null ? "–" : mean.toFixed(2);
-  const where = `${name}, noise ${noise}: ${text}, ${done} of ${group.length} rollouts scored`;
+  const windows = windowsOf(group);
+  const where = `${name}, noise ${noise}: ${text}, ${done} of ${group.length} rollouts scored${windows && `, windows of ${windows}`}`;
   const made = button(text, { planner: name, noise }, where);
-  if (mean === null) made.append(" ", span("soft", `${done}/${group.length}`));
+  if (mean === null) made.append(" ", span("soft", windows || `${done}/${group.length}`));
   else made.style.setProperty("--loss", `${0.4 * (100 - mean)}%`);
   made.classList.toggle("best", text === best);
   return made;

@@ -111,6 +111,13 @@ class TestMatrix:
         assert listing.text("count") == "12 of 12 rollouts"
         assert listing.browser.current_url.endswith("#")
 
+    def test_windows_of_several_lengths_have_no_common_mean(self, page, tmp_path):
+        spans = [{"window": "15 s"}, {"window": "4 s"}, {"window": "15 s", "planner": "pdm"}]
+        open_rows(page, tmp_path, [made_row(number, **more) for number, more in enumerate(spans)])
+
+        assert cell(page, "idm", "ou-low").find_element("xpath", "..").text == "– 4 s, 15 s"
+        assert cell(page, "pdm", "ou-low").text == "98.00"
+
     def test_no_mean_is_shown_where_rollouts_have_no_score(self, page, tmp_path):
         lost = made_row(3, cls=None, failed="failed: boom", violated={}, at=None)
         other = made_row(4, planner="simple")

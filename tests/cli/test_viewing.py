@@ -2,8 +2,10 @@ import json
 
 import pytest
 from pages import sections
+from stores import write_toy_store
 from typer.testing import CliRunner
 
+import shiftsim
 from shiftsim.cli import app, main
 from shiftsim.report.build import TABLES
 
@@ -39,6 +41,15 @@ def test_view_says_how_many_it_left_out(call, clean_run, tmp_path):
     done = call("view", clean_run.path, "--limit", 1, "--out", tmp_path, "--no-open", "-q")
 
     assert "1 replay, 3 more with --limit 0" in done.output
+
+
+def test_another_run_must_have_the_scenario(call, clean_run, tmp_path):
+    store = write_toy_store(tmp_path / "store", count=1, iterations=20)
+    other = shiftsim.run("simple", store=str(store), workers=1, out=tmp_path / "other").path
+    words = ("--out", tmp_path / "out", "--no-open", "--with")
+    assert call("view", clean_run.path, "0001", *words, clean_run.path).exit_code == 0
+    done = call("view", clean_run.path, "0001", *words, other)
+    assert str(done.exception) == f"--with {other}: no rollout of scenario 0001cafe of that store"
 
 
 def test_the_report_page_holds_tables_pictures_and_replays(call, clean_run, tmp_path):
@@ -93,6 +104,7 @@ def test_a_figure_of_fewer_rollouts_says_so(call, clean_run, tmp_path, monkeypat
     [
         (("view", "{run}", "ffff"), "hint:"),
         (("view", "{run}", "0001", "-p", "nobody"), "planners: constant-velocity, log-future"),
+        (("view", "{run}", "-n", "ou-hihg"), "noise: none, ou-high; seeds: "),
         (("plot", "{run}", "0001cafe", "-o", "a.bmp"), "pictures: .pdf"),
         (("view", "nowhere"), "hint:"),
     ],
