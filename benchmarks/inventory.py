@@ -105,7 +105,10 @@ def _rows(track: str, stores: list[Row]) -> Iterator[Row]:
 def coverage(track: Track, groups: Sequence[Group]) -> Table:
     """Rollouts finished of those that the track's score needs, by set of scenarios and planner."""
     inside = [group for group in groups if _belongs(group, track)]
-    sets = {data.name: (data.label, data.whole) for data in distinct_sets(inside)}
+    sets: dict[str, tuple[str, int]] = {}
+    for data in distinct_sets(inside):  # one for each length of windows, all of which count
+        label = data.label.removesuffix(f", {''.join(data.classes)}")
+        sets[data.name] = (label, data.whole)
     if listed := track.reference:
         sets.setdefault(listed.name, (listed.label, listed.count))
     rows: list[tuple[Cell, ...]] = []

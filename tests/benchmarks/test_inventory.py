@@ -4,10 +4,11 @@ import json
 
 import pytest
 from commands import call
+from made_runs import write_run
 from stores import write_toy_store
 
-from shiftsim.benchmarks import TRACKS, inventory, known_sets
-from shiftsim.report.groups import KnownSet, token_digest
+from shiftsim.benchmarks import TRACKS, inventory, known_sets, load_track
+from shiftsim.report.groups import KnownSet, read_groups, token_digest
 
 
 @pytest.fixture
@@ -89,3 +90,12 @@ def test_the_command_prints_the_same_as_data_and_as_text(place):
     found = json.loads(call(place, "data", "--json").stdout)
     assert [store["name"] for store in found["stores"]] == ["toy"]
     assert {row["track"] for row in found["rows"]} == {*TRACKS}
+
+
+def test_windows_of_all_lengths_count_as_one_set(tmp_path):
+    lost = [("alpha", "none", 0, "t1")]
+    rules = {"durations": ("15 s", "8 s", "8 s", "15 s"), "thresholds": "deepplan"}
+    run = write_run(tmp_path / "a", missing=lost, split="cities", **rules)
+    table = inventory.coverage(load_track("semantic-shift"), read_groups([run]))
+    [row] = [row for row in table.rows if row[0] == "cities"]
+    assert (row[1], row[2].value, row[3].value, row[4]) == ("alpha", 3, 8, "partial (3/8)")
