@@ -5,6 +5,7 @@ any number of threshold profiles can be applied to it.
 """
 
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -111,7 +112,7 @@ def _run(metric: Any, log: SimulationLog, road: VectorMap | Scenario) -> list[Me
             raise ConfigError(f"metric {name!r} needs the scenario", "give it instead of its map")
         found: list[MetricRow] = metric(log, road)
         return found
-    value = metric(log, map)
+    value = metric(deepcopy(log), map)  # what it writes there is not in what is stored
     if isinstance(value, MetricRow):
         return [value]
     try:

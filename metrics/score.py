@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from shiftsim.errors import DataError, missing_attribute
-from shiftsim.kernels import FloatArray, IntArray
+from shiftsim.kernels import FloatArray, IntArray, kernel
 from shiftsim.metrics import (
     collision,
     comfort,
@@ -36,6 +36,7 @@ from shiftsim.sim.log import SimulationLog
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import STATE_COLUMNS, VehicleParameters, center_poses
 
+_FAR = 1e9  # m, rad, m/s of a box in sum
 MULTIPLIERS = (
     "no_ego_at_fault_collisions",
     "drivable_area_compliance",
@@ -255,13 +256,25 @@ def _check(log: SimulationLog, tracks: collision.FlatTracks) -> None:
             row, column = (int(i) for i in np.argwhere(~np.isfinite(states))[0])
             what = f"{where}: {name} {STATE_COLUMNS[column]} at sample {row} is not finite"
             raise DataError(what)
-    poses, sizes = tracks.poses, tracks.sizes
-    # not finite as soon as one of them is
-    total = poses[..., 0] + poses[..., 1] + poses[..., 2] + sizes[..., 0] + sizes[..., 1]
-    is_broken = tracks.valid & ~np.isfinite(total)
-    if is_broken.any():
-        row, column = (int(i) for i in np.argwhere(is_broken)[0])
+    row, column = _first_broken(tracks)
+    if row >= 0:
         raise DataError(
             f"{where}: track {log.tracks.tokens[column]!r} at sample {row} has a pose or size "
-            "that is not finite"
+            f"or velocity that is not finite or beyond {_FAR:g}, or a negative size"
         )
+
+
+@kernel
+def _first_broken(tracks: collision.FlatTracks) -> tuple[int, int]:
+    """Sample and track of the first box that cannot be; -1, -1 where there is none."""
+    for row in range(len(tracks.valid)):
+        for column in range(len(tracks.is_static)):
+            if tracks.valid[row, column]:
+                (x, y, heading), size = tracks.poses[row, column], tracks.sizes[row, column]
+                far = abs(x) + abs(y) + abs(heading) + size[0] + size[1]
+                if not tracks.is_static[column]:  # these have no velocity
+                    speed = tracks.velocities[row, column]
+                    far += abs(speed[0]) + abs(speed[1])
+                if not (far <= _FAR and size[0] >= 0.0 and size[1] >= 0.0):  # NaN neither
+                    return row, column
+    return -1, -1

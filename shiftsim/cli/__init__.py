@@ -204,7 +204,8 @@ def with_settings(
             for item in items:
                 value, parse = values.pop(item.name), item.metadata["option"].parse
                 if value not in (None, []):
-                    settings[item.name] = parse(value) if parse else value
+                    text = ",".join(value) if isinstance(value, list) else value
+                    settings[item.name] = parse(text) if parse else value
             return command(settings=settings, **values)
 
         call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -219,7 +220,7 @@ def _option(item: Any, text: str | None, *, in_file: bool) -> inspect.Parameter:
     if get_origin(kind) is dict or (get_origin(kind) is tuple and not option.parse):
         kind = list[get_args(kind)[0]]  # type: ignore[misc]
     elif option.parse:
-        kind = str
+        kind = list[str] if get_origin(kind) is tuple else str
     flags = option.flags or ((f"--{item.name.replace('_', '-')}",) if kind is bool else ())
     words = Option(*flags, help=text or option.help)
     default = None if in_file else item.default

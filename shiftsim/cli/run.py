@@ -282,6 +282,9 @@ def _print_results(finished: "Run", *, allow_partial: bool) -> None:
 
     counts = finished.manifest["counts"]
     echo()
+    if not counts["expected"]:
+        echo(f"no task falls into shard {finished.manifest['shard']}; merge takes it all the same")
+        return
     look = {"width": cli.terminal_width(), "mark": cli.paint}
     echo(score_table([finished], allow_partial=allow_partial, **look))
     print_worst([finished], _WORST)

@@ -269,7 +269,10 @@ def drift_matrix(groups: Sequence[Group]) -> Table | None:
     words = "planners that are given the recording drive by it, whatever is seen: {}"
     informed = {g.name for g in drifts if planner_identities(g.run)[g.name].get("sees_recording")}
     notes = [data.rules for data in distinct_sets(drifts)]
-    notes += [f"a latency is borne if it costs at most {_BORNE:g} points"] if any(findings) else []
+    borne = (
+        f"a latency is borne if it and shorter ones that were run cost at most {_BORNE:g} points"
+    )
+    notes += [borne] if any(findings) else []
     notes += [words.format(", ".join(sorted(informed)))] if informed else []
     title = "Planner × traffic × drift: closed-loop score × 100"
     return Table.of("drift", title, records, 3, notes=notes, findings=[*filter(None, findings)])

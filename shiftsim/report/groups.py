@@ -317,7 +317,7 @@ def _contradiction(
 def _groups(run: Run, known: Sequence[KnownSet]) -> Iterator[Group]:
     tasks, scores = run.tasks, run.scores
     if not len(tasks):
-        raise DataError(f"run {run.path.name!r} holds no tasks", hint="make the run again")
+        raise DataError(f"run {run.path.name!r} holds no tasks", hint="merge the shards of a run")
     data = _data_set(run, known)
     parts = _by_duration(data)
     traffic = str(run.manifest["determining"]["traffic"])

@@ -104,11 +104,13 @@ class RunConfig:
         (0,), "Plans arrive late by so many ms: 0,100,300 are three. [0]", parse=parse_latency
     )
     seeds: tuple[int, ...] = setting(
-        (0,), "Noise seeds: 0,1,2 or 0-2 are three, 3 is number 3 alone. [0]", parse=parse_seeds
+        (0,),
+        "Noise seeds: 0,1,2 or 0-2 are three, 3 is number 3 alone; repeatable. [0]",
+        parse=parse_seeds,
     )
     store: str = setting(DEFAULT_STORE, "Name or folder. [demo]", "--store", "-s")
     split: str = setting("", "Name or file (.toml, .txt). [whole store; runs on demo: demo-mini]")
-    limit: int = setting(0, "Only the first N scenarios.")
+    limit: int = setting(0, "Only the first N scenarios. [0: all]")
     all_scenarios: bool = setting(False, "Also the scenarios that the filter dropped.", "--all")
     edits: str = setting("", "File (.toml) of edits; only what they make is run.")
     traffic: str = setting(

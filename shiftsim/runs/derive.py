@@ -166,6 +166,9 @@ def rescore(
         "code": here if here == simulated else f"{simulated}, scored by {here}",
     }
     target = Path(out) if out else RUNS / run_name(config, run.manifest["split"], fingerprint)
+    if target.resolve() == run.path.resolve():
+        what = f"{str(target)!r} is the run that is scored: its times would be lost"
+        raise ConfigError(what, hint="give other thresholds, a metric, or another folder as out")
     check_target(target, fingerprint)
     done = tasks_with_rollouts(run)
     place = run.manifest["store"] if store is None else found.source

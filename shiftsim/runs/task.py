@@ -290,6 +290,15 @@ def score_rollout(
             f"a custom metric returned what metrics.parquet cannot hold: {error}",
             hint="return a number, or a MetricRow of texts and numbers",
         ) from error
+    for row in custom:
+        score, at = row["score"], row["first_violation_iteration"]
+        if score is not None and not 0.0 <= score <= 1.0:
+            what = f"metric {row['metric']!r} has score {score:g}"
+            raise ConfigError(what, "a score is from 0 to 1, or None; other numbers are a value")
+        times = log.time_us[at : at + 1] if at is not None and at >= 0 else ()
+        if at is not None and row["first_violation_time_us"] not in times:
+            what = f"metric {row['metric']!r} has a violation at iteration {at}"
+            raise ConfigError(what, f"from 0 to {len(log.time_us) - 1}, with its log.time_us")
     return scores, [*(_metric_row(row, start_us, profile) for row in ordered), *custom]
 
 

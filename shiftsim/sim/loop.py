@@ -133,7 +133,7 @@ class Rollout:
         """
         if self._follow(plan, seconds):
             row = self._start + self.iteration
-            self._traffic.step(self.iteration, self._ego[row], self._tracks, row + 1)
+            self._traffic.step(self.iteration, self._ego[row].copy(), self._tracks, row + 1)
         self._go_on()
 
     def _follow(self, plan: Any, seconds: float) -> bool:
@@ -392,7 +392,7 @@ def simulate_together(
                 ended[index] = moved
             elif moved:
                 at, row = rollout.iteration, rollout._start + rollout.iteration
-                moves[index] = Move(at, rollout._ego[row], rollout._tracks, row + 1)
+                moves[index] = Move(at, rollout._ego[row].copy(), rollout._tracks, row + 1)
         batch = [i for i in moves if rollouts[i]._is_batch]
         if batch:
             models = [cast(BatchTraffic, rollouts[i]._traffic) for i in batch]

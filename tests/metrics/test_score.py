@@ -32,9 +32,11 @@ def test_multipliers_alone_score_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("array", "column"), [("poses", n) for n in range(3)] + [("sizes", 0), ("sizes", 1)]
+    ("array", "column"),
+    [("poses", n) for n in range(3)]
+    + [(name, n) for name in ("sizes", "velocities") for n in (0, 1)],
 )
-@pytest.mark.parametrize(("value", "sample"), [(np.nan, 7), (np.inf, 19)])
+@pytest.mark.parametrize(("value", "sample"), [(np.nan, 7), (np.inf, 19), (1e300, 3)])
 def test_every_number_of_a_track_must_be_finite_where_it_is_valid(
     array: str, column: int, value: float, sample: int
 ) -> None:
@@ -46,6 +48,13 @@ def test_every_number_of_a_track_must_be_finite_where_it_is_valid(
     valid = LOG.tracks.valid.copy()
     valid[sample, 0] = False
     compute_metrics(replace(LOG, tracks=replace(tracks, valid=valid)), straight_road())
+
+
+def test_a_box_of_negative_size_is_refused() -> None:
+    sizes = LOG.tracks.sizes.copy()
+    sizes[4, 0, 1] = -1.0
+    with pytest.raises(DataError, match=r"track 't0' at sample 4 .* a negative size"):
+        compute_metrics(replace(LOG, tracks=replace(LOG.tracks, sizes=sizes)), straight_road())
 
 
 def test_the_states_of_the_expert_are_looked_at_too() -> None:

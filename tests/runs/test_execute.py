@@ -11,6 +11,7 @@ from stores import write_toy_store
 
 import shiftsim
 from shiftsim.errors import ConfigError, DataError
+from shiftsim.metrics import MetricRow, Violation
 from shiftsim.planners.basic import ConstantVelocity
 from shiftsim.runs.config import make_config
 from shiftsim.runs.execute import execute
@@ -284,6 +285,39 @@ def test_own_metrics_are_reported_and_never_scored(toy, tmp_path, clean_run):
     row = next(r for r in run.metrics.to_pylist() if r["metric"] == "own_metric")
     assert row["value"] == pytest.approx(6.0)
     assert run.scores["cls"].to_pylist() == clean_run.scores["cls"].to_pylist()[:1]
+
+
+def zeroing(log, road):
+    log.ego[:] = 0.0
+    return 0.0
+
+
+def scored(log, road):
+    return MetricRow("scored", 5.0, 1.0, "meters", 2.0, None)
+
+
+def violated(log, road):
+    return MetricRow("violated", 0.0, 1.0, "", None, Violation(99999, 5, None, 1.0))
+
+
+def test_metrics_write_to_a_copy(toy, tmp_path):
+    names = [f"{__name__}:{name}" for name in ("zeroing", "own_metric")]
+    run = execute(prepare(settings(toy, tmp_path / "run", metrics=names, limit=1)))
+    row = next(r for r in run.metrics.to_pylist() if r["metric"] == "own_metric")
+    assert row["value"] == pytest.approx(6.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("scored", "metric 'scored' has score 5"),
+        ("violated", "metric 'violated' has a violation at iteration 99999"),
+    ],
+)
+def test_what_a_metric_cannot_return_fails_its_task(toy, tmp_path, name, message):
+    metrics = [f"{__name__}:{name}"]
+    run = execute(prepare(settings(toy, tmp_path / "run", metrics=metrics, limit=1)))
+    assert run.tasks["error"].to_pylist() == [message]
 
 
 def test_the_name_of_a_run_depends_on_what_determines_it(toy, tmp_path, monkeypatch):

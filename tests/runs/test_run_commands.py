@@ -52,6 +52,29 @@ def test_shards_are_run_and_merged(call, tmp_path):
     assert "partial" in out
 
 
+def test_a_shard_without_tasks_is_done(call, tmp_path):
+    words = ("run", "-p", "constant-velocity", "--limit", 1, "--workers", 1, "--shard")
+    outs = [call(*words, f"{i}/2", "--out", tmp_path / str(i)) for i in (1, 2)]
+    assert [code for code, _, _ in outs] == [0, 0]
+    assert sum("no task falls into shard" in out for _, out, _ in outs) == 1
+    code, _, _ = call("merge", tmp_path / "1", tmp_path / "2", "--out", tmp_path / "m", store=False)
+    assert code == 0
+
+
+def test_a_run_is_not_scored_into_itself(call, tmp_path):
+    run = tmp_path / "run"
+    call("run", "-p", "constant-velocity", "--limit", 1, "--workers", 1, "--out", run)
+    before = (run / "tasks.parquet").read_bytes()
+    code, _, err = call("score", run, "--out", run)
+    assert (code, "is the run that is scored" in err) == (1, True)
+    assert (run / "tasks.parquet").read_bytes() == before
+
+
+def test_seeds_may_be_given_one_by_one(call):
+    words = ("-p", "constant-velocity", "-n", "ou-high", "--seeds", "0-1", "--seeds", 3)
+    assert "seeds 0 1 3" in " ".join(call("run", *words, "--dry-run")[1].split())
+
+
 def test_resuming_and_its_state_are_printed(call, tmp_path):
     words = ("run", "-p", "constant-velocity", "--workers", 1, "--out", tmp_path / "run")
     assert "nothing there yet" in call(*words, "--resume")[1]

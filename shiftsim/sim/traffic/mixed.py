@@ -15,7 +15,7 @@ from shiftsim.sim.traffic import Traffic
 from shiftsim.world.events import CROSSING_SIZE, ScriptedPedestrian
 from shiftsim.world.lanes import find_start
 from shiftsim.world.scenario import Scenario
-from shiftsim.world.state import LAST_AGENT_KIND, Tracks, center_poses
+from shiftsim.world.state import LAST_AGENT_KIND, AgentKind, Tracks, center_poses
 
 Rule = Collection[int] | Callable[[Tracks], BoolArray]
 _SETS_OFF = 50.0  # m, how near along its lane the ego must be
@@ -78,6 +78,10 @@ class Mixed:
 
     def __init__(self, *policies: tuple[Rule, AgentPolicy]) -> None:
         self._policies = policies
+        for rule, policy in policies:
+            if not callable(rule) and (unknown := set(rule) - set(AgentKind)):
+                what = f"the tracks of {type(policy).__name__} are of no kind: {unknown.pop()!r}"
+                raise ConfigError(what, hint="give AgentKind.VEHICLE and so on")
 
     def start(self, scenario: Scenario, tracks: Tracks, row: int) -> None:
         """Share the tracks out."""

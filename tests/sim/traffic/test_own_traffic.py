@@ -118,6 +118,11 @@ def test_a_rule_that_is_no_mask_is_named(scenario: Scenario) -> None:
         drive(scenario, Mixed((lambda tracks: [True], LogReplay())))
 
 
+def test_kinds_are_no_texts() -> None:
+    with pytest.raises(ConfigError, match="tracks of LogReplay are of no kind: 'car'"):
+        Mixed((["car"], LogReplay()))  # type: ignore[list-item]
+
+
 def test_wrong_names_say_what_there_is() -> None:
     with pytest.raises(ConfigError, match="traffic 'idm' unknown") as caught:
         make_traffic("idm")
