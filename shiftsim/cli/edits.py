@@ -51,11 +51,12 @@ def check(
         except ShiftsimError as error:
             refused.append({"token": token, "error": error.message, "hint": error.hint})
     count = len(edited.tokens)
+    made = count - len(refused)
     lines = [
         *(f"refused: {row['error']}" + (row["hint"] and f" ({row['hint']})") for row in refused),
-        f"{plural(count, 'edited scenario')}, {len(refused)} refused",
+        f"{plural(made, 'edited scenario')}, {len(refused)} refused",
     ]
-    print_result({"edited": count, "refused": refused}, lines, as_json=as_json)
+    print_result({"edited": made, "refused": refused}, lines, as_json=as_json)
     if refused:
         what = f"{len(refused)} of {plural(count, 'edited scenario')} cannot be made"
         raise ConfigError(what, hint="repair or remove the edits named above")

@@ -52,7 +52,12 @@ def apply_edit(
         if edit.start is not None:
             scenario = _begin_at(scenario, edit.start, replay)
         if not edit.code:
-            return _apply_tables(scenario, edit)
+            edited = _apply_tables(scenario, edit)
+            events = edited.script and (edited.script.pedestrians or edited.script.termination)
+            if not (events or edit.start or edit.agents) and _seen(edited) == _seen(scenario):
+                what = f"nothing changes in the {edited.duration:.1f} s of the scenario"
+                raise ConfigError(what, "choose tracks and values that make a difference")
+            return edited
         if driven_lanes is None:
             what = f"the code {edit.code!r} is applied in runs only"
             raise ConfigError(what, 'write it into a file with profile = "interplan", and run that')
@@ -60,6 +65,21 @@ def apply_edit(
     except ShiftsimError as error:
         text = f"edit {edit.name!r} of scenario {scenario.token!r}: {error.message}"
         raise ConfigError(text, error.hint) from error
+
+
+def _seen(scenario: Scenario) -> list[bytes]:
+    """What an edit can change, up to the last iteration, as bytes that can be compared."""
+    rows = slice(int(scenario.iteration_rows[-1]) + 1)
+    tracks, status = scenario.tracks.rows(rows), scenario.traffic_lights.status[rows]
+    lit = (status != LightStatus.ABSENT).any(axis=0)
+    lights = np.array(scenario.traffic_lights.connector_ids)[lit]
+    tracks = tracks.select(np.flatnonzero(tracks.valid.any(axis=0)))
+    values = (
+        *(tracks.tokens, *tracks.arrays, lights, status[:, lit], scenario.ego[rows]),
+        *(scenario.map.speed_limits, scenario.route, scenario.mission_goal),
+        scenario.iteration_rows,
+    )
+    return [np.asarray(value).tobytes() for value in values]
 
 
 def _apply_tables(scenario: Scenario, edit: spec.Edit) -> Scenario:
@@ -270,6 +290,8 @@ def _set_window(builder: ScenarioBuilder, seconds: float) -> None:
             "its start on",
             hint="convert the recording with a longer duration",
         )
+    if len(inside) <= _MIN_LEFT:
+        raise ConfigError(f"a window of {seconds:g} s is too short", "give some seconds")
     _, offset, ratio = scenario.mapping
     builder.change(iteration_rows=inside, mapping=(seconds, offset, ratio), is_short=False)
 

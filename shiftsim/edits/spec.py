@@ -33,6 +33,8 @@ _CHOICES: dict[str, Sequence[str]] = {
     "command": COMMANDS,
 }
 _FREE_SIGN = ("ahead_m", "left_m", "turn", "pose", "near", "goal", "also_at", "from_s", "ego")
+_POSITIVE = ("length_m", "decel_mps2")
+_WITHIN = 50.0  # m, from a pedestrian to the ego that sets it off
 _MAX_NAME = 60  # characters
 # of keys, in words
 _SIDES = {"ahead_m": ("ahead", "behind"), "left_m": ("left", "right")}
@@ -124,7 +126,7 @@ class Walk:
     start: Place
     end: Place
     start_s: float | None = None  # when it sets off [s]; without, when the ego is near
-    ego_within_m: float = 50.0  # distance of the ego's centre that sets it off [m]
+    ego_within_m: float = _WITHIN  # distance of the ego's centre that sets it off [m]
     speed_mps: float = 1.4
     visible: bool = True  # whether it can be seen before it sets off
 
@@ -313,8 +315,11 @@ def _contradictions(edit: Edit) -> Iterator[tuple[str, str]]:
         yield ", light: give either connectors or route = true", ""
     if any(light.to_s is not None and light.to_s <= light.from_s for light in edit.light):
         yield ", light: to_s is not after from_s", "leave to_s out for the end of the scenario"
-    if any(not block.length_m for block in edit.block_lane):
-        yield ", block_lane: length_m is 0", "give the length of what is closed, such as 10"
+    if any(walk.start_s is not None and walk.ego_within_m != _WITHIN for walk in edit.walk):
+        yield ", walk: give either start_s or ego_within_m", ""
+    if any(one.speed_mps and _stands(one) for one in edit.spawn):
+        what = ", spawn: speed_mps is for a vehicle that is not stopped"
+        yield what, 'leave speed_mps out, or give behavior = "idm"'
     if any(not slow.tokens and not slow.kinds for slow in edit.slow):
         yield ", slow: say which tracks, by tokens or kinds", ""
     if any(not stop.tokens for stop in edit.stop):
@@ -323,6 +328,10 @@ def _contradictions(edit: Edit) -> Iterator[tuple[str, str]]:
         yield ", slow: factor is above 1", "a recording cannot be sped up"
     if any(not remove.share <= 1.0 for remove in edit.remove):
         yield ", remove: share is above 1", ""
+
+
+def _stands(spawn: Spawn) -> bool:
+    return spawn.behavior == "stopped" or spawn.kind != "vehicle"
 
 
 def _renamed(table: Mapping[str, Any]) -> dict[str, Any]:
@@ -347,10 +356,11 @@ def _walk(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _check(name: str, value: Any, where: str) -> None:
-    """Refuse a number that is none or negative, and a word that is not among the choices."""
+    """Refuse a number that is none or of the wrong sign, and a word that is no choice."""
     if isinstance(value, (int, float)):
-        if not math.isfinite(value) or (value < 0.0 and name not in _FREE_SIGN):
-            signed = "finite" if name in _FREE_SIGN else "0 or more"
+        is_positive, is_free = name in _POSITIVE, name in _FREE_SIGN
+        if not math.isfinite(value) or (value < 0.0 and not is_free) or (is_positive and not value):
+            signed = "finite" if is_free else "above 0" if is_positive else "0 or more"
             allowed = "from 0 to 1" if name in ("factor", "share") else signed
             raise ConfigError(f"{where}: {name} {value!r} must be {allowed}")
     elif value and name in _CHOICES:

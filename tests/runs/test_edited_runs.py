@@ -192,6 +192,7 @@ def test_the_commands_check_and_show_edits(toy, edits, tmp_path):
     done = call(tmp_path, "edits", "check", str(bad), "--store", str(toy))
     assert done.returncode == 1
     assert "refused: edit 'mine' of scenario '0003cafe': there is no track 'nobody'" in done.stdout
+    assert "\n0 edited scenarios, " in done.stdout
     done = call(tmp_path, "edits", "show", str(edits), "0001", "--store", str(toy), "-o", "a.png")
     assert done.returncode == 0
     assert (tmp_path / "a.png").stat().st_size > 5000

@@ -247,6 +247,9 @@ def test_the_path_goes_on_beyond_the_recording(scene):
     np.testing.assert_allclose(path.pose(At(100.0, 1.0, 0.1))[1:], [1.0, 0.1], atol=1e-9)
 
 
+_WALK = {"from": {"ahead_m": 40.0, "left_m": -4.0}, "to": {"ahead_m": 40.0, "left_m": 4.0}}
+
+
 @pytest.mark.parametrize(
     ("tables", "reason"),
     [
@@ -265,6 +268,16 @@ def test_the_path_goes_on_beyond_the_recording(scene):
             "from_s is 99, the scenario ends at 6.0 s",
         ),
         ({"slow": {"factor": 0.5, "kinds": ["vehicle"], "from_s": 6.0}}, "slow: from_s is 6"),
+        ({"remove": {"share": 0.0}}, "nothing changes in the 6.0 s of the scenario"),
+        ({"remove": {"near": [0.0, 0.0, 5.0]}}, "nothing changes"),
+        ({"remove": {"kinds": ["barrier"]}}, "nothing changes"),
+        ({"move": {"tokens": ["0" * 16]}}, "nothing changes"),
+        ({"slow": {"factor": 1.0, "kinds": ["vehicle"]}}, "nothing changes"),
+        ({"slow": {"factor": 0.5, "kinds": ["barrier"]}}, "nothing changes"),
+        ({"speed": {}}, "nothing changes"),
+        ({"speed": {"limit": 1.0, "tracks": 1.0}}, "nothing changes"),
+        ({"walk": _WALK | {"start_s": 13.0, "visible": False}}, "nothing changes"),
+        ({"window_s": 0.1}, "a window of 0.1 s is too short"),
         ({"reroute": {"route": ["3"]}}, "does not hold roadblock '1' of the ego"),
         ({"reroute": {"goal": [5.0, 0.0]}}, "no lanes lead|the goal is"),
     ],
@@ -292,7 +305,11 @@ def test_what_cannot_be_applied_names_scenario_edit_and_reason(scene, tables, re
             {"light": [{"status": "red", "route": True, "from_s": 10, "to_s": 5}]},
             "to_s is not after",
         ),
-        ({"block_lane": [{"at": {}, "length_m": 0}]}, "block_lane: length_m is 0"),
+        ({"block_lane": [{"at": {}, "length_m": 0}]}, "block_lane: length_m 0 must be above 0"),
+        ({"stop": [{"tokens": ["a"], "decel_mps2": 0}]}, "stop: decel_mps2 0 must be above 0"),
+        ({"spawn": [{"at": {}, "behavior": "stopped", "speed_mps": 8}]}, "speed_mps is for"),
+        ({"spawn": [{"at": {}, "kind": "barrier", "speed_mps": 8}]}, "speed_mps is for"),
+        ({"walk": _WALK | {"start_s": 1, "ego_within_m": 20}}, "either start_s or ego_within_m"),
         ({"spawn": [{"at": {}, "speed_mps": "fast"}]}, "speed_mps is 'fast'; it must be a number"),
         ({"spawn": [{"at": {}, "speed_mps": 10**400}]}, "it must be a number that is not so large"),
         ({"slow": [{"factor": 2.0, "kinds": ["vehicle"]}]}, "factor is above 1"),
