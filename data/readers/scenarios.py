@@ -9,7 +9,7 @@ shorter one is one window with 2 s of history. Whatever is dropped is counted.
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -152,12 +152,29 @@ def require_scenarios(summary: RecordingSummary, source: Path) -> None:
             "check the unit of time, or --hz",
         )
     counts = ", ".join(f"{rule} {count}" for rule, count in summary.rejected.items())
-    others = {rule: count for rule, count in summary.rejected.items() if rule != windows.CATEGORY}
     raise ConversionError(
         f"{source}: no scenario is left of {summary.seen} pairs of window and object; dropped"
         f" by the rules {counts}",
-        _REMEDIES[max(others, key=lambda rule: others[rule]) if others else windows.CATEGORY],
+        _REMEDIES[_worst_rule(summary.rejected)],
     )
+
+
+def why_none(summaries: Sequence[RecordingSummary]) -> tuple[str, bool]:
+    """Why recordings have no scenario, in words, and whether shorter windows may help."""
+    rejected: Counter[str] = Counter()
+    for summary in summaries:
+        rejected.update(summary.rejected)
+    if not rejected:
+        longest = max((summary.duration_s for summary in summaries), default=0.0)
+        return f"no window fits, the longest recording has {longest:.1f} s", True
+    rule = _worst_rule(rejected)
+    return _REMEDIES[rule].partition(":")[0], rule == windows.PRESENCE
+
+
+def _worst_rule(rejected: Mapping[str, int]) -> str:
+    """The rule that dropped most, categories last."""
+    known = [rule for rule in rejected if rule in _REMEDIES]  # not what is beyond max_per_window
+    return max(known, key=lambda rule: (rule != windows.CATEGORY, rejected[rule]))
 
 
 def write_converted(writer: StoreWriter, converted: Converted) -> None:

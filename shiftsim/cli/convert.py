@@ -284,13 +284,24 @@ def _convert(
     as_json: bool,
 ) -> int:
     """Convert a source over processes, print the report, and return the code for it."""
+    from shiftsim.data.readers.scenarios import why_none
+
     folder = store_path(store)
     with progress_bar(quiet=quiet or as_json) as advance:
         report = make(store=folder, on_progress=advance)
     following = f" next: shiftsim filter {store}, then shiftsim run --planner idm --store {store}"
+    # of a data set, the report says nothing of what was kept
+    if is_empty := not report.accepted and (kind == "site" or not report.kept):
+        reason, is_short = why_none(report.recordings)
+        following = f" no scenario: {reason}"
+        if kind == "dataset":
+            following += "\n   remedy: --egos vehicles, or other recordings"
+        elif is_short:
+            following += "\n   remedy: shorter windows, such as --window-s 10 --overlap-s 5"
+            following += " --history-s 2; shiftsim convert dsc3d --help shows the shortest"
     printed = [*lines(report, folder), following]
     print_result({kind: report.name, **_contents(report)}, printed, as_json=as_json)
-    return cli.UNFINISHED if report.skipped else 0
+    return cli.UNFINISHED if report.skipped or is_empty else 0
 
 
 def _options(path: Path | None, flags: dict[str, Any]) -> "ConversionConfig":

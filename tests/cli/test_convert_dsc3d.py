@@ -165,6 +165,23 @@ def test_settings_come_from_a_file_and_flags_win(place, capsys):
 
 
 @pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("--window-s", "40"), "no window fits, the longest recording has 30.0 s"),
+        (("--config", "still.toml"), "all vehicles stand"),
+    ],
+)
+def test_a_conversion_without_scenarios_says_why(place, capsys, words, reason):
+    (place / "still.toml").write_text("min_peak_speed = 50.0\n")
+    store = f"empty-{words[1]}"
+    code, out, _ = convert(place, capsys, "town", "--store", store, "--workers", "1", *words)
+    assert code == 3
+    assert f" no scenario: {reason}\n" in out
+    assert ("remedy: shorter windows, such as --window-s" in out) == ("window" in reason)
+    assert "next:" not in out
+
+
+@pytest.mark.parametrize(
     ("words", "code", "fact"),
     [
         (("--category", "lorry"), 1, "category 'lorry' is not NAME=KNOWN"),
