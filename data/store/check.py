@@ -53,7 +53,7 @@ _REMEDIES = {
     "off the map": "check that map and recording have one origin, or leave the scenario out",
     "range": CHECK,
     "length": "cut longer windows, or leave the scenario out",
-    "route": "correct the route in shiftsim inspect",
+    "route": "correct the route in shiftsim inspect, or leave the scenario out",
     "gap": "leave the scenario out",
     "short": "its score does not compare with that of a whole scenario",
 }
@@ -309,7 +309,7 @@ def _check_scenario(scene: Scenario, overlaps: _Overlaps | None) -> Iterator[_Fi
         )
         yield "length", what, True
     if overlaps is not None:
-        yield from chain(_check_lanes(scene, overlaps), _check_place(scene), _check_route(scene))
+        yield from chain(_check_route(scene), _check_lanes(scene, overlaps), _check_place(scene))
     gap = np.diff(scene.time_us).max(initial=0)
     if gap > _MAX_STEP_US:
         what = f"the recording has a gap of {gap / 1e6:.2f} s, at most {_MAX_STEP_US / 1e6:g} s"
@@ -400,6 +400,8 @@ def _check_route(scene: Scenario) -> Iterator[_Finding]:
         yield "route", what, False
     if not blocks:
         yield "route", "there is no route, so progress cannot be measured", False
+    if len(blocks) == 1:
+        yield "route", "the route has 1 roadblock, IDM and PDM planners need at least 2", False
 
 
 def _wrong_numbers(scene: Scenario) -> Iterator[str]:

@@ -167,6 +167,12 @@ def test_a_route_that_does_not_connect_is_an_error(tmp_path):
     assert "roadblock 2 of 2 of the route, '3', does not follow '1'" in problem.what
 
 
+def test_a_route_of_one_roadblock_is_unusual(tmp_path):
+    problem = _only(_write(tmp_path / "s", route=("1",)))
+    assert (problem.is_error, problem.kind) == (False, "route")
+    assert "the route has 1 roadblock" in problem.what
+
+
 def _crossing_lanes(low, high):
     """Two lanes without neighbours; the second reaches from y = low to y = high over the first."""
     edges, blocks = [], []
@@ -215,7 +221,7 @@ def test_lanes_that_overlap_elsewhere_on_the_route_are_an_error(tmp_path):
     road = _crossing_lanes(1.0, 10.0)
     scene = cruise_scenario(iterations=LONG, speed=0.0, start=(10.0, 0.0, 0.0))
     found = survey_store(_write(tmp_path / "s", road=road, scene=scene, route=("0",))).problems
-    assert [p.is_error for p in found if p.where == "scenario cafe"] == [True]
+    assert [p.is_error for p in found if p.where == "scenario cafe"] == [False, True]
     assert "on the route overlap by 7.5 m²" in found[-1].what
 
 
@@ -231,5 +237,5 @@ def test_the_command_shows_remedies_and_a_table(tmp_path, capsys):
         main(["check", str(tmp_path / "s")])
     out = capsys.readouterr().out
     assert end.value.code == 2
-    assert "does not follow '1' (correct the route in shiftsim inspect)" in out
+    assert "does not follow '1' (correct the route in shiftsim inspect, or" in out
     assert "route 1" in out.splitlines()[-2]
