@@ -165,8 +165,15 @@ def open_checkpoint(path: Path) -> Checkpoint:
     tensors = {str(name): value for name, value in holder.items() if hasattr(value, "as_strided")}
     if not tensors:
         entries = ", ".join([*contents.entries][:8]) or "none"
-        what = f"checkpoint {str(path)!r} holds no tensors (entries: {entries})"
-        raise CheckpointError(what, reader.WRITTEN_HINT)
+        what, hint = "holds no tensors", reader.WRITTEN_HINT
+        for name, value in contents.entries.items():
+            if isinstance(value, dict) and any(
+                hasattr(one, "as_strided") for one in value.values()
+            ):
+                what = f"holds its tensors in the entry {name!r}, not in one of {_ENTRIES}"
+                hint = f"save that alone: torch.save(torch.load(FILE)[{name!r}], NEW)"
+        what = f"checkpoint {str(path)!r} {what} (entries: {entries})"
+        raise CheckpointError(what, hint)
     state = _without_prefixes(tensors)
     others = [name for name in contents.entries if name != entry] if entry else []
     others += [name for name in holder if name not in tensors]

@@ -79,6 +79,8 @@ def convert_checkpoint(spec: str, out: Path, *, half: bool = False) -> Inspectio
     if out.suffix != ".safetensors":
         raise CheckpointError(f"cannot write {str(out)!r}", hint="name it ….safetensors")
     found = checkpoint.open_checkpoint(checkpoint.find_checkpoint(spec))
+    if out.exists() and out.samefile(found.path):
+        raise CheckpointError(f"{str(out)!r} is the checkpoint itself", "write to another file")
     planner = checkpoint.most_like(checkpoint.shapes_of(found.state))
     if not planner:
         what = f"checkpoint {str(found.path)!r} is of no planner known here"

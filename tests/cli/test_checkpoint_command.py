@@ -86,6 +86,8 @@ def test_convert_writes_what_loads_equally(place):
         (("inspect", "absent.ckpt"), "checkpoint 'absent.ckpt' does not exist", "check the path"),
         (("convert", "planTF.ckpt", "a.pth"), "cannot write 'a.pth'", "name it"),
         (("inspect", "page.ckpt"), "is a web page: the download has failed", ""),
+        (("inspect", "own.pth"), "its tensors in the entry 'net', not in one of", "(FILE)['net']"),
+        (("convert", "own.safetensors", "own.safetensors"), "is the checkpoint itself", "another"),
         (("convert", "other.pth", "a.safetensors"), "is of no planner known here", "inspect"),
     ],
 )
@@ -93,7 +95,11 @@ def test_what_cannot_be_done_is_two_lines(place, words, fact, hint):
     import torch
 
     (place / "page.ckpt").write_text("<html>")
+    from safetensors.torch import save_file
+
     save({"a": torch.ones(2)}, place / "other.pth")
+    save({"epoch": 3, "net": {"a": torch.ones(2)}}, place / "own.pth")
+    save_file({"a": torch.ones(2)}, place / "own.safetensors")
     done = call(place, "checkpoint", *words)
     assert done.returncode == 1
     assert fact in done.stderr
