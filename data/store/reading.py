@@ -4,6 +4,7 @@ The layout and every column are described in `shiftsim.data.store.schema`.
 """
 
 import json
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property
@@ -19,7 +20,7 @@ from shiftsim.data.recording import scenario as make_scenario
 from shiftsim.data.store import schema, tables
 from shiftsim.data.store.map import read_map_file
 from shiftsim.data.store.recordings import StoredRecording, ego_states
-from shiftsim.errors import FAILED, ConfigError, DataError, beginning
+from shiftsim.errors import FAILED, ConfigError, DataError, beginning, listed
 from shiftsim.files import safe_join
 from shiftsim.world.map import VectorMap
 from shiftsim.world.scenario import Scenario
@@ -55,6 +56,9 @@ class ScenarioStore:
         self.generator: dict[str, Any] = dict(manifest.get("generator", {}))
         self._file = path / tables.SCENARIOS
         self._table = tables.Table(self._file, schema.SCENARIOS).read()
+        if tables.digest(self._file) != manifest["files"].get(tables.SCENARIOS):
+            what = f"{self._file}: the content is not what {tables.MANIFEST} says"
+            raise DataError(what, tables.REPAIR)
         self.tokens: tuple[str, ...] = tuple(self._table["token"].to_pylist())
         self._row_of = {token: row for row, token in enumerate(self.tokens)}
         if len(self._row_of) != len(self.tokens):
@@ -167,7 +171,11 @@ class ScenarioStore:
     def map(self, city: str) -> VectorMap:
         """A map, kept for the next scenario of that city; a DataError if missing or damaged."""
         if city not in self._maps:
-            self._maps[city] = read_map_file(self.map_file(city))
+            path = self.map_file(city)
+            if city not in self.cities and not os.path.exists(path):
+                what = f"store {self.path.name!r}: map {city!r} is missing"
+                raise DataError(what, f"there are: {listed(self.cities)}")
+            self._maps[city] = read_map_file(path)
         return self._maps[city]
 
     def failed_checks(self) -> Iterator[tuple[Path, dict[str, int]]]:

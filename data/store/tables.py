@@ -76,7 +76,9 @@ def read_manifest(store: Path) -> dict[str, Any]:
             what = f"{store}: the conversion of this store was interrupted"
             raise DataError(what, "start the same shiftsim convert again, it goes on")
         what = f"{store}: not a scenario store: {MANIFEST} is missing"
-        raise DataError(what, "give the folder that `shiftsim convert` wrote")
+        is_near = not store.exists() and Path(store.name).is_dir()
+        here = f"; ./{store.name} has no {MANIFEST} either" if is_near else ""
+        raise DataError(what, f"give the folder that `shiftsim convert` wrote{here}")
     try:
         manifest = json.loads(path.read_text("utf-8"))
         kind, version = manifest["format"], manifest["version"]

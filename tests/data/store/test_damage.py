@@ -19,6 +19,7 @@ from shiftsim.data.store.reading import open_store
 from shiftsim.data.store.recordings import ego_states, write_ego
 from shiftsim.data.store.writing import StoreWriter
 from shiftsim.errors import DataError
+from shiftsim.files import store_path
 from shiftsim.world.map import VectorMap
 from shiftsim.world.state import TrafficLights
 
@@ -107,6 +108,26 @@ def test_a_missing_store_and_an_unknown_token_are_named(store: Path, tmp_path: P
         open_store(tmp_path / "nothing")
     with pytest.raises(DataError, match="'abc'"):
         open_store(store).read("abc")
+
+
+def test_an_unknown_map_is_named_with_those_there_are(store: Path) -> None:
+    with pytest.raises(DataError, match="map 'junktion' is missing") as caught:
+        open_store(store).map("junktion")
+    assert caught.value.hint.startswith("there are: ")
+
+
+def test_a_folder_here_that_is_no_store_is_named(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "broke").mkdir()
+    with pytest.raises(DataError, match=r"\./broke has no store.json either"):
+        tables.read_manifest(store_path("broke"))
+
+
+def test_a_table_of_scenarios_that_was_cut_is_refused(store: Path) -> None:
+    path = store / "scenarios.parquet"
+    pq.write_table(pq.read_table(path).slice(0, 0), path)
+    with pytest.raises(DataError, match=r"scenarios\.parquet: the content is not what store\.json"):
+        open_store(store)
 
 
 def test_another_version_is_refused(store: Path) -> None:
