@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from shiftsim._version import __version__
 from shiftsim.data import open_store
-from shiftsim.errors import ConfigError, one_of
+from shiftsim.errors import ConfigError, nearest, one_of
+from shiftsim.files import expand
 from shiftsim.metrics import METRIC_VERSION, load_metric, thresholds_of
 from shiftsim.planners import registry
 from shiftsim.planners.registry import PLANNERS, RunPlanner, planner_name, takes_argument
@@ -250,6 +251,9 @@ def _checkpoints(config: RunConfig, takers: Sequence[str]) -> dict[str, str]:
     for text in config.checkpoints:
         name, equals, path = text.partition("=")
         if not equals or name not in labels:
+            is_label = nearest(name, takers) or expand(path).is_file()
+            if equals and takers and is_label and not expand(text).exists():
+                one_of("planner with a checkpoint", name, takers)
             name, path = (takers[0], text) if len(takers) == 1 else ("", text)
         if not name and not takers:
             what = f"checkpoint {text!r}: {', '.join(labels)} takes none"

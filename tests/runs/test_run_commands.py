@@ -103,6 +103,7 @@ def test_checkpoint_device_and_batch_size_are_printed(call, tmp_path):
     [
         (("--checkpoint", "x.ckpt"), "constant-velocity takes none"),
         (("--checkpoint", "constant-velocity=x.ckpt"), "planner with a checkpoint"),
+        (("-p", "plantf", "--checkpoint", "plantff=a.ckpt"), "'plantff' unknown"),
         (("--device", "gpu"), "device 'gpu' unknown"),
         (("--batch-size", "0"), "batch_size is 0"),
         (("--timeout", "-1"), "timeout is -1.0"),
