@@ -50,6 +50,9 @@ class TracksReader(Reader):
         self.config = config = config or ConversionConfig(ego_categories=EGO_CATEGORIES)
         self.paths = [tracks] if isinstance(tracks, Path) else tracks
         self.source, self.map_path = self.paths[0], map_path
+        if self.source.suffix.lower() == ".xodr":
+            what = f"{self.source} is an OpenDRIVE map, not a table of tracks"
+            raise ConversionError(what, "give the tables first, then the map")
         table = read_tracks(self.paths, overrides=overrides, hz=hz)
         drive, self.name = read_opendrive(map_path), city or map_path.stem
         self.site: BuiltMap = opendrive_site(drive, name=self.name, country=config.country)
@@ -57,6 +60,9 @@ class TracksReader(Reader):
             table = _at_origin(table, self.road, table.origin)
         self.table, self.diagnostics = table, diagnose(table, self.road, config.min_drivable_share)
         _note_inputs(self.paths, table, self.diagnostics)
+        if hz is not None and "frame" not in table.columns.found:
+            remedy = "leave hz out, or name the column of frames: [columns] frame = 'NAME'"
+            self.diagnostics.warn("hz is not used: the table has times", remedy)
         tables = [digest(path) for path in self.paths]  # which others of that name have not
         self.details = {"figures": self.diagnostics.figures, "tables": tables}
         columns = asdict(table.columns) | {"hz": table.hz}

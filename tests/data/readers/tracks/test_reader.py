@@ -253,6 +253,19 @@ def test_the_corner_with_the_least_numbers_is_half_a_size_from_the_middle(town, 
     np.testing.assert_allclose(read_tracks(path, overrides=columns).xy, expected, rtol=0, atol=1e-6)
 
 
+def test_frames_per_second_of_a_table_with_times_are_not_used_and_that_is_said(town, tmp_path):
+    table = {name: values for name, values in town[0].items() if name != "frame"}
+    inspection = TracksReader(write_tracks(tmp_path / "t.csv", table), town[1], hz=5.0)
+    assert [w.what for w in inspection.diagnostics.warnings] == [
+        "hz is not used: the table has times"
+    ]
+
+
+def test_a_map_where_a_table_is_wanted_is_refused(town, tmp_path):
+    with pytest.raises(ConversionError, match="is an OpenDRIVE map, not a table"):
+        TracksReader(town[1], write_tracks(tmp_path / "t.csv", town[0]))
+
+
 def test_files_of_levelxdata_need_nothing_said(town, tmp_path):
     c = town[0]
     table = {
