@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from shiftsim.compat.nuplan.results import ResultsExport
     from shiftsim.data.nuplan.export import ExportReport
     from shiftsim.data.store.check import CheckReport
-    from shiftsim.data.store.reading import ScenarioStore
     from shiftsim.runs.filter import FilterResults
 
 _MAX_SHOWN = 20  # problems of one kind
@@ -110,16 +109,6 @@ def _verdict_lines(found: "FilterResults", thresholds: str) -> "Iterator[str]":
 _DETAILS = {"path_m": "path", "progress_m": "along the route", "max_outside_m": "off the road"}
 
 
-def _chosen(store: "ScenarioStore", settings: cli.Settings) -> tuple[str, ...]:
-    """The scenarios of a split, or all that review and filter accepted."""
-    from shiftsim.runs.scenarios import open_split, require_scenarios
-
-    whole = settings.get("all_scenarios", False)
-    split, _ = open_split(store, settings.get("split", ""), whole=whole)
-    require_scenarios(split.name, split.tokens, store.path.name, store.tokens)
-    return split.tokens
-
-
 @cli.with_settings("split", "all_scenarios")
 def make_split(
     settings: cli.Settings,
@@ -137,12 +126,12 @@ def make_split(
 
     Scenarios are taken in the order of their tokens, which says nothing about their content.
     """
-    from shiftsim.runs.scenarios import choose_scenarios, write_split
+    from shiftsim.runs.scenarios import choose_scenarios, usable_tokens, write_split
 
     opened = cli.open_store(store)
     found = choose_scenarios(
         opened.summary().select(["token", "type", "city"]).to_pylist(),
-        set(_chosen(opened, settings)),
+        set(usable_tokens(opened, **settings)),
         wanted={"type": types or [], "city": cities or []},
         per_type=per_type,
         limit=limit,
@@ -167,8 +156,10 @@ def export_to_nuplan(
     nuPlan's own code opens its four city maps whatever map is asked for: put them into the folder
     of the maps too, and merge the two index files.
     """
+    from shiftsim.runs.scenarios import usable_tokens
+
     opened = cli.open_store(store)
-    tokens = _chosen(opened, settings)
+    tokens = usable_tokens(opened, **settings)
     with progress_bar(quiet=quiet or as_json) as advance:
         report = opened.export_nuplan(out, tokens=tokens, progress=advance)
     mappings: list[dict[str, Any]] = [
@@ -269,10 +260,11 @@ def show_stats(
     from shiftsim.data.store.statistics import store_stats
     from shiftsim.report.dataset import stats_dict, stats_figure, stats_table
     from shiftsim.report.palette import FigureFormat, save_picture
+    from shiftsim.runs.scenarios import usable_tokens
 
     one_of("column", by, ("city", "type"))
     opened = cli.open_store(store)
-    tokens = _chosen(opened, settings)
+    tokens = usable_tokens(opened, **settings)
     with progress_bar(quiet=quiet or as_json) as advance:
         found = store_stats(
             opened, tokens, progress=lambda done, total, token: advance(done, total)

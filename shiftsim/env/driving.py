@@ -21,6 +21,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 from numpy.typing import NDArray
 
 from shiftsim.data import open_store
+from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.env.episode import REWARDS, Episode, NoObservation, Observer, Reward
 from shiftsim.env.raster import RasterObserver, picture_of
 from shiftsim.env.vector import VectorObserver
@@ -28,7 +29,7 @@ from shiftsim.errors import ConfigError, DataError, ShiftsimError, one_of, reada
 from shiftsim.geometry.boxes import from_frame
 from shiftsim.kernels import FloatArray
 from shiftsim.planners.learned.carl.planner import command_of
-from shiftsim.runs.scenarios import find_split
+from shiftsim.runs.scenarios import find_split, require_scenarios, usable_tokens
 from shiftsim.sim.log import Setting, Snapshot
 from shiftsim.sim.noise import NoiseModel
 from shiftsim.sim.perception import Localization, Perception, make_drift
@@ -89,7 +90,8 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
 
         Args:
             store: Store by name, path or URL, or an object with `tokens` and `read(token)`.
-            split: Name or file of a split of the store; all its scenarios if empty.
+            split: Name or file of a split of the store; if empty, all its scenarios but those that
+                filter or review have dropped.
             observation: `vector`, `raster`, `none`, or an `Observer` of one's own.
             reward: `regular`, `nuplan` or `survival` as CaRL has them, `score`, or a function of
                 the `Episode`.
@@ -109,14 +111,15 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         """
         self._settings = {name: value for name, value in locals().items() if name != "self"}
         self._store: Any = _opened(store) if isinstance(store, str) else store
-        self._tokens = tuple(self._store.tokens)
-        if split:
-            folder = Path(getattr(self._store, "path", ""))
-            self._tokens = find_split(split, folder, self._tokens).tokens
-        missing = set(self._tokens) - set(self._store.tokens)
-        if missing or not self._tokens:
-            what = f"lacks {len(missing)} of the split {split!r}" if missing else "has no scenarios"
-            raise DataError(f"store {str(store)!r} {what}", hint="choose another store or split")
+        held = tuple(self._store.tokens)
+        if type(self._store) is ScenarioStore:  # what filter and review say is of recorded ones
+            self._tokens = usable_tokens(self._store, split)
+        else:
+            found = find_split(split, Path(getattr(store, "path", "")), held)
+            require_scenarios(found.name, found.tokens, str(store), held)
+            self._tokens = found.tokens
+        if not self._tokens:
+            raise DataError(f"store {str(store)!r} has no scenarios", hint="choose another store")
         named = traffic_name(traffic) if isinstance(traffic, str) else deepcopy(traffic)
         drift = make_drift(noise, perception, localization, latency)
         models: Any = {item.name: getattr(drift, item.name) for item in fields(drift)}
@@ -169,7 +172,7 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
             DataError: The store has no scenario of that token.
         """
         super().reset(seed=seed)
-        drawn = {
+        drawn: dict[str, Any] = {
             "token": self._tokens[int(self.np_random.integers(len(self._tokens)))],
             "noise_seed": int(self.np_random.integers(2**31)),
         }

@@ -207,6 +207,15 @@ def open_split(store: ScenarioStore, name: str, *, whole: bool = False) -> "tupl
     return find_split(name, Path(store.path), usable), digest
 
 
+def usable_tokens(
+    store: ScenarioStore, split: str = "", *, all_scenarios: bool = False
+) -> tuple[str, ...]:
+    """The scenarios of a split, all of which the store must hold, or all that may be used."""
+    found, _ = open_split(store, split, whole=all_scenarios)
+    require_scenarios(found.name, found.tokens, store.path.name, store.tokens)
+    return found.tokens
+
+
 def require_scenarios(split: str, tokens: Sequence[str], store: str, held: Iterable[str]) -> None:
     """Refuse a split of which a store does not hold everything, with a DataError."""
     if missing := sorted(set(tokens).difference(held)):

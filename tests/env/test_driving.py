@@ -10,13 +10,17 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from stores import write_toy_store
 from worlds import cruise_scenario, standing_tracks
 
 import shiftsim
 import shiftsim.env
+from shiftsim.data import open_store
+from shiftsim.data.store.review import Review, Reviews, write_reviews
 from shiftsim.env.driving import DrivingEnv
 from shiftsim.errors import ConfigError, DataError, InvalidTrajectoryError
 from shiftsim.planners.learned.carl.planner import MAX_ACCELERATION, command_of
+from shiftsim.runs.edited import EditedStore, make_edits
 from shiftsim.sim.loop import simulate
 from shiftsim.sim.noise import sample_noise
 from shiftsim.sim.perception import Localization, Perception
@@ -247,8 +251,9 @@ def test_settings_that_are_wrong_are_named(toy, settings, error, message):
 
 def test_what_is_not_there_is_named(toy, tmp_path, source_of):
     (tmp_path / "other.txt").write_text("0001cafe\nffffcafe\n")
-    with pytest.raises(DataError, match=r"lacks 1 of the split"):
-        DrivingEnv(store=str(toy), split=str(tmp_path / "other.txt"))
+    for store in (str(toy), source_of(cruise_scenario())):
+        with pytest.raises(DataError, match=r"split 'other' needs 2 scenarios, .* lacks (1|2)"):
+            DrivingEnv(store=store, split=str(tmp_path / "other.txt"))
     with pytest.raises(DataError, match="has no scenarios"):
         DrivingEnv(store=source_of())
     env = DrivingEnv(store=str(toy))
@@ -262,6 +267,17 @@ def test_a_split_limits_what_is_drawn(toy, tmp_path):
     (tmp_path / "one.txt").write_text(f"{TOKEN}\n")
     env = DrivingEnv(store=str(toy), split=str(tmp_path / "one.txt"))
     assert {env.reset()[1]["token"] for _ in range(6)} == {TOKEN}
+
+
+def test_scenarios_that_filter_or_review_dropped_are_not_drawn(tmp_path):
+    store = write_toy_store(tmp_path / "toy", count=2)
+    write_reviews(store, Reviews([Review(TOKEN, "reject")]))
+    for place in (str(store), open_store(store)):
+        env = DrivingEnv(store=place)
+        assert {env.reset()[1]["token"] for _ in range(6)} == {"0000cafe"}
+    assert env.reset(options={"token": TOKEN})[1]["token"] == TOKEN
+    edits = make_edits({"edit": [{"name": "none", "remove": {}, "tokens": [TOKEN]}]}, "x")
+    assert DrivingEnv(store=EditedStore(open_store(store), edits)).reset()[1]["token"] != TOKEN
 
 
 def test_the_picture_shows_the_ego_on_the_road(source_of):
