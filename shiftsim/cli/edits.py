@@ -124,12 +124,11 @@ def sample(
     from shiftsim.edits.sampling import KINDS, sample_edits
     from shiftsim.runs.avoidable import grade
     from shiftsim.runs.edited import edits_text
-    from shiftsim.runs.scenarios import default_split, find_split
+    from shiftsim.runs.scenarios import default_split, usable_tokens
 
     one_of("kind", kind, KINDS)
     opened = cli.open_store(store)
-    name = split or default_split(opened)
-    tokens = find_split(name, Path(opened.path), opened.tokens).tokens
+    tokens = usable_tokens(opened, split or default_split(opened))
     read = lru_cache(maxsize=256)(opened.read)
     edits = list(sample_edits(kind, count, seed, tokens, read, grade, even=even))
     path = out if out.suffix else Path(f"{kind}.toml")

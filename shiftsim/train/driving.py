@@ -17,7 +17,7 @@ import numpy as np
 from shiftsim.data import open_store
 from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.env.episode import Episode
-from shiftsim.errors import DataError, ShiftsimError
+from shiftsim.errors import DataError, ShiftsimError, plural
 from shiftsim.kernels import FloatArray
 from shiftsim.planners.learned.carl import planner as carl
 from shiftsim.planners.pdm.planner import PdmClosed
@@ -225,7 +225,8 @@ def divide(store: ScenarioStore, tokens: Iterable[str], seed: int) -> Towns:
     for row in rows:
         groups.setdefault(row[column], []).append(row["token"])
     if len(groups) < 2:
-        raise DataError(f"the store has {len(rows)} scenarios", hint="training needs two or more")
+        what = f"{plural(len(rows), 'scenario')} to train on"
+        raise DataError(what, hint="training needs two or more")
     names = np.random.default_rng([seed, 1]).permutation(sorted(groups)).tolist()
     count = max(1, round(LEFT_OUT * len(names)))
     return Towns({n: groups[n] for n in names[count:]}, {n: groups[n] for n in names[:count]})

@@ -45,7 +45,7 @@ class BaseSettings:
 
     out: Path = field(metadata={"option": Option("Folder for networks, curves and tables.")})
     store: str = setting("demo", "Store by name, path or URL.")
-    split: str = setting("", "Split of the store; all its scenarios if empty.")
+    split: str = setting("", "Split of the store; if empty, all that was not dropped.")
     seed: int = setting(0, "Of everything that is random.")
 
     def __post_init__(self) -> None:
@@ -307,11 +307,11 @@ def write_features(settings: FeatureSettings, on_message: OnMessage) -> dict[str
     from safetensors import safe_open
 
     from shiftsim.data import open_store
-    from shiftsim.runs.scenarios import open_split
+    from shiftsim.runs.scenarios import usable_tokens
     from shiftsim.train.stream import Stream, load_blocks
 
     store = open_store(settings.store)
-    tokens = tuple(sorted(open_split(store, settings.split)[0].tokens))
+    tokens = tuple(sorted(usable_tokens(store, settings.split)))
     prepare_folder(settings, store.hash, resume=True)
     which = settings.store, tokens, settings.seed, sys.maxsize, settings.planner
     stream = Stream(*which, as_published=True)

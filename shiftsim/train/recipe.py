@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from shiftsim.data import open_store
-from shiftsim.errors import ConfigError, DataError
+from shiftsim.errors import ConfigError, DataError, listed
 from shiftsim.files import write_text
 from shiftsim.metrics.open_loop import METRICS
 from shiftsim.planners.learned.checkpoint import load_weights, resolve_device
@@ -29,7 +29,7 @@ from shiftsim.runs.config import make_config
 from shiftsim.runs.execute import execute
 from shiftsim.runs.prepare import prepare
 from shiftsim.runs.results import Run
-from shiftsim.runs.scenarios import open_split
+from shiftsim.runs.scenarios import usable_tokens
 from shiftsim.runs.workers import map_unordered
 from shiftsim.train import driving, folder, learning
 from shiftsim.train.checks import check
@@ -73,8 +73,8 @@ class Recipe(ABC):
         self.steps = max(1, samples // self._rounds // batch)  # of a round
         self.device = resolve_device(settings.device)
         store = open_store(settings.store)
-        split, _ = open_split(store, settings.split)
-        self.towns: driving.Towns = driving.divide(store, split.tokens, settings.seed)
+        tokens = usable_tokens(store, settings.split)
+        self.towns: driving.Towns = driving.divide(store, tokens, settings.seed)
         folder.prepare_folder(settings, store.hash, resume=resume)
         self.progress = Progress()
         self._make_learner(self.steps * self._rounds)
@@ -382,7 +382,7 @@ class ImitationTraining(Recipe):
     @property
     def _reasons(self) -> str:
         counts = self._left_out.most_common()
-        return ", ".join(f"{count} {reason}" for reason, count in counts) or "none"
+        return listed([f"{count} {reason}" for reason, count in counts]) or "none"
 
 
 def _open_loop_errors(rows: list[dict[str, Any]]) -> dict[str, float]:

@@ -99,7 +99,7 @@ class BlockMaker:
             scenario = self._store.read(token)
             self._planner.reset(scene_info(scenario))
         except ShiftsimError as error:
-            failed[type(error).__name__] += 1
+            failed[_reason(error)] += 1
             return made
         as_recorded = None, _draw(scenario, key)
         driven = [_draw_driven(*one, scenario, key) for one in self._driven[token]]
@@ -110,12 +110,16 @@ class BlockMaker:
                 try:
                     one = make_sample(self._planner, scenario, iteration, random, **how)
                 except ShiftsimError as error:
-                    one = type(error).__name__
+                    one = _reason(error)
                 if isinstance(one, str):
                     failed[one] += 1
                 else:
                     made.append(one)
         return made
+
+
+def _reason(error: ShiftsimError) -> str:
+    return f"{type(error).__name__}: {error.message}"
 
 
 def _usable(scenario: Scenario) -> IntArray:

@@ -90,7 +90,14 @@ def test_where_no_sample_can_be_made_it_says_why(asked, monkeypatch):
     monkeypatch.setattr(Pluto, "features", nothing)
     with pytest.raises(DataError, match="no sample could be made") as caught:
         write(asked)
-    assert "PlannerError" in caught.value.hint
+    assert "PlannerError: no route" in caught.value.hint
+
+
+def test_a_split_that_the_store_lacks_a_part_of_is_refused(asked, road, tmp_path):
+    (tmp_path / "mix.txt").write_text(f"{open_store(road).tokens[0]}\nffffcafe\n")
+    with pytest.raises(DataError, match=r"split 'mix' needs 2 scenarios, .* lacks 1 of them"):
+        write(replace(asked, split=str(tmp_path / "mix.txt")))
+    assert not asked.out.exists()
 
 
 @pytest.mark.parametrize("changes", [{"planner": "carl"}, {"samples": -1}, {"workers": -1}])

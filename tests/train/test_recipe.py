@@ -12,12 +12,20 @@ import pytest
 
 import shiftsim
 from shiftsim.data.store.reading import open_store
-from shiftsim.errors import CheckpointError, ConfigError
+from shiftsim.errors import CheckpointError, ConfigError, DataError
 from shiftsim.planners.learned.carl.planner import Carl
 from shiftsim.train import recipe
 from shiftsim.train.driving import Driven, Driver, Job, Start, divide
-from shiftsim.train.folder import BEST, LATEST, STATE, Settings
-from shiftsim.train.recipe import Training
+from shiftsim.train.folder import (
+    BEST,
+    LATEST,
+    STATE,
+    ImitationSettings,
+    Settings,
+    TrafficSettings,
+)
+from shiftsim.train.recipe import ImitationTraining, Training
+from shiftsim.train.traffic.recipe import train_traffic
 
 pytestmark = pytest.mark.thorough
 
@@ -123,6 +131,16 @@ def test_towns_that_are_tested_on_are_not_trained_on(toy):
     assert trained | tested == set(store.tokens)
     assert not trained & tested
     assert tested
+
+
+@pytest.mark.parametrize("of", [Settings, ImitationSettings, TrafficSettings])
+def test_a_split_that_the_store_lacks_a_part_of_is_refused(of, toy, tmp_path):
+    (tmp_path / "mix.txt").write_text("0000cafe\n0001cafe\n0002cafe\nffffcafe\n")
+    train = {TrafficSettings: train_traffic, Settings: Training}.get(of, ImitationTraining)
+    settings = of(store=str(toy), split=str(tmp_path / "mix.txt"), out=tmp_path / "out")
+    with pytest.raises(DataError, match=r"split 'mix' needs 4 scenarios, .* lacks 1 of them"):
+        train(settings, print)
+    assert not settings.out.exists()
 
 
 def test_a_folder_holds_one_training(small, tmp_path):

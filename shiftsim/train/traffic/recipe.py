@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from shiftsim.data import open_store
 from shiftsim.files import atomic_write
-from shiftsim.runs.scenarios import find_split
+from shiftsim.runs.scenarios import usable_tokens
 from shiftsim.sim.traffic import Traffic, make_traffic
 from shiftsim.sim.traffic.learned.features import NUM_FEATURES
 from shiftsim.sim.traffic.learned.model import HIDDEN, SCALES, LearnedTraffic, Weights
@@ -39,8 +39,7 @@ def train_traffic(settings: TrafficSettings, on_message: OnMessage) -> Path:
     """
     out, seed = settings.out, settings.seed
     store = open_store(settings.store)
-    tokens = find_split(settings.split, store.path, store.tokens).tokens
-    towns = divide(store, tokens, seed)
+    towns = divide(store, usable_tokens(store, settings.split), seed)
     trained = [token for group in towns.trained.values() for token in sorted(group)]
     tested = [token for group in towns.tested.values() for token in sorted(group)]
     make_folder(out)
