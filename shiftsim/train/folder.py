@@ -75,7 +75,7 @@ class Settings(BaseSettings):
     device: str = setting("cpu", "cpu, cuda, cuda:N or auto.")
     workers: int = setting(2, "Processes that drive, threads that train.")
     rounds: int = setting(8, "Of collecting, training and testing.")
-    states: int = setting(360_000, "Labelled states to collect in all.")
+    states: int = setting(360_000, "Labelled states to collect in all, at least.")
     samples: int = setting(1_280_000, "States to train on, each time counted.")
     tau: float = setting(0.0, "Of the labels [s]; 0 to choose it.")
     tests: int = setting(40, "Scenarios that each round is tested on.")
@@ -158,7 +158,7 @@ class FeatureSettings(BaseSettings):
     out: Path = field(metadata={"option": Option("Folder for the samples.")})
     planner: str = field(metadata={"option": _FOR})
     workers: int = setting(2, "Processes that make samples; 0 for none but this one.")
-    samples: int = setting(0, "Stop at so many; 0 to take every scenario once.")
+    samples: int = setting(0, "At least so many; 0 to take every scenario once.")
 
     def __post_init__(self) -> None:
         """Refuse other planners, and numbers that make no stream."""

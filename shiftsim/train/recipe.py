@@ -224,7 +224,7 @@ class Training(Recipe):
         settings, number = self._settings, self.progress.round
         checkpoint = str(settings.out / LATEST) if number or settings.checkpoint else _NO_DRIVER
         random = np.random.default_rng([settings.seed, 2, number])
-        wanted, count, jobs_done = settings.states // settings.rounds, 0, 0
+        wanted, count, jobs_done = -(-settings.states // settings.rounds), 0, 0
         while count < wanted:
             sizes = [min(len(tokens), driving.TOGETHER) for tokens in self.towns.trained.values()]
             expected = count / jobs_done if jobs_done else _EXPECTED * float(np.mean(sizes))

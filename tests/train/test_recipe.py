@@ -123,6 +123,12 @@ def test_tau_is_chosen_by_driving_the_expert_through_its_labels(small):
     assert min(row["none"] for row in rows) > 0.3
 
 
+def test_every_round_collects_something(small):
+    settings = small(states=1)
+    train(settings)
+    assert settings.part(1).exists()
+
+
 def test_towns_that_are_tested_on_are_not_trained_on(toy):
     store = open_store(toy)
     towns = divide(store, store.tokens, 0)
