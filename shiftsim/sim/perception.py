@@ -222,7 +222,8 @@ def _values(part: str) -> dict[str, Any]:
     """Fields of a model that a name stands for, such as `miss-low` or `range-60`."""
     kind, _, level = part.partition("-")
     if kind in _LEVELS:
-        number = LEVELS.index(one_of(kind, level, LEVELS))
+        others = ", or miss-, dropout- with these, range-METRES" if kind == "perception" else ""
+        number = LEVELS.index(one_of(kind, level, LEVELS, others))
         return {field: values[number] for field, values in _LEVELS[kind].items()}
     if not level.isdecimal():
         raise ConfigError(f"{part!r} has no number", hint="for example latency-200 or range-60")
@@ -247,9 +248,14 @@ def make_drift(
     given = {"": noise, "perception": perception, "localization": localization}
     for kind, one in given.items():
         if isinstance(one, str):
-            names += [f"{kind}-{n}" if kind and n in LEVELS else n for n in one.split("+")]
-        else:
+            for part in one.split("+"):
+                is_whole = part == "none" or ":" in part or part.partition("-")[0] in _AXES
+                names += [part if is_whole or not kind else f"{kind}-{part}"]
+        elif isinstance(one, (Drift, NoiseModel, Perception, Localization)):
             models.append(one)
+        else:
+            what = f"{kind or 'noise'} {one!r} is no name or model"
+            raise ConfigError(what, hint="give one; `run` and `bench` take lists of them")
     found = parse_drift("+".join(names))
     for model in models:
         found = model if isinstance(model, Drift) else replace(found, **{_axis(model): model})

@@ -179,6 +179,7 @@ def test_wrong_planners_are_found_before_the_first_task(toy, tmp_path, planner, 
     ("more", "message"),
     [
         ({"noise": ["ou-hihg"]}, "noise 'ou-hihg' unknown"),
+        ({"perception": ["hihg"]}, "perception 'hihg' unknown"),
         ({"thresholds": "nuplam"}, "nuplam"),
         ({"traffic": "jammed"}, "jammed"),
         ({"split": "val14"}, "split 'val14' unknown"),
