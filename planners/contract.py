@@ -9,6 +9,7 @@ import pickle
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from time import perf_counter
 from typing import Any, TypeAlias
 
@@ -18,6 +19,7 @@ from shiftsim.files import place_of
 from shiftsim.geometry.boxes import wrap_angle
 from shiftsim.kernels import FloatArray, IntArray
 from shiftsim.planners.prototype import PlannerPrototype
+from shiftsim.planners.registry import load_planner, planner_factory
 from shiftsim.sim.loop import Rollout
 from shiftsim.sim.plan_check import FAR, SHORT, find_fault, is_short
 from shiftsim.world.scenario import Scenario
@@ -70,8 +72,9 @@ class Finding:
 def check_planner(planner: Any, scenario: Scenario, other: Scenario | None = None) -> list[Finding]:
     """Try a planner on one scenario of at least three iterations; what was found, errors first.
 
-    `planner` is one, or a class or function without arguments that makes one. With `other` it must
-    not matter whether that scenario was driven before. The run time is always among the findings.
+    `planner` is one, its name, or a class or function without arguments that makes one. With
+    `other` it must not matter whether that scenario was driven before. The run time is always among
+    the findings. It is a ConfigError if there is no planner of the name.
 
     Example:
         ```python
@@ -81,6 +84,9 @@ def check_planner(planner: Any, scenario: Scenario, other: Scenario | None = Non
         ```
     """
     findings: list[Finding] = []
+    if isinstance(planner, str):
+        planner_factory(planner)
+        planner = partial(load_planner, planner)
     is_made = isinstance(planner, type) or not hasattr(planner, "plan")
     candidate = _make(planner, findings) if is_made else planner
     if candidate is None or not _has_methods(candidate, findings):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from worlds import cruise_scenario
 
+from shiftsim.errors import ConfigError
 from shiftsim.planners.contract import check_planner
 from shiftsim.world.state import Command, Trajectory
 
@@ -249,6 +250,13 @@ def test_a_broken_rule_is_named_with_a_remedy(planner, severity, check, message)
     assert bad[check].severity == severity
     assert bad[check].hint
     assert re.search(message, bad[check].message), bad
+
+
+def test_a_planner_may_be_named():
+    findings = check_planner("constant-velocity", cruise_scenario())
+    assert {found.severity for found in findings} == {"note"}
+    with pytest.raises(ConfigError, match="planner 'idmm' unknown"):
+        check_planner("idmm", cruise_scenario())
 
 
 def test_an_exception_is_named_with_its_line():
