@@ -9,8 +9,10 @@ from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import fields, replace
 from functools import cache, partial
+from math import isfinite
 from multiprocessing import TimeoutError as NoAnswerError
 from multiprocessing.connection import wait
+from numbers import Real
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -25,7 +27,7 @@ from shiftsim.data.store.reading import ScenarioStore
 from shiftsim.env.episode import REWARDS, Episode, NoObservation, Observer, Reward
 from shiftsim.env.raster import RasterObserver, picture_of
 from shiftsim.env.vector import VectorObserver
-from shiftsim.errors import ConfigError, DataError, ShiftsimError, one_of, readable
+from shiftsim.errors import ConfigError, DataError, ShiftsimError, beginning, one_of, readable
 from shiftsim.geometry.boxes import from_frame
 from shiftsim.kernels import FloatArray
 from shiftsim.planners.learned.carl.planner import command_of
@@ -45,6 +47,17 @@ OBSERVATIONS: dict[str, Callable[[], Observer]] = {
     "vector": VectorObserver,
 }
 ACTIONS = ("command", "trajectory")
+# which values some settings and options may have, and in words
+_VALUES: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "terminate": (lambda one: isinstance(one, (bool, np.bool_)), "True or False"),
+    "penalty": (lambda one: isinstance(one, Real) and isfinite(one), "a finite number"),
+    "token": (lambda one: isinstance(one, str), "one token of the store"),
+    "noise_seed": (
+        lambda one: isinstance(one, (int, np.integer)) and type(one) is not bool and bool(one >= 0),
+        "a whole number, 0 or more",
+    ),
+    "snapshot": (lambda one: isinstance(one, Snapshot), "the `snapshot` of an info"),
+}
 
 Make = Callable[[], gymnasium.Env[Any, Any]]
 
@@ -56,6 +69,13 @@ class Source(Protocol):
 
     def read(self, token: str) -> Scenario:
         """The scenario of a token."""
+
+
+def _require_values(values: dict[str, Any]) -> None:
+    for name, value in values.items():
+        fits, wanted = _VALUES[name]
+        if not fits(value):
+            raise ConfigError(f"{name} is {value!r}", hint=f"give {wanted}")
 
 
 @cache
@@ -102,7 +122,7 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
             traffic: Traffic, by name or model.
             action: `command` or `trajectory`.
             terminate: Whether an infraction ends the episode.
-            penalty: Added to the reward of a step with an infraction.
+            penalty: Added to the reward of every step with an infraction.
             render_mode: `rgb_array` or None.
 
         Raises:
@@ -110,6 +130,7 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
             DataError: The store is not there, or has no scenario.
         """
         self._settings = {name: value for name, value in locals().items() if name != "self"}
+        _require_values({"terminate": terminate, "penalty": penalty})
         self._store: Any = _opened(store) if isinstance(store, str) else store
         held = tuple(self._store.tokens)
         if type(self._store) is ScenarioStore:  # what filter and review say is of recorded ones
@@ -164,12 +185,12 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
     ) -> tuple[Any, dict[str, Any]]:
         """Begin a scenario, drawn at random; `options` may name its `token` and `noise_seed`.
 
-        Or they have a `snapshot` as steps return it: the episode goes on from there. The observer
-        then looks at the beginning and at the present.
+        The token may be shortened. Or they have a `snapshot` as steps return it, and nothing else:
+        the episode goes on from there. The observer then looks at the beginning and at the present.
 
         Raises:
-            ConfigError: There is another option, or the snapshot has another setting.
-            DataError: The store has no scenario of that token.
+            ConfigError: An option is unknown or has a wrong value, the store has no scenario of
+                that token, or the snapshot has another setting.
         """
         super().reset(seed=seed)
         drawn: dict[str, Any] = {
@@ -179,9 +200,16 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         chosen = dict(options or {})
         for name in chosen:
             one_of("option of reset", name, [*drawn, "snapshot"])
+        _require_values(chosen)
         snapshot: Snapshot | None = chosen.pop("snapshot", None)
         if snapshot is not None:
-            chosen |= {"token": snapshot.token, "noise_seed": snapshot.setting.seed}
+            if chosen:
+                what = f"a snapshot has its own {' and '.join(chosen)}"
+                raise ConfigError(what, hint="give no other option beside it")
+            chosen = {"token": snapshot.token, "noise_seed": snapshot.setting.seed}
+        elif "token" in chosen:
+            held = self._store.tokens
+            chosen["token"] = beginning("the store", "scenario", chosen["token"], held)
         chosen = drawn | chosen
         scenario = self._store.read(chosen["token"])
         setting = replace(self._setting, seed=chosen["noise_seed"])
@@ -213,7 +241,12 @@ class DrivingEnv(gymnasium.Env[Any, Any]):
         if is_over:
             info["scores"] = episode.scores
             info["error"] = episode.error
-        reward = float(self._reward(episode)) + (self._penalty if infraction else 0.0)
+        paid = self._reward(episode)
+        try:
+            reward = float(paid) + (self._penalty if infraction else 0.0)
+        except (TypeError, ValueError) as error:
+            what = f"reward {getattr(self._reward, '__name__', self._reward)} returned {paid!r}"
+            raise ConfigError(what, hint="return a number") from error
         terminated = self._terminate and infraction != ""
         return self.observer.look(episode), reward, terminated, is_over, info
 

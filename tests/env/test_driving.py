@@ -159,6 +159,8 @@ def test_an_infraction_ends_an_episode_unless_it_may_go_on(source_of):
     rewards, terminated, truncated, info = drive(env, [left] * 200)
     assert (len(rewards), terminated, truncated) == (99, False, True)
     assert rewards[short - 1] == 0.0
+    paid, *_ = drive(DrivingEnv(store=source, terminate=False, penalty=-5), [left] * 200)
+    assert paid[short - 1 : short + 19] == [-5.0] * 20  # in every step off the road
     assert info["scores"]["drivable_area_compliance"] == 0.0
 
 
@@ -237,7 +239,20 @@ def test_observations_and_rewards_of_ones_own(source_of):
         ({"observation": "pixels"}, ConfigError, "observation 'pixels' unknown"),
         ({"action": "steer"}, ConfigError, "action 'steer' unknown"),
         ({"noise": "loud"}, ConfigError, "noise 'loud' unknown"),
-        ({"perception": "blurred"}, ConfigError, "noise 'blurred' unknown"),
+        ({"noise": ["none", "ou-high"]}, ConfigError, "noise .*'ou-high'.* is no name or model"),
+        (
+            {"perception": "hihg"},
+            ConfigError,
+            "perception 'hihg' .*\nhint: did .* 'high'?.*miss-",
+        ),
+        (
+            {"localization": "blur"},
+            ConfigError,
+            "localization 'blur' .*\nhint: .*high, low, mid$",
+        ),
+        ({"penalty": "x"}, ConfigError, "penalty is 'x'\nhint: give a finite number"),
+        ({"penalty": np.nan}, ConfigError, "penalty is nan"),
+        ({"terminate": "no"}, ConfigError, "terminate is 'no'\nhint: give True or False"),
         ({"latency": 150}, ConfigError, "not a multiple of 100 ms"),
         ({"traffic": "busy"}, ConfigError, "traffic 'busy' unknown"),
         ({"split": "none"}, ConfigError, "split 'none' unknown"),
@@ -259,8 +274,35 @@ def test_what_is_not_there_is_named(toy, tmp_path, source_of):
     env = DrivingEnv(store=str(toy))
     with pytest.raises(ConfigError, match="option of reset 'tokn' unknown"):
         env.reset(options={"tokn": TOKEN})
-    with pytest.raises(DataError, match="no scenario 'ffff'"):
+    with pytest.raises(ConfigError, match="the store has no scenario 'ffff'"):
         env.reset(options={"token": "ffff"})
+    assert env.reset(options={"token": TOKEN[:4], "noise_seed": np.int64(3)})[1]["token"] == TOKEN
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        *(({"noise_seed": one}, f"noise_seed is {one!r}") for one in (1.5, "3", True, -1, None)),
+        ({"token": [TOKEN] * 3}, r"token is \['0001cafe'.*\nhint: give one token"),
+        ({"snapshot": {}}, r"snapshot is {}\nhint: give the `snapshot` of an info"),
+        ({"snapshot": ..., "token": TOKEN, "noise_seed": 1}, "has its own token and noise_seed"),
+    ],
+)
+def test_options_that_are_wrong_are_named(toy, options, message):
+    env = DrivingEnv(store=str(toy), observation="none")
+    snapshot = env.reset()[1]["snapshot"]
+    given = {name: snapshot if value is ... else value for name, value in options.items()}
+    with pytest.raises(ConfigError, match=message):
+        env.reset(options=given)
+
+
+def test_a_reward_that_is_no_number_is_named(source_of):
+    def nothing(episode): ...
+
+    env = DrivingEnv(store=source_of(cruise_scenario()), reward=nothing)
+    env.reset()
+    with pytest.raises(ConfigError, match="reward nothing returned None"):
+        env.step(COAST)
 
 
 def test_a_split_limits_what_is_drawn(toy, tmp_path):
