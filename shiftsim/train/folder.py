@@ -187,9 +187,11 @@ def prepare_folder(settings: BaseSettings, store: str, *, resume: bool) -> None:
         write_text(place, json.dumps(now, indent=2) + "\n")
         return
     before = {"planner": "plantf"} | json.loads(place.read_text("utf-8"))  # was the only one once
-    for name in sorted(now):
+    for name in sorted(now, key=lambda name: (name in before, name)):
         if (old := before.get(name)) != now[name]:
-            what = f"{str(place)!r} is of a training with {name} {old!r}, not {now[name]!r}"
+            is_of = f"with {name} {old!r}, not {now[name]!r}"
+            is_of = is_of if name in before else f"by another recipe, without {name}"
+            what = f"{str(place)!r} is of a training {is_of}"
             raise ConfigError(what, hint="choose another --out")
     if not resume:
         what = f"{str(settings.out)!r} holds a training already"

@@ -9,7 +9,7 @@ import shiftsim
 from shiftsim.errors import ConfigError, DataError
 from shiftsim.planners.learned.checkpoint import network_module
 from shiftsim.train import folder, recipe
-from shiftsim.train.folder import BEST, LATEST, ImitationSettings, Preset
+from shiftsim.train.folder import BEST, LATEST, ImitationSettings, Preset, Settings
 from shiftsim.train.imitation import ImitationLearner, motion
 from shiftsim.train.recipe import ImitationTraining
 from shiftsim.train.stream import Stream, load_blocks
@@ -180,6 +180,12 @@ def test_the_folder_of_another_planner_is_refused(small):
     folder.prepare_folder(small("out"), "a store", resume=False)
     with pytest.raises(ConfigError, match="planner 'plantf', not 'pluto'"):
         folder.prepare_folder(small("out", planner="pluto"), "a store", resume=True)
+
+
+def test_the_folder_of_another_recipe_is_refused(small, tmp_path):
+    folder.prepare_folder(Settings(out=tmp_path / "out"), "a store", resume=False)
+    with pytest.raises(ConfigError, match="is of a training by another recipe, without batch"):
+        folder.prepare_folder(small("out"), "a store", resume=True)
 
 
 def test_a_sample_of_pluto_costs_more(monkeypatch):
