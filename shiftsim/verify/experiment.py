@@ -118,11 +118,15 @@ def _compare_results(path: Path, challenge: str, find: FindScenario, report: Rep
     runner = _read(path, "runner_report", "scenario_name", report)
     logs, tables = find_simulation_logs(path), {**metrics, **scores, **runner}
     listed: list[Iterable[Key]] = [*tables.values(), logs]
+    for name in (name for name, found in zip(_PARTS, (metrics, scores), strict=False) if not found):
+        report.skip(f"{path}: there are no tables in {name}")
     left_out, known = set[str](), set[str]()
     for token, planner in dict.fromkeys(key for keys in listed for key in keys):
         run, scenario = Run(challenge, token, planner), find(token)
         with report.attempt("run", str(run)):
             recorded = read_simulation_log(logs[run.key], report) if run.key in logs else None
+            if logs and not recorded:
+                report.skip(f"{run}: there is no simulation log of it, but of others")
             if recorded:
                 left_out |= recorded.left_out
                 source = "exported"

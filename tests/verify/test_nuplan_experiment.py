@@ -88,12 +88,24 @@ def write_log(path: Path, content: bytes) -> None:
 def test_results_of_nuplan_are_equal_with_and_without_logs(nuplan_reference):
     report = compare(GOLDEN, nuplan_reference)
     assert report.mismatches == []
-    assert report.not_covered == {}
+    [path] = GOLDEN.rglob("aggregator_metric/*.parquet")
+    tokens = {row["scenario"] for row in pq.read_table(path).to_pylist() if row["log_name"]}
+    lacking = " SimplePlanner: there is no simulation log of it, but of others"
+    assert {*report.not_covered} == {f"NR {token}{lacking}" for token in tokens - {LOGGED}}
     assert report.quantities["ego x"].cases == 1
     assert report.quantities["scores score"].cases == 4
     assert report.quantities["simple plan x"].cases == 150
     assert sum(name.startswith("metric ") for name in report.quantities) == 16
     assert any("pathlib.PosixPath" in line for line in report.informative)
+
+
+@pytest.mark.parametrize("name", ["metrics", "aggregator_metric"])
+def test_tables_that_are_not_there_are_not_covered(nuplan_reference, tmp_path, name):
+    shutil.copytree(GOLDEN, tmp_path / "exp")
+    [folder] = (tmp_path / "exp").rglob(name)
+    shutil.rmtree(folder)
+    report = compare(tmp_path / "exp", nuplan_reference)
+    assert f"{folder.parent}: there are no tables in {name}" in report.not_covered
 
 
 TABLE_NUMBERS = [  # of the last row, and what names them
