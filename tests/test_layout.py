@@ -19,28 +19,28 @@ BUDGETS = {
     "shiftsim": 1_940,  # goal 900
     "shiftsim/geometry": 1_015,  # goal 1_000
     "shiftsim/world": 2_076,  # goal 1_800
-    "shiftsim/edits": 2_105,  # goal 2_100
-    "shiftsim/sim": 2_480,  # goal 1_600
-    "shiftsim/sim/traffic": 2_335,  # goal 2_200
-    "metrics": 2_837,
-    "shiftsim/runs": 5_373,  # goal 3_300
-    "planners": 4_272,  # goal 4_300
-    "planners/learned": 4_900,  # goal 4_600; attention of all scenes at once on a GPU brings 40
+    "shiftsim/edits": 2_137,  # goal 2_100
+    "shiftsim/sim": 2_486,  # goal 1_600
+    "shiftsim/sim/traffic": 2_337,  # goal 2_200
+    "metrics": 2_851,
+    "shiftsim/runs": 5_398,  # goal 3_300
+    "planners": 4_273,  # goal 4_300
+    "planners/learned": 4_909,  # goal 4_600; attention of all scenes at once on a GPU brings 40
     "data/maps": 3_620,  # goal 3_000
-    "data": 5_002,  # goal 3_900
+    "data": 5_032,  # goal 3_900
     "data/nuplan": 2_685,  # goal 2_400
-    "data/store": 2_190,
+    "data/store": 2_202,
     "data/synthetic": 2_520,  # goal 2_100
-    "shiftsim/report": 3_220,  # goal 2_200
-    "shiftsim/view": 2_365,  # goal 1_800
-    "shiftsim/env": 1_415,
-    "shiftsim/train": 3_255,  # goal 1_600; rasters and rounds on a GPU, faster samples bring 30
+    "shiftsim/report": 3_222,  # goal 2_200
+    "shiftsim/view": 2_371,  # goal 1_800
+    "shiftsim/env": 1_451,
+    "shiftsim/train": 3_256,  # goal 1_600; rasters and rounds on a GPU, faster samples bring 30
     "shiftsim/compat": 3_590,  # goal 2_300
     "shiftsim/verify": 1_199,  # goal 1_200
-    "shiftsim/cli": 2_661,  # goal 2_300
+    "shiftsim/cli": 2_676,  # goal 2_300
     "benchmarks": 755,  # goal 700; the tracks finding and sensor-drift bring 40
 }
-MOST_LINES, MOST_MODULES, MOST_KERNELS = 63_768, 300, 220  # the goal is 52_000 lines
+MOST_LINES, MOST_MODULES, MOST_KERNELS = 63_981, 300, 220  # the goal is 52_000 lines
 LONGEST_MODULE, CROWDED = 450, 16
 # modules of under 80 lines that one other module imports, and why they stand alone
 SMALL_AND_ALONE = {
