@@ -88,10 +88,8 @@ def write_log(path: Path, content: bytes) -> None:
 def test_results_of_nuplan_are_equal_with_and_without_logs(nuplan_reference):
     report = compare(GOLDEN, nuplan_reference)
     assert report.mismatches == []
-    [path] = GOLDEN.rglob("aggregator_metric/*.parquet")
-    tokens = {row["scenario"] for row in pq.read_table(path).to_pylist() if row["log_name"]}
-    lacking = " SimplePlanner: there is no simulation log of it, but of others"
-    assert {*report.not_covered} == {f"NR {token}{lacking}" for token in tokens - {LOGGED}}
+    assert report.not_covered == {}
+    assert sum("no simulation log, as others have" in line for line in report.remarks) == 3
     assert report.quantities["ego x"].cases == 1
     assert report.quantities["scores score"].cases == 4
     assert report.quantities["simple plan x"].cases == 150
