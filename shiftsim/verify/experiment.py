@@ -163,6 +163,9 @@ def _compare_results(path: Path, challenge: str, find: FindScenario, report: Rep
         for name in sorted({*metrics} - known):
             report.skip(f"metric {name}: shiftsim has none of this name")
             del tables[name]
+        columns = {name for table in scores.values() for name in table.table}
+        for name in sorted((known & columns) - {*metrics} if metrics else ()):
+            report.skip(f"{path}: there is no table of {name} in metrics, but a score")
         _finish(path, tables.values(), left_out, report)
 
 

@@ -97,6 +97,14 @@ def test_results_of_nuplan_are_equal_with_and_without_logs(nuplan_reference):
     assert any("pathlib.PosixPath" in line for line in report.informative)
 
 
+def test_a_scored_metric_without_a_table_is_not_covered(folder, nuplan_reference):
+    keep(folder, LOGGED)
+    [path] = folder.rglob("ego_is_comfortable.parquet")
+    path.unlink()
+    lacking = f"{path.parents[1]}: there is no table of ego_is_comfortable in metrics, but a score"
+    assert compare(folder, nuplan_reference).not_covered == {lacking: 1}
+
+
 @pytest.mark.parametrize("name", ["metrics", "aggregator_metric"])
 def test_tables_that_are_not_there_are_not_covered(nuplan_reference, tmp_path, name):
     shutil.copytree(GOLDEN, tmp_path / "exp")
