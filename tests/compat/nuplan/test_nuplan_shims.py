@@ -211,7 +211,8 @@ def test_objects_come_sorted_by_type_and_absent_ones_not_at_all():
     assert np.isnan(vehicle.angular_velocity)
     assert len(seen.get_agents()) == 2
     assert seen.get_static_objects() == [barrier]
-    assert seen.get_tracked_objects_of_type(TrackedObjectType.BICYCLE) == []
+    bicycles = seen.get_tracked_objects_of_type(tracked_object_type=TrackedObjectType.BICYCLE)
+    assert bicycles == []
     assert seen.get_tracked_objects_of_types(
         [TrackedObjectType.BARRIER, TrackedObjectType.VEHICLE]
     ) == [barrier, vehicle]

@@ -181,7 +181,10 @@ class TrackedObjects:
             tracked_objects or (), key=lambda item: int(item.tracked_object_type)
         )
 
-    def get_tracked_objects_of_type(self, wanted: TrackedObjectType) -> list[TrackedObject]:
+    def get_tracked_objects_of_type(
+        self, tracked_object_type: TrackedObjectType
+    ) -> list[TrackedObject]:
+        wanted = tracked_object_type
         return [item for item in self.tracked_objects if item.tracked_object_type == wanted]
 
     def get_tracked_objects_of_types(
