@@ -115,6 +115,7 @@ def test_proximity_is_a_square_and_means_lines_for_connectors(road):
     assert _ids(near[SemanticMapLayer.LANE]) == ["10", "11"]
     assert _ids(near[SemanticMapLayer.LANE_CONNECTOR]) == ["21"]  # the line of 20 is at y = 3.5
     assert _ids(near[SemanticMapLayer.ROADBLOCK]) == ["1"]
+    assert near[SemanticMapLayer.CROSSWALK] == []  # was not asked for
     with pytest.raises(AssertionError, match="DRIVABLE_AREA"):
         road.get_proximal_map_objects(Point2D(0.0, 0.0), 5.0, [SemanticMapLayer.DRIVABLE_AREA])
 

@@ -7,6 +7,7 @@ nuPlan rule 578: the table of lane connectors that most queries read holds lines
 another one: proximity, distance and `is_in_layer` mean lines, `get_all_map_objects` means areas.
 """
 
+from collections import defaultdict
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, NamedTuple, NoReturn
@@ -356,10 +357,13 @@ class BridgeMap(AbstractMap):
     def get_proximal_map_objects(
         self, point: Any, radius: float, layers: Sequence[Any]
     ) -> dict[Any, list[Any]]:
-        """Per layer the objects that meet an axis-parallel square of half width `radius` [m]."""
+        """Per layer the objects that meet an axis-parallel square of half width `radius` [m].
+
+        Other layers have none.
+        """
         unknown = [layer.name for layer in layers if layer not in self.get_available_map_objects()]
         assert not unknown, f"layers without objects: {', '.join(unknown)}"
-        return {layer: self._near(point, radius, layer) for layer in layers}
+        return defaultdict(list, {layer: self._near(point, radius, layer) for layer in layers})
 
     def _near(self, point: Any, radius: float, layer: Any) -> list[Any]:
         span, x, y = self._objects(layer), float(point.x), float(point.y)
