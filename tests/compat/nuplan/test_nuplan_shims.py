@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from worlds import rear_states
 
 from shiftsim.compat.nuplan.bridge.planner import (
-    ObservedTracks,
     ego_state,
+    observed_tracks,
     traffic_lights,
     vehicle_parameters,
 )
@@ -43,6 +43,9 @@ from nuplan.common.geometry.convert import (  # isort: skip
     relative_to_absolute_poses,
 )
 from nuplan.common.geometry.transform import rotate_angle, transform  # isort: skip
+from nuplan.planning.simulation.observation.observation_type import (  # isort: skip
+    DetectionsTracks,
+)
 from nuplan.planning.simulation.trajectory.interpolated_trajectory import (  # isort: skip
     InterpolatedTrajectory,
 )
@@ -193,7 +196,9 @@ def _tracks():
 
 
 def test_objects_come_sorted_by_type_and_absent_ones_not_at_all():
-    seen = ObservedTracks(START_US, _tracks()).tracked_objects
+    observed = observed_tracks(START_US, _tracks())
+    assert (type(observed), observed.detection_type()) == (DetectionsTracks, "DetectionsTracks")
+    seen = observed.tracked_objects
     assert [item.track_token for item in seen] == ["c", "b", "a"]
     vehicle, pedestrian, barrier = seen
     assert isinstance(vehicle, Agent)
@@ -219,7 +224,7 @@ def test_objects_come_sorted_by_type_and_absent_ones_not_at_all():
 
 
 def test_predictions_must_add_up_to_one():
-    agent = next(iter(ObservedTracks(START_US, _tracks()).tracked_objects))
+    agent = next(iter(observed_tracks(START_US, _tracks()).tracked_objects))
     with pytest.raises(ValueError, match="probabilit"):
         agent.predictions = [PredictedTrajectory(0.4, [None])]
     agent.predictions = [PredictedTrajectory(0.4, [None]), PredictedTrajectory(0.6, [None])]

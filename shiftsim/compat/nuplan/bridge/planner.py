@@ -5,7 +5,6 @@ import hashlib
 import inspect
 import pickle
 from collections.abc import Mapping
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -58,30 +57,24 @@ def ego_state(time_us: int, row: FloatArray, vehicle: Any) -> Any:
     )
 
 
-class ObservedTracks(DetectionsTracks):
-    """The objects of one moment, built on first access."""
+def observed_tracks(time_us: int, tracks: Tracks) -> Any:
+    """The objects of one moment, the first row of the tracks."""
+    present = np.flatnonzero(tracks.valid[0]).tolist()
+    return DetectionsTracks(TrackedObjects([_object(time_us, tracks, track) for track in present]))
 
-    def __init__(self, time_us: int, tracks: Tracks) -> None:
-        self._time_us, self._tracks = int(time_us), tracks
 
-    @cached_property
-    def tracked_objects(self) -> Any:
-        present = np.flatnonzero(self._tracks.valid[0]).tolist()
-        return TrackedObjects([self._object(track) for track in present])
-
-    def _object(self, track: int) -> Any:
-        tracks = self._tracks
-        kind = TrackedObjectType(int(tracks.kinds[track]))
-        token = tracks.tokens[track]
-        length, width = tracks.sizes[0, track].tolist()
-        box = OrientedBox(StateSE2(*tracks.poses[0, track].tolist()), length, width, HEIGHT)
-        sample, now_us = f"{token}@{self._time_us}", self._time_us
-        metadata = SceneObjectMetadata(now_us, sample, track, token, kind.fullname)
-        if tracks.kinds[track] > LAST_AGENT_KIND:
-            return StaticObject(kind, box, metadata)
-        velocity = StateVector2D(*tracks.velocities[0, track].tolist())
-        # nuPlan rule 579: objects of a log come with an unknown angular velocity and no predictions
-        return Agent(kind, box, velocity, metadata, angular_velocity=np.nan, predictions=[])
+def _object(time_us: int, tracks: Tracks, track: int) -> Any:
+    kind = TrackedObjectType(int(tracks.kinds[track]))
+    token = tracks.tokens[track]
+    length, width = tracks.sizes[0, track].tolist()
+    box = OrientedBox(StateSE2(*tracks.poses[0, track].tolist()), length, width, HEIGHT)
+    sample = f"{token}@{time_us}"
+    metadata = SceneObjectMetadata(time_us, sample, track, token, kind.fullname)
+    if tracks.kinds[track] > LAST_AGENT_KIND:
+        return StaticObject(kind, box, metadata)
+    velocity = StateVector2D(*tracks.velocities[0, track].tolist())
+    # nuPlan rule 579: objects of a log come with an unknown angular velocity and no predictions
+    return Agent(kind, box, velocity, metadata, angular_velocity=np.nan, predictions=[])
 
 
 def traffic_lights(time_us: int, lights: TrafficLights) -> list[Any]:
@@ -186,7 +179,7 @@ class NuplanPlanner:
 
         def sample(row: int) -> tuple[Any, Any]:
             time_us = int(history.time_us[row])
-            seen = ObservedTracks(time_us, history.tracks.rows(slice(row, row + 1)))
+            seen = observed_tracks(time_us, history.tracks.rows(slice(row, row + 1)))
             return ego_state(time_us, history.ego[row], self._vehicle), seen
 
         last = len(history.time_us) - 1
