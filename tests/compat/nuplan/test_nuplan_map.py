@@ -79,6 +79,9 @@ def test_lanes_know_their_roadblock_and_neighbours(road):
     assert left.adjacent_edges == (None, right)
     assert left.is_left_of(right)
     assert right.is_right_of(left)
+    assert left.is_adjacent_to(right)
+    assert right.is_adjacent_to(left)
+    assert not right.is_adjacent_to(right)
     assert left.is_same_roadblock(right)
     assert right.parent.interior_edges == [left, right]
     assert right.get_roadblock_id() == right.parent.id == "1"
@@ -124,10 +127,11 @@ def test_distances_are_those_of_shapely(road, rng):
     points = [Point2D(*xy) for xy in rng.uniform((-50, -50), (450, 50), (60, 2))]
     source = road.source
     lanes = [source.edges.shape(i) for i in range(source.num_lanes)]
-    lines = [shapely.LineString(source.baselines.at(i)) for i in (4, 5)]
+    lines = [shapely.LineString(source.baselines.at(i)) for i in range(len(source.edges))]
     for layer, shapes in (
         (SemanticMapLayer.LANE, lanes),
-        (SemanticMapLayer.LANE_CONNECTOR, lines),
+        (SemanticMapLayer.LANE_CONNECTOR, lines[4:]),
+        (SemanticMapLayer.BASELINE_PATHS, lines),
     ):
         wanted = [
             min(shape.distance(shapely.Point(point.x, point.y)) for shape in shapes)

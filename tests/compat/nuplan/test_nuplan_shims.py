@@ -28,8 +28,13 @@ from shiftsim.world.state import (
 )
 
 from nuplan.common.actor_state.agent import Agent  # isort: skip  # the names exist now
+from nuplan.common.actor_state.car_footprint import CarFootprint  # isort: skip
 from nuplan.common.actor_state.ego_state import EgoState  # isort: skip
-from nuplan.common.actor_state.oriented_box import OrientedBox, in_collision  # isort: skip
+from nuplan.common.actor_state.oriented_box import (  # isort: skip
+    OrientedBox,
+    OrientedBoxPointType,
+    in_collision,
+)
 from nuplan.common.actor_state.state_representation import (  # isort: skip
     StateSE2,
     StateVector2D,
@@ -42,7 +47,11 @@ from nuplan.common.geometry.convert import (  # isort: skip
     absolute_to_relative_poses,
     relative_to_absolute_poses,
 )
-from nuplan.common.geometry.transform import rotate_angle, transform  # isort: skip
+from nuplan.common.geometry.transform import (  # isort: skip
+    rotate_angle,
+    transform,
+    translate_longitudinally,
+)
 from nuplan.planning.simulation.observation.observation_type import (  # isort: skip
     DetectionsTracks,
 )
@@ -125,6 +134,15 @@ def test_corners_of_a_box_are_ours(x, y, heading):
     box_corners(x, y, heading, 4.5, 2.0, wanted)
     np.testing.assert_allclose([[*p] for p in box.all_corners()], wanted, rtol=0, atol=1e-12)
     assert box.geometry.area == pytest.approx(9.0)
+
+
+def test_a_footprint_is_the_same_from_its_centre_of_gravity():
+    wanted = CarFootprint.build_from_rear_axle(StateSE2(1.0, 2.0, 0.5), CAR)
+    cog = translate_longitudinally(wanted.rear_axle, CAR.cog_position_from_rear_axle)
+    found = CarFootprint.build_from_cog(cog_pose=cog, vehicle_parameters=CAR)
+    np.testing.assert_allclose([*found.center], [*wanted.center], rtol=0, atol=1e-12)
+    front = found.get_point_of_interest(OrientedBoxPointType.FRONT_BUMPER)
+    assert front == found.corner(OrientedBoxPointType.FRONT_BUMPER)
 
 
 def test_boxes_that_touch_collide():

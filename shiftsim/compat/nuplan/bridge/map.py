@@ -197,6 +197,10 @@ class NuPlanLane(_Edge, Lane):
         assert self.is_same_roadblock(other), "lanes of different roadblocks"
         return self.index > other.index
 
+    def is_adjacent_to(self, other: Any) -> bool:
+        """Whether it is the next one on the left or right in the same roadblock."""
+        return other in self.adjacent_edges and self.is_same_roadblock(other)
+
     @property
     def adjacent_edges(self) -> tuple[Any, Any]:
         """The lanes on the left and on the right, or None."""
@@ -298,6 +302,7 @@ class BridgeMap(AbstractMap):
     def __init__(self, source: VectorMap) -> None:
         self.source = source
         self._by_index: dict[tuple[str, int], Any] = {}
+        self._trees: dict[int, shapely.STRtree] = {}
 
     map_name = part("source.name", "Its name.")
 
@@ -312,11 +317,16 @@ class BridgeMap(AbstractMap):
             spans[key] = _Span(name, layer, first, stop, kind)
         return spans
 
-    @cached_property
+    def _lines(self, first: int) -> shapely.STRtree:
+        """The baselines of edges from a number on."""
+        if first not in self._trees:
+            lines = map(self.source.baselines.at, range(first, len(self.source.edges)))
+            self._trees[first] = shapely.STRtree([shapely.LineString(line) for line in lines])
+        return self._trees[first]
+
+    @property
     def _connector_lines(self) -> shapely.STRtree:
-        lines = self.source.baselines
-        connectors = range(self.source.num_lanes, len(self.source.edges))
-        return shapely.STRtree([shapely.LineString(lines.at(edge)) for edge in connectors])
+        return self._lines(self.source.num_lanes)
 
     def object(self, layer: str, index: int) -> Any:
         """Object number `index` of one of our layers, always the same one."""
@@ -389,12 +399,16 @@ class BridgeMap(AbstractMap):
     def get_distance_to_nearest_map_object(
         self, point: Any, layer: Any
     ) -> tuple[str | None, float | None]:
-        """Id of the nearest object of a layer and its distance [m]; None where there is none."""
-        span = self._span(layer)
+        """Id of the nearest object of a layer and its distance [m]; None where there is none.
+
+        A baseline has the id of its lane or lane connector.
+        """
+        is_any_line = layer == _LAYERS.BASELINE_PATHS
+        span = self._span(_LAYERS.LANE if is_any_line else layer)
         if span.first == span.stop:
             return None, None
-        if layer == _LAYERS.LANE_CONNECTOR:
-            place, lines = shapely.Point(point.x, point.y), self._connector_lines
+        if is_any_line or layer == _LAYERS.LANE_CONNECTOR:
+            place, lines = shapely.Point(point.x, point.y), self._lines(span.first)
             index = int(lines.nearest(place))
             distance = float(lines.geometries[index].distance(place))
             return span.layer.ids[span.first + index], distance

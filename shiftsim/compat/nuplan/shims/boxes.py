@@ -172,6 +172,18 @@ class CarFootprint(OrientedBox):
     ) -> "CarFootprint":
         return cls(center, vehicle_parameters)
 
+    @classmethod
+    def build_from_cog(
+        cls, cog_pose: StateSE2, vehicle_parameters: VehicleParameters
+    ) -> "CarFootprint":
+        """From the pose of the centre of gravity."""
+        behind = vehicle_parameters.cog_position_from_rear_axle
+        distance = vehicle_parameters.rear_axle_to_center - behind
+        return cls(translate_longitudinally(cog_pose, distance), vehicle_parameters)
+
+    def get_point_of_interest(self, point_of_interest: OrientedBoxPointType) -> Point2D:
+        return self.corner(point_of_interest)
+
     oriented_box = derived(lambda self: self, "The box itself.")
     rear_axle_to_center_dist = derived(
         lambda self: float(self.vehicle_parameters.rear_axle_to_center),
