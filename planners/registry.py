@@ -61,19 +61,21 @@ def _construct(name: str, make: Callable[[], Any]) -> Any:
         ) from error
 
 
-def planner_factory(spec: str) -> Any:
+def planner_factory(spec: str, adapter: str = "", method: str = "plan") -> Any:
     """The class, or other callable, that makes the planner `spec` (see `load_planner`).
+
+    An adapter gives its prefix, which is left out of `spec`, and a method of its planners.
 
     Raises ConfigError: there is none. MissingExtraError: it needs more than nuPlan's shims have.
     """
-    for prefix, adapter in _ADAPTERS.items():
+    for prefix, module_name in _ADAPTERS.items():
         if spec.startswith(prefix):
-            return importlib.import_module(adapter).from_spec(spec)
-    entry = PLANNERS.get(spec)
+            return importlib.import_module(module_name).from_spec(spec)
+    entry, full = PLANNERS.get(spec), adapter + spec
     if entry is None and spec.endswith(".py"):
         raise ConfigError(
-            f"planner {spec!r} is a file: which of its classes is meant?",
-            hint=f"write {spec}:MyPlanner",
+            f"planner {full!r} is a file: which of its classes is meant?",
+            hint=f"write {full}:MyPlanner",
         )
     if entry is None and ":" not in spec:
         one_of("planner", spec, PLANNERS)
@@ -81,7 +83,7 @@ def planner_factory(spec: str) -> Any:
     in_file = module_name.endswith(".py")
     if not module_name or not attribute.isidentifier() or (":" in module_name and not in_file):
         raise ConfigError(
-            f"planner {spec!r} is not of the form package.module:Class or file.py:Class",
+            f"planner {full!r} is not of the form package.module:Class or file.py:Class",
             hint="for example my_package.my_module:MyPlanner, or ./my_file.py:MyPlanner",
         )
     try:
@@ -90,14 +92,15 @@ def planner_factory(spec: str) -> Any:
         raise
     except ImportError as error:
         raise ConfigError(
-            f"planner {spec!r}: module {module_name!r} cannot be imported ({error})",
-            hint=_import_hint(module_name, error),
+            f"planner {full!r}: module {module_name!r} cannot be imported ({error})",
+            hint=_import_hint(spec, module_name, error),
         ) from error
     factory = getattr(module, attribute, None)
     if not callable(factory):
-        names = [n for n, v in vars(module).items() if inspect.isclass(v) and hasattr(v, "plan")]
+        kinds = {n: v for n, v in vars(module).items() if inspect.isclass(v) and hasattr(v, method)}
+        names = [name for name, kind in kinds.items() if not inspect.isabstract(kind)]
         raise ConfigError(
-            f"planner {spec!r}: module {module_name!r} has no class {attribute!r}",
+            f"planner {full!r}: module {module_name!r} has no class {attribute!r}",
             hint=f"planners in it: {', '.join(sorted(names)) or 'none'}",
         )
     return factory
@@ -298,7 +301,9 @@ def _require_methods(name: str, planner: object) -> None:
             )
 
 
-def _import_hint(module_name: str, error: ImportError) -> str:
+def _import_hint(spec: str, module_name: str, error: ImportError) -> str:
+    if (error.name or "").partition(".")[0] == "nuplan":
+        return f"if it is written for nuPlan, write nuplan:{spec}"
     if not module_name.endswith(".py"):
         return "install it, or run from the folder that holds it"
     if not Path(module_name).is_file():

@@ -60,6 +60,14 @@ class Coast(Named):
         return InterpolatedTrajectory(states)
 
 
+class Late(Coast):
+    """Leaves out the present state."""
+
+    def compute_planner_trajectory(self, current_input):
+        plan = super().compute_planner_trajectory(current_input)
+        return InterpolatedTrajectory(plan.get_sampled_trajectory()[1:])
+
+
 class Roll(Named):
     """The motion model, as nuPlan's own simple planner uses it: 40 steps of 0.25 s."""
 

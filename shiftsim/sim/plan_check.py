@@ -163,7 +163,8 @@ def _explain(code: int, plan: Trajectory, now_us: int, next_us: int) -> Fault:
     hint = (
         "times of from_poses are seconds from now, the first one 0"
         if plan.relative
-        else "time_us are log time stamps (observation.time_us is now) unless relative=True"
+        else "time_us are log time stamps from now on (observation.time_us; for a nuPlan planner "
+        "the time_point of the last ego state), unless a Trajectory has relative=True"
     )
     if code == _STARTS_LATE:
         what = f"the plan starts at {kind} {times[0]} us, after the present ({now_us} us)"

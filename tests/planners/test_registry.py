@@ -64,6 +64,15 @@ def test_what_cannot_be_loaded_says_why(own_module, spec, arguments, message):
         load_planner(spec, arguments)
 
 
+def test_a_forgotten_prefix_of_nuplan_is_named(tmp_path, monkeypatch):
+    (tmp_path / "odd.py").write_text("raise ModuleNotFoundError('none', name='nuplan.planning')")
+    monkeypatch.chdir(tmp_path)
+    for spec in ("odd:Base", "./odd.py:Base"):
+        with pytest.raises(ConfigError, match="cannot be imported") as caught:
+            load_planner(spec)
+        assert f"nuplan:{spec}" in caught.value.hint
+
+
 def test_a_planner_may_be_named_by_its_file(own_module, tmp_path):
     for spec in ("./own_planner_module.py:Own", f"{own_module}:Own"):
         assert load_planner(spec, {"gain": 2}).values == (2, False, None, "a")

@@ -178,7 +178,7 @@ def from_spec(spec: str) -> Callable[..., "NuplanPlanner"]:
     install()
     inner = spec.removeprefix("nuplan:")
     try:
-        return factory(planner_factory(inner))
+        return factory(planner_factory(inner, "nuplan:", _METHODS[-1]))
     except MissingExtraError as error:
         module = inner.rpartition(":")[0]
         shims = (finder for finder in sys.meta_path if isinstance(finder, ShimFinder))

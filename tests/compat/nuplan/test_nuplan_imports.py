@@ -167,6 +167,13 @@ def test_what_cannot_drive_is_refused_before_the_run(name, message):
         load_planner(f"nuplan:nuplan_planners:{name}")
 
 
+def test_the_planners_of_a_module_are_named():
+    with pytest.raises(ConfigError, match="planner 'nuplan:nuplan_planners:Nobody'") as caught:
+        load_planner("nuplan:nuplan_planners:Nobody")
+    assert "planners in it: Coast, " in caught.value.hint
+    assert "AbstractPlanner" not in caught.value.hint
+
+
 def test_a_name_of_another_form_is_explained():
     with pytest.raises(ConfigError, match=r"not of the form nuplan:package\.module:Class"):
         load_planner("nuplan:Coast")
@@ -249,6 +256,9 @@ def test_sensor_data_and_strange_results_are_refused():
         simulate(scenario, load_planner("nuplan:nuplan_planners:WantsImages"))
     with pytest.raises(PlannerError, match="returned list, not an AbstractTrajectory"):
         simulate(scenario, load_planner("nuplan:nuplan_planners:ReturnsAList"))
+    with pytest.raises(InvalidTrajectoryError, match="starts at time") as late:
+        simulate(scenario, load_planner("nuplan:nuplan_planners:Late"))
+    assert "time_point of the last ego state" in late.value.hint
     short = load_planner("nuplan:nuplan_planners:Coast", {"horizon": "0.1"})
     with pytest.raises(InvalidTrajectoryError, match="three poses"):
         simulate(scenario, short)
