@@ -96,6 +96,14 @@ def test_a_planner_of_the_main_script_stays_at_home(monkeypatch):
     assert shiftsim.simulate(cruise_scenario(iterations=5), entry.make()).ego.shape == (4, 11)
 
 
+def test_a_planner_without_a_name_is_called_as_its_class():
+    class Silent(planners.Coast):
+        def name(self):
+            return None
+
+    assert nuplan.wrap(Silent).name == "Silent"
+
+
 def test_the_contract_finds_no_fault():
     findings = shiftsim.check_planner(
         nuplan.wrap(planners.FollowLeader), cruise_scenario(iterations=60)

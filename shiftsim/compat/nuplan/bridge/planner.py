@@ -134,7 +134,7 @@ class NuplanPlanner:
         self._source, self._arguments = source, dict(arguments)
         self._planner = self._make()
         self.code = _hash_of_code(type(self._planner))
-        self.name = str(self._planner.name())
+        self.name = str(self._planner.name() or type(self._planner).__name__)
         self.report: Any = None  # what the planner reported of the scenario before
         self._scene: SceneInfo | None = None
         self._vehicle: Any = None
