@@ -196,7 +196,7 @@ def parse_drift(name: str) -> Drift:
     Raises:
         ConfigError: A name is unknown, or there are two of a kind.
     """
-    found, kinds = Drift(), list[str]()
+    found, given = Drift(), dict[str, str]()
     for part in filter(lambda part: part != "none", name.split("+")):
         kind = part.partition("-")[0]
         if kind not in _AXES:
@@ -212,9 +212,12 @@ def parse_drift(name: str) -> Drift:
             before = getattr(found, axis)
             joined = part if before.name == "none" else f"{before.name}+{part}"
             found = replace(found, **{axis: replace(before, **_values(part), name=joined)})
-        kinds.append(kind)
-    if len(kinds) != len(set(kinds)):
-        raise ConfigError(f"drift {name!r} has two of a kind")
+        if kind in given:
+            raise ConfigError(
+                f"{given[kind]!r} and {part!r} are two of a kind in one drift",
+                hint=f"join one each of noise, {', '.join(_AXES)}; drive others one by one",
+            )
+        given[kind] = part
     return found
 
 
@@ -226,7 +229,8 @@ def _values(part: str) -> dict[str, Any]:
         number = LEVELS.index(one_of(kind, level, LEVELS, others))
         return {field: values[number] for field, values in _LEVELS[kind].items()}
     if not level.isdecimal():
-        raise ConfigError(f"{part!r} has no number", hint="for example latency-200 or range-60")
+        what = f"{kind} {level!r} is not a whole number, 0 or more"
+        raise ConfigError(what, hint="of milliseconds in latency-200, of metres in range-60")
     return {kind: int(level) if kind == "latency" else float(level)}
 
 

@@ -116,14 +116,22 @@ def test_levels_are_those_of_the_boxes_and_of_the_pose():
         ("perception-huge", "perception 'huge' unknown"),
         ("loud", "noise 'loud' unknown"),
         ("latency-150", "latency 150 is not a multiple of 100 ms"),
-        ("latency-soon", "'latency-soon' has no number"),
-        ("ou-low+awgn-low", "two of a kind"),
+        ("latency-soon", "latency 'soon' is not a whole number"),
+        ("ou-low+awgn-low", "^'ou-low' and 'awgn-low' are two of a kind"),
         ("no.where:model", "cannot be imported"),
     ],
 )
 def test_a_wrong_name_is_refused(name, message):
     with pytest.raises(ConfigError, match=message):
         parse_drift(name)
+
+
+def test_a_wrong_value_is_named_as_it_was_given():
+    with pytest.raises(ConfigError, match=r"^'ou-low' and 'ou-high' are two of a kind") as caught:
+        make_drift("none+ou-low+ou-high")
+    assert "one each of noise, perception, miss" in caught.value.hint
+    with pytest.raises(ConfigError, match=r"^latency '-100' is not a whole number, 0 or more"):
+        make_drift(latency=-100)
 
 
 def test_values_out_of_their_bounds_are_refused():
