@@ -132,7 +132,7 @@ def coverage(track: Track, groups: Sequence[Group]) -> Table:
         f"{', '.join(map(str, track.seeds))} on all scenarios; {', '.join(rules)}",
         f"scores that are not complete are not the benchmark's; own scenarios: {track.own_note}",
     ]
-    notes += [f"planners of the paper that are not here: {', '.join(missing)}"] if missing else []
+    notes += [f"planners of the track that are not here: {', '.join(missing)}"] if missing else []
     header = ("set", "planner", "rollouts", "of", "verdict")
     title = f"Coverage of the track {track.name}"
     return Table("coverage", title, header, tuple(rows), 2, tuple(notes))

@@ -99,3 +99,4 @@ def test_windows_of_all_lengths_count_as_one_set(tmp_path):
     table = inventory.coverage(load_track("semantic-shift"), read_groups([run]))
     [row] = [row for row in table.rows if row[0] == "cities"]
     assert (row[1], row[2].value, row[3].value, row[4]) == ("alpha", 3, 8, "partial (3/8)")
+    assert table.notes[-1].startswith("planners of the track that are not here: ")
