@@ -117,9 +117,12 @@ def report(
     look: dict[str, Any] = {"width": cli.terminal_width(), "mark": cli.paint}
     words = "\n\n".join(render(one, kind, **look) for one in tables)
     (echo if kind == "text" else typer.echo)(words)  # files are not broken into lines
+    counts = {run.path.name: run.manifest["counts"] for run in opened.runs if not run.is_complete}
+    part = ", ".join(f"{one['ok']} of {one['expected']} in {run}" for run, one in counts.items())
+    note = f"; planners that lack rollouts may be left out, {part} finished" if part else ""
     for name in table:
         if not any(one.name.split("_")[0] == name for one in tables):
-            echo(f"no table {name}: these runs hold nothing of it", err=True)
+            echo(f"no table {name}: these runs hold nothing of it{note}", err=True)
     if kind == "text" and not table:
         print_worst(opened.runs, worst)
 

@@ -1,6 +1,7 @@
 import json
 
 import pytest
+from made_runs import write_run
 from pages import sections
 from stores import write_toy_store
 from typer.testing import CliRunner
@@ -77,7 +78,16 @@ def test_a_report_compares_under_noise_too_and_names_its_tables(call, clean_run)
     assert [line.split()[0] for line in listed.output.splitlines()] == list(TABLES)
 
     empty = call("report", clean_run.path, "--table", "edits")
-    assert "no table edits" in empty.output
+    assert "no table edits: these runs hold nothing of it\n" in empty.output
+
+
+def test_a_report_says_that_missing_rollouts_may_leave_out_planners(call, tmp_path):
+    lost = [(planner, "ou-low", 0, "t1") for planner in ("alpha", "beta")]
+    settings = {"planners": ("alpha", "beta"), "noise": ("ou-low",), "missing": lost}
+    run = write_run(tmp_path / "a", **settings)
+    done = call("report", run.path, "--table", "planner-comparison-noise")
+    words = " ".join(done.output.split())
+    assert "planners that lack rollouts may be left out, 6 of 8 in a finished" in words
 
 
 def test_plot_writes_a_figure(call, clean_run, tmp_path):
