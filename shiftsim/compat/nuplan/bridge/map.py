@@ -324,10 +324,6 @@ class BridgeMap(AbstractMap):
             self._trees[first] = shapely.STRtree([shapely.LineString(line) for line in lines])
         return self._trees[first]
 
-    @property
-    def _connector_lines(self) -> shapely.STRtree:
-        return self._lines(self.source.num_lanes)
-
     def object(self, layer: str, index: int) -> Any:
         """Object number `index` of one of our layers, always the same one."""
         found = self._by_index.get((layer, index))
@@ -367,10 +363,7 @@ class BridgeMap(AbstractMap):
     def get_proximal_map_objects(
         self, point: Any, radius: float, layers: Sequence[Any]
     ) -> dict[Any, list[Any]]:
-        """Per layer the objects that meet an axis-parallel square of half width `radius` [m].
-
-        Other layers have none.
-        """
+        """Per layer the objects that meet an axis-parallel square of half width `radius` [m]."""
         unknown = [layer.name for layer in layers if layer not in self.get_available_map_objects()]
         assert not unknown, f"layers without objects: {', '.join(unknown)}"
         return defaultdict(list, {layer: self._near(point, radius, layer) for layer in layers})
@@ -379,7 +372,7 @@ class BridgeMap(AbstractMap):
         span, x, y = self._objects(layer), float(point.x), float(point.y)
         if layer == _LAYERS.LANE_CONNECTOR:
             square = shapely.box(x - radius, y - radius, x + radius, y + radius)
-            found = self._connector_lines.query(square, predicate="intersects")
+            found = self._lines(span.first).query(square, predicate="intersects")
             near = sorted((span.first + found).tolist())
         else:
             near = span.layer.within_box(x, y, float(radius)).tolist()
@@ -393,17 +386,14 @@ class BridgeMap(AbstractMap):
             return any(kinds[line] == int(StopLineType.TURN_STOP) for line in lines)
         if layer == _LAYERS.LANE_CONNECTOR:
             place = shapely.Point(point.x, point.y)
-            return bool(self._connector_lines.query(place, predicate="within").size)
+            return bool(self._lines(self.source.num_lanes).query(place, predicate="within").size)
         return bool(self._holding(self._span(layer), point))
 
     def get_distance_to_nearest_map_object(
         self, point: Any, layer: Any
     ) -> tuple[str | None, float | None]:
-        """Id of the nearest object of a layer and its distance [m]; None where there is none.
-
-        A baseline has the id of its lane or lane connector.
-        """
-        is_any_line = layer == _LAYERS.BASELINE_PATHS
+        """Id of the nearest object of a layer and its distance [m]; None where there is none."""
+        is_any_line = layer == _LAYERS.BASELINE_PATHS  # which has the id of its edge
         span = self._span(_LAYERS.LANE if is_any_line else layer)
         if span.first == span.stop:
             return None, None
