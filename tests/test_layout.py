@@ -20,11 +20,11 @@ BUDGETS = {
     "shiftsim/geometry": 1_015,  # goal 1_000
     "shiftsim/world": 2_076,  # goal 1_800
     "shiftsim/edits": 2_137,  # goal 2_100
-    "shiftsim/sim": 2_486,  # goal 1_600
+    "shiftsim/sim": 2_491,  # goal 1_600
     "shiftsim/sim/traffic": 2_337,  # goal 2_200
     "metrics": 2_851,
     "shiftsim/runs": 5_398,  # goal 3_300
-    "planners": 4_273,  # goal 4_300
+    "planners": 4_278,  # goal 4_300
     "planners/learned": 4_909,  # goal 4_600; attention of all scenes at once on a GPU brings 40
     "data/maps": 3_620,  # goal 3_000
     "data": 5_032,  # goal 3_900
@@ -35,12 +35,12 @@ BUDGETS = {
     "shiftsim/view": 2_371,  # goal 1_800
     "shiftsim/env": 1_451,
     "shiftsim/train": 3_256,  # goal 1_600; rasters and rounds on a GPU, faster samples bring 30
-    "shiftsim/compat": 3_590,  # goal 2_300
-    "shiftsim/verify": 1_199,  # goal 1_200
-    "shiftsim/cli": 2_676,  # goal 2_300
+    "shiftsim/compat": 3_600,  # goal 2_300
+    "shiftsim/verify": 1_200,  # goal 1_200
+    "shiftsim/cli": 2_679,  # goal 2_300
     "benchmarks": 755,  # goal 700; the tracks finding and sensor-drift bring 40
 }
-MOST_LINES, MOST_MODULES, MOST_KERNELS = 63_981, 300, 220  # the goal is 52_000 lines
+MOST_LINES, MOST_MODULES, MOST_KERNELS = 64_013, 300, 220  # the goal is 52_000 lines
 LONGEST_MODULE, CROWDED = 450, 16
 # modules of under 80 lines that one other module imports, and why they stand alone
 SMALL_AND_ALONE = {
