@@ -270,11 +270,13 @@ def _first_broken(tracks: collision.FlatTracks) -> tuple[int, int]:
     for row in range(len(tracks.valid)):
         for column in range(len(tracks.is_static)):
             if tracks.valid[row, column]:
-                (x, y, heading), size = tracks.poses[row, column], tracks.sizes[row, column]
-                far = abs(x) + abs(y) + abs(heading) + size[0] + size[1]
+                length, width = tracks.sizes[row, column, 0], tracks.sizes[row, column, 1]
+                far = length + width
+                for part in range(3):
+                    far += abs(tracks.poses[row, column, part])
                 if not tracks.is_static[column]:  # these have no velocity
-                    speed = tracks.velocities[row, column]
-                    far += abs(speed[0]) + abs(speed[1])
-                if not (far <= _FAR and size[0] >= 0.0 and size[1] >= 0.0):  # NaN neither
+                    for part in range(2):
+                        far += abs(tracks.velocities[row, column, part])
+                if not (far <= _FAR and length >= 0.0 and width >= 0.0):  # NaN neither
                     return row, column
     return -1, -1

@@ -22,7 +22,7 @@ BUDGETS = {
     "shiftsim/edits": 2_137,  # goal 2_100
     "shiftsim/sim": 2_491,  # goal 1_600
     "shiftsim/sim/traffic": 2_337,  # goal 2_200
-    "metrics": 2_851,
+    "metrics": 2_853,
     "shiftsim/runs": 5_398,  # goal 3_300
     "planners": 4_278,  # goal 4_300
     "planners/learned": 4_909,  # goal 4_600; attention of all scenes at once on a GPU brings 40
@@ -40,7 +40,7 @@ BUDGETS = {
     "shiftsim/cli": 2_679,  # goal 2_300
     "benchmarks": 755,  # goal 700; the tracks finding and sensor-drift bring 40
 }
-MOST_LINES, MOST_MODULES, MOST_KERNELS = 64_013, 300, 220  # the goal is 52_000 lines
+MOST_LINES, MOST_MODULES, MOST_KERNELS = 64_015, 300, 220  # the goal is 52_000 lines
 LONGEST_MODULE, CROWDED = 450, 16
 # modules of under 80 lines that one other module imports, and why they stand alone
 SMALL_AND_ALONE = {
