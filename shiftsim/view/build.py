@@ -331,9 +331,9 @@ def galleries(runs: Sequence[Run], stores: Sequence[Any], choice: Choice) -> lis
         opened[made_with] = opened.get(made_with) or store
         members.setdefault(made_with, []).append(run)
     found = [Gallery(same, opened[made_with], choice) for made_with, same in members.items()]
+    tasks = [task for gallery in found for task in gallery.rollouts]
     for name, values in vars(choice).items():
         for only in (Choice(**{name: (value,)}) for value in values):
-            tasks = [task for gallery in found for task in gallery.rollouts]
             if not any(task in only for task in tasks):
                 raise ConfigError(f"no rollout has {only}", hint=_offered(tasks))
     return found

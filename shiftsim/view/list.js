@@ -170,7 +170,7 @@ function cellOf(name, noise, best) {
   const windows = windowsOf(group);
   const where = `${name}, noise ${noise}: ${text}, ${done} of ${group.length} rollouts scored${windows && `, windows of ${windows}`}`;
   const made = button(text, { planner: name, noise }, where);
-  if (mean === null) made.append(" ", span("soft", windows || `${done}/${group.length}`));
+  if (mean === null) made.append(" ", span("soft", done === group.length ? windows : `${done}/${group.length}`));
   else made.style.setProperty("--loss", `${0.4 * (100 - mean)}%`);
   made.classList.toggle("best", text === best);
   return made;
